@@ -1,0 +1,59 @@
+# Each target works as the first command after cloning: what it needs is installed on the way.
+# Another interpreter: make test PYTHON=python3.12
+
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.installed
+READY_BENCH := .venv/.installed-bench
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup demo test slow lint bench clean
+
+help:
+	@echo "make setup   create .venv and install the package with its development tools"
+	@echo "make demo    simulate the mini forwarder; results in demo-output/"
+	@echo "make test    fast tests"
+	@echo "make slow    slow tests: browser, MuJoCo, long simulations"
+	@echo "make lint    ruff and mypy"
+	@echo "make bench   measure speed"
+	@echo "make clean   remove .venv, caches and results"
+
+setup: $(READY)
+
+$(READY): pyproject.toml
+	@$(PYTHON) -c "" 2>/dev/null || \
+	    { echo "error: no $(PYTHON) on this machine, install Python 3.11 to 3.14 or name it: make PYTHON=/path/to/python" >&2; exit 2; }
+	@$(PYTHON) -c "import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))" || \
+	    { echo "error: $$($(PYTHON) --version) is too old or too new, take 3.11 to 3.14: make PYTHON=python3.12" >&2; exit 2; }
+	@$(PYTHON) -c "import venv, ensurepip" 2>/dev/null || \
+	    { echo "error: $(PYTHON) has no venv module, install it: sudo apt install python3-venv (Debian, Ubuntu)" >&2; exit 2; }
+	@echo "Installing into .venv (the first time takes a few minutes)"
+	@$(PYTHON) -m venv .venv
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+$(READY_BENCH): $(READY)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
+	@touch $@
+
+demo: $(READY)
+	$(BIN)/crane demo --out demo-output --force
+
+test: $(READY)
+	$(BIN)/python -m pytest -n 2
+
+slow: $(READY_BENCH)
+	$(BIN)/python -m pytest -n 2 -m slow
+
+lint: $(READY)
+	$(BIN)/python -m ruff check .
+	$(BIN)/python -m ruff format --check .
+	$(BIN)/python -m mypy
+
+bench: $(READY_BENCH)
+	$(BIN)/python scripts/benchmark.py
+
+clean:
+	rm -rf .venv .hypothesis .mypy_cache .pytest_cache .ruff_cache build dist demo-output
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,49 @@
+"""crane: machines with closed kinematic chains, simulated and identified in their actuators."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from crane.closure import Closure
+    from crane.control import PI, ComputedTorque
+    from crane.description import EndStop, ForceElement, Friction, PIGains
+    from crane.dynamics import Dynamics
+    from crane.errors import CraneError, CraneWarning
+    from crane.kinematics import Kinematics
+    from crane.machine import Machine, Payload, load
+    from crane.paths import Path, point_to_point, polynomial, task_path, tip_path
+    from crane.recording import Recording
+    from crane.simulation import simulate
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "crane.closure": ("Closure",),
+    "crane.control": ("PI", "ComputedTorque"),
+    "crane.description": ("EndStop", "ForceElement", "Friction", "PIGains"),
+    "crane.dynamics": ("Dynamics",),
+    "crane.errors": ("CraneError", "CraneWarning"),
+    "crane.kinematics": ("Kinematics",),
+    "crane.machine": ("Machine", "Payload", "load"),
+    "crane.paths": ("Path", "point_to_point", "polynomial", "task_path", "tip_path"),
+    "crane.recording": ("Recording",),
+    "crane.simulation": ("simulate",),
+}
+
+__all__ = [
+    "PI", "Closure", "ComputedTorque", "CraneError", "CraneWarning", "Dynamics", "EndStop",
+    "ForceElement", "Friction", "Kinematics", "Machine", "PIGains", "Path", "Payload",
+    "Recording", "load", "point_to_point", "polynomial", "simulate", "task_path", "tip_path",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    # imports run when a name is first used, so that `crane --help` answers at once
+    for module, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(module), name)
+    raise AttributeError(f"module 'crane' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

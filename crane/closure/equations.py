@@ -1,0 +1,172 @@
+"""The loop equations phi(q) = 0, their Jacobian and its time derivative."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from crane.description import LOOP_TYPES, LoopSpec
+from crane.errors import MechanismError
+from crane.samples import Array
+
+
+def frame_id(model: pin.Model, link: str) -> int:
+    """Index of the frame of a URDF link."""
+    index: int = model.getFrameId(link, pin.FrameType.BODY)
+    if index >= model.nframes:
+        raise MechanismError(f"frame '{link}' is not in the assembled model, name a link")
+    return index
+
+
+def _turned(axis: Sequence[float]) -> Array:
+    """A rotation (3, 3) whose third column is the axis."""
+    third = np.asarray(axis)
+    first = np.cross(np.eye(3)[np.argmin(np.abs(third))], third)
+    first /= np.linalg.norm(first)
+    return np.column_stack([first, np.cross(third, first), third])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Row-wise cross product; numpy's own costs several times more on a few rows."""
+    out = np.empty_like(a)
+    out[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
+    out[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
+    out[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return out
+
+
+class LoopEquations:
+    """All equations of all loops of a machine.
+
+    A loop joins frame 1 (predecessor) and frame 2 (successor), both turned so that the loop's
+    axis is their z. With their axes a_i, b_k and origins p_1, p_2 in the world, its equations are
+
+        a_i . (p_2 - p_1) = 0    for every locked translation i,
+        a_i . b_k = 0            for locked rotations: two rows with b_k the free axis, or
+                                 (x, y), (y, z), (z, x) where all three are locked.
+
+    Row by row there is a wrench w = [a_i; p_2 x a_i] or [0; b_k x a_i] at the world's origin, so
+    that phi' = w . (V_2 - V_1) with the spatial velocities V. Columns of joints that carry both
+    frames therefore cancel exactly.
+
+    Args:
+        model: The spanning tree.
+        loops: The loops.
+    """
+
+    def __init__(self, model: pin.Model, loops: Sequence[LoopSpec]):
+        self.model = model
+        self.data = model.createData()
+        self.loops = tuple(loops)
+        self._frames: list[tuple[int, pin.SE3]] = []  # (joint, placement), two per loop
+        sign = np.zeros((len(loops), model.nv))
+        rows: list[tuple[int, bool, int, int]] = []  # loop, is translation, axis of 1, axis of 2
+        for index, loop in enumerate(loops):
+            turn = pin.SE3(_turned(loop.axis), np.zeros(3))
+            for side, name in ((-1.0, loop.predecessor), (1.0, loop.successor)):
+                frame = model.frames[frame_id(model, name)]
+                self._frames.append((frame.parentJoint, frame.placement * turn))
+                for joint in model.supports[frame.parentJoint]:
+                    if joint > 0:
+                        start = model.joints[joint].idx_v
+                        sign[index, start : start + model.joints[joint].nv] += side
+            locked = LOOP_TYPES[loop.type]
+            rows += [(index, True, i, 0) for i in range(3) if locked[i]]
+            free = [k for k in range(3) if not locked[3 + k]]
+            if not free:
+                rows += [(index, False, 0, 1), (index, False, 1, 2), (index, False, 2, 0)]
+            elif len(free) == 1:
+                rows += [(index, False, i, free[0]) for i in range(3) if i != free[0]]
+        self.loop_of_row = np.array([row[0] for row in rows], dtype=np.intp)
+        self.is_translation = np.array([row[1] for row in rows], dtype=bool)
+        self._axis1 = np.array([row[2] for row in rows], dtype=np.intp)
+        self._axis2 = np.array([row[3] for row in rows], dtype=np.intp)
+        self._sign = sign
+        self._row_sign = sign[self.loop_of_row]
+
+    def _geometry(self) -> tuple[Array, Array, Array, Array]:
+        """Of every row: axis of frame 1, axis of frame 2, origins of both frames, each (m, 3)."""
+        placements = [self.data.oMi[joint] * local for joint, local in self._frames]
+        turns = np.array([placement.rotation for placement in placements])
+        origins = np.array([placement.translation for placement in placements])
+        one = 2 * self.loop_of_row
+        return (
+            turns[one, :, self._axis1],
+            turns[one + 1, :, self._axis2],
+            origins[one],
+            origins[one + 1],
+        )
+
+    def _wrenches(self, a: Array, b: Array, p2: Array) -> Array:
+        wrenches = np.zeros((len(a), 6))
+        moved = self.is_translation
+        wrenches[moved, :3] = a[moved]
+        wrenches[:, 3:] = _cross(np.where(moved[:, None], p2, b), a)
+        return wrenches
+
+    def evaluate(self, q: Array) -> tuple[Array, Array]:
+        """Residuals and Jacobian.
+
+        Args:
+            q: (nq,) [m], [rad].
+
+        Returns:
+            phi (m,) [m] for translations, [1] for rotations, and dphi/dq (m, nv).
+        """
+        if not self.loops:
+            return np.zeros(0), np.zeros((0, self.model.nv))
+        jacobian = pin.computeJointJacobians(self.model, self.data, q)
+        a, b, p1, p2 = self._geometry()
+        phi = np.einsum("ij,ij->i", a, np.where(self.is_translation[:, None], p2 - p1, b))
+        return phi, self._row_sign * (self._wrenches(a, b, p2) @ jacobian)
+
+    def turned_over(self, q: Array) -> str | None:
+        """Name of a loop whose axes are antiparallel, which also solves its equations."""
+        if not self.loops:
+            return None
+        pin.forwardKinematics(self.model, self.data, q)
+        for index, loop in enumerate(self.loops):
+            locked = LOOP_TYPES[loop.type][3:]
+            if not any(locked):
+                continue
+            (j1, local1), (j2, local2) = self._frames[2 * index : 2 * index + 2]
+            turn1 = (self.data.oMi[j1] * local1).rotation
+            turn2 = (self.data.oMi[j2] * local2).rotation
+            aligned = np.einsum("ik,ik->k", turn1, turn2)
+            checked = range(3) if all(locked) else [k for k in range(3) if not locked[k]]
+            if any(aligned[k] < 0 for k in checked):
+                return loop.name
+        return None
+
+    def evaluate_rate(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """Jacobian and second derivative of phi at zero joint acceleration.
+
+        Args:
+            q: (nq,) [m], [rad].
+            v: (nv,) [m/s], [rad/s].
+
+        Returns:
+            dphi/dq (m, nv) and (d/dt dphi/dq) v (m,).
+        """
+        if not self.loops:
+            return np.zeros((0, self.model.nv)), np.zeros(0)
+        rate = pin.computeJointJacobiansTimeVariation(self.model, self.data, q, v)
+        a, b, _, p2 = self._geometry()
+        velocity = np.array([self.data.ov[joint].vector for joint, _ in self._frames])
+        one = 2 * self.loop_of_row
+        v2, w1, w2 = velocity[one + 1, :3], velocity[one, 3:], velocity[one + 1, 3:]
+        moved = self.is_translation[:, None]
+        a_rate = _cross(w1, a)
+        arm = np.where(moved, p2, b)
+        arm_rate = _cross(w2, arm) + np.where(moved, v2, 0.0)
+        wrench_rate = np.zeros((len(a), 6))
+        wrench_rate[self.is_translation, :3] = a_rate[self.is_translation]
+        wrench_rate[:, 3:] = _cross(arm_rate, a) + _cross(arm, a_rate)
+        split = self._row_sign * v  # (m, nv): v of frame 2 minus v of frame 1
+        relative = split @ self.data.J.T
+        bias = split @ rate.T
+        wrenches = self._wrenches(a, b, p2)
+        second = np.einsum("ij,ij->i", wrench_rate, relative) + np.einsum(
+            "ij,ij->i", wrenches, bias
+        )
+        return self._row_sign * (wrenches @ self.data.J), second

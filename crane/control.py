@@ -1,0 +1,139 @@
+"""Controllers: forces of the active joints from time, coordinates and velocities."""
+
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import numpy as np
+
+from crane.description import PIGains
+from crane.dynamics import Dynamics
+from crane.errors import InputError, known
+from crane.machine import Machine
+from crane.paths import Path
+from crane.samples import Array
+
+
+class Controller(Protocol):
+    """What `simulate` asks of a controller; a plain function (t, q_a, v_a) -> tau_a serves too.
+
+    Attributes:
+        path: The reference motion, or None.
+        states: Number of the controller's own states, integrated with the machine's.
+    """
+
+    path: Path | None
+    states: int
+
+    def __call__(
+        self, time: float, q_a: Array, v_a: Array, state: Array
+    ) -> tuple[Array, Array]:
+        """Active forces (n,) [N], [N m], and the rate of the controller's states."""
+
+
+class PI:
+    """One PI controller per active joint, equation (7) of the reduced-scale forwarder paper.
+
+    tau = K_p e + K_i int e dt, e = q_ref(t) - q_A.
+
+    Args:
+        machine: The machine.
+        path: Reference of the active joints.
+        gains: By active joint; those of the machine file if not given.
+
+    Raises:
+        InputError: No gains for a joint.
+    """
+
+    def __init__(self, machine: Machine, path: Path, gains: Mapping[str, PIGains] | None = None):
+        gains = machine.control if gains is None else gains
+        for joint in machine.active:
+            if joint not in gains:
+                raise InputError(
+                    f"no PI gains for active joint '{joint}' of '{machine.name}', give kp and ki "
+                    "under 'control' of the machine file"
+                )
+        self.path: Path | None = path
+        self.states = len(machine.active)
+        self._reference = path
+        self._kp = np.array([gains[joint].kp for joint in machine.active])
+        self._ki = np.array([gains[joint].ki for joint in machine.active])
+
+    def __call__(
+        self, time: float, q_a: Array, v_a: Array, state: Array
+    ) -> tuple[Array, Array]:
+        """See `Controller`; the states are the integrals of the errors."""
+        error = self._reference(time)[0] - q_a
+        return self._kp * error + self._ki * state, error
+
+
+class ComputedTorque:
+    """Inverse dynamics with a critically damped error: e'' + 2 w e' + w^2 e = 0.
+
+    tau = inverse(q_A, v_A, a_ref + 2 w (v_ref - v_A) + w^2 (q_ref - q_A)) with friction.
+
+    Args:
+        machine: The machine.
+        path: Reference of the active joints.
+        bandwidth: w [rad/s].
+    """
+
+    def __init__(self, machine: Machine, path: Path, bandwidth: float = 20.0):
+        if not (np.isfinite(bandwidth) and bandwidth > 0):
+            raise InputError(f"the bandwidth is {bandwidth} rad/s, give a positive number")
+        self.path: Path | None = path
+        self.states = 0
+        self._reference, self._bandwidth = path, bandwidth
+        self._dynamics = Dynamics(machine)
+
+    def __call__(
+        self, time: float, q_a: Array, v_a: Array, state: Array
+    ) -> tuple[Array, Array]:
+        """See `Controller`."""
+        q_ref, v_ref, a_ref = self._reference(time)
+        wanted = (
+            a_ref + 2 * self._bandwidth * (v_ref - v_a) + self._bandwidth**2 * (q_ref - q_a)
+        )
+        return self._dynamics.inverse(q_a, v_a, wanted, friction=True), state
+
+
+class Feedback:
+    """A plain function of the user as a controller.
+
+    Args:
+        function: (t, q_a, v_a) -> tau_a.
+        machine: The machine, whose number of active joints the answer must have.
+    """
+
+    def __init__(self, function: Callable[[float, Array, Array], Array], machine: Machine):
+        self.path: Path | None = None
+        self.states = 0
+        self._function, self._active = function, machine.active
+
+    def __call__(
+        self, time: float, q_a: Array, v_a: Array, state: Array
+    ) -> tuple[Array, Array]:
+        """See `Controller`."""
+        tau = np.asarray(self._function(time, q_a.copy(), v_a.copy()), dtype=np.float64)
+        if tau.shape != (len(self._active),):
+            raise InputError(
+                f"the controller gave the shape {tau.shape} at t = {time:g} s, return one force "
+                f"per active joint ({', '.join(self._active)})"
+            )
+        return tau, state
+
+
+CONTROLLERS: Mapping[str, Callable[[Machine, Path], Controller]] = {
+    "pi": PI,
+    "computed-torque": ComputedTorque,
+}
+
+
+def controller(name: str, machine: Machine, path: Path) -> Controller:
+    """A built-in controller by name.
+
+    Raises:
+        InputError: There is no such controller.
+    """
+    if name not in CONTROLLERS:
+        raise InputError(f"controller '{name}' is unknown, {known(CONTROLLERS, name)}")
+    return CONTROLLERS[name](machine, path)

@@ -1,0 +1,21 @@
+"""Reading and checking what the user wrote: machine files and URDFs."""
+
+from crane.description.machine_file import read
+from crane.description.sources import bundled, examples
+from crane.description.spec import (
+    LOOP_TYPES,
+    Chain,
+    EndStop,
+    ForceElement,
+    Friction,
+    LoopSpec,
+    MachineSpec,
+    PIGains,
+    Task,
+)
+from crane.description.urdf import inertia_problem
+
+__all__ = [
+    "LOOP_TYPES", "Chain", "EndStop", "ForceElement", "Friction", "LoopSpec", "MachineSpec",
+    "PIGains", "Task", "bundled", "examples", "inertia_problem", "read",
+]  # fmt: skip

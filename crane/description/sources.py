@@ -1,0 +1,71 @@
+"""Where machines are found: bundled by name, example-robot-data by name, or a path."""
+
+from functools import cache
+from importlib.metadata import PackageNotFoundError, files
+from pathlib import Path
+
+from crane.errors import DescriptionError, known
+
+
+def _models() -> Path:
+    package = Path(__file__).resolve().parents[1]
+    installed = package / "models"
+    return installed if installed.is_dir() else package.parent / "models"
+
+
+def bundled() -> dict[str, Path]:
+    """Names and machine files of the machines that come with the package."""
+    return {path.stem: path for path in sorted(_models().glob("*.yaml"))}
+
+
+@cache
+def example_root() -> Path | None:
+    """Folder `robots` of example-robot-data, or None where that is not installed."""
+    try:
+        listed = files("example-robot-data") or []
+    except PackageNotFoundError:
+        return None
+    for item in listed:
+        parts = item.parts
+        if "robots" in parts:
+            here = Path(str(item.locate())).resolve()
+            depth = len(parts) - 1 - parts.index("robots")
+            return here.parents[depth - 1]
+    return None
+
+
+@cache
+def examples() -> dict[str, Path]:
+    """Names and URDFs of the robots in example-robot-data."""
+    root = example_root()
+    if root is None:
+        return {}
+    return {path.stem: path for path in sorted(root.glob("**/*.urdf"))}
+
+
+def find(name: str | Path) -> Path:
+    """The machine file or URDF that a name or path stands for.
+
+    Args:
+        name: A bundled machine, a robot of example-robot-data, or a path that ends in .yaml,
+            .yml or .urdf.
+
+    Raises:
+        DescriptionError: There is none.
+    """
+    path = Path(name)
+    if path.suffix.lower() in {".yaml", ".yml", ".urdf"}:
+        if not path.is_file():
+            raise DescriptionError(f"{path}: no such file, check the path")
+        return path.resolve()
+    text = str(name)
+    if text in (machines := bundled()):
+        return machines[text]
+    if text in (robots := examples()):
+        return robots[text]
+    if path.exists():
+        raise DescriptionError(f"{path}: not a machine, give a .yaml machine file or a .urdf")
+    hint = known([*machines, *robots], text)
+    if hint.startswith("known"):
+        hint = known(machines)
+    raise DescriptionError(f"{text}: no such machine, {hint}; or give the path of a file")

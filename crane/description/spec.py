@@ -1,0 +1,169 @@
+"""What a user wrote, read and checked, before anything is assembled."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lxml import etree
+
+
+@dataclass(frozen=True)
+class Chain:
+    """One open sub-chain: a URDF whose root link is fixed to a frame of an earlier chain.
+
+    Attributes:
+        name: The sub-chain's name.
+        urdf: Its file.
+        parent: Frame it hangs from; None for the first chain, which stands on the world.
+        where: Where it was written, for errors.
+    """
+
+    name: str
+    urdf: Path
+    parent: str | None
+    where: str
+
+
+@dataclass(frozen=True)
+class LoopSpec:
+    """A joint that closes a loop between two frames of the spanning tree.
+
+    Attributes:
+        name: The loop's name.
+        type: One of the keys of `LOOP_TYPES`.
+        predecessor: First frame.
+        successor: Second frame.
+        axis: Unit vector in both frames: the direction the joint leaves free (normal of a
+            planar joint).
+        where: Where it was written, for errors.
+    """
+
+    name: str
+    type: str
+    predecessor: str
+    successor: str
+    axis: tuple[float, float, float]
+    where: str
+
+
+# Locked directions of a loop joint whose axis is local z: three translations, three rotations.
+LOOP_TYPES: Mapping[str, tuple[int, int, int, int, int, int]] = {
+    "fixed": (1, 1, 1, 1, 1, 1),
+    "revolute": (1, 1, 1, 1, 1, 0),
+    "prismatic": (1, 1, 0, 1, 1, 1),
+    "cylindrical": (1, 1, 0, 1, 1, 0),
+    "spherical": (1, 1, 1, 0, 0, 0),
+    "planar": (0, 0, 1, 1, 1, 0),
+}
+
+
+@dataclass(frozen=True)
+class Friction:
+    """Friction of one tree joint, asymmetric Coulomb and viscous.
+
+    tau = coulomb sign(v) + coulomb_offset + viscous v + viscous_offset |v|, the joint's drive
+    force that the friction consumes, with sign(v) smoothed to tanh(v / smoothing). This is
+    equation (5) of the reduced-scale forwarder paper with the sign that brakes.
+
+    Attributes:
+        coulomb: [N] or [N m].
+        coulomb_offset: Difference between the two directions [N] or [N m].
+        viscous: [N s/m] or [N m s/rad].
+        viscous_offset: Difference between the two directions [N s/m] or [N m s/rad].
+        smoothing: Velocity over which the sign changes [m/s] or [rad/s]; 0 for a jump.
+    """
+
+    coulomb: float = 0.0
+    coulomb_offset: float = 0.0
+    viscous: float = 0.0
+    viscous_offset: float = 0.0
+    smoothing: float = 1e-3
+
+
+@dataclass(frozen=True)
+class ForceElement:
+    """A passive force along one tree joint: f = force - stiffness (q - rest) - damping v.
+
+    Attributes:
+        joint: The joint it acts on, active or passive.
+        stiffness: [N/m] or [N m/rad].
+        rest: Coordinate at which the spring is slack [m] or [rad].
+        damping: [N s/m] or [N m s/rad].
+        force: Constant force in the joint's positive direction [N] or [N m].
+    """
+
+    joint: str
+    stiffness: float = 0.0
+    rest: float = 0.0
+    damping: float = 0.0
+    force: float = 0.0
+
+
+@dataclass(frozen=True)
+class EndStop:
+    """Elastic stops at both limits of a joint, after Hunt and Crossley.
+
+    f = stiffness d max(0, 1 + damping d') towards the inside, d > 0 the depth beyond the limit.
+
+    Attributes:
+        joint: The joint, with finite limits in its URDF.
+        stiffness: [N/m] or [N m/rad].
+        damping: [s/m] or [s/rad].
+    """
+
+    joint: str
+    stiffness: float
+    damping: float = 0.0
+
+
+@dataclass(frozen=True)
+class PIGains:
+    """Gains of one joint's PI controller, equation (7) of the reduced-scale forwarder paper.
+
+    Attributes:
+        kp: [N/m] or [N m/rad].
+        ki: [N/(m s)] or [N m/(rad s)].
+    """
+
+    kp: float
+    ki: float
+
+
+@dataclass(frozen=True)
+class Task:
+    """A named reference motion: polynomials in time of the tip or of active joints.
+
+    Attributes:
+        name: The task's name.
+        description: One line on what it is.
+        duration: [s].
+        space: "tip" (coordinates x, y, z of the world) or "active" (the active joints).
+        coefficients: Per coordinate the polynomial in time [s], lowest power first [m], [rad].
+    """
+
+    name: str
+    description: str
+    duration: float
+    space: str
+    coefficients: Mapping[str, tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class MachineSpec:
+    """A machine as described by its file; see docs/machine_file.md for the keys."""
+
+    name: str
+    source: str
+    path: Path
+    chains: tuple[Chain, ...]
+    tree: etree._Element  # all chains merged into one <robot>
+    loops: tuple[LoopSpec, ...] = ()
+    active: tuple[str, ...] | None = None  # None: every joint of the tree
+    home: Mapping[str, float] = field(default_factory=dict)
+    friction: Mapping[str, Friction] = field(default_factory=dict)
+    forces: tuple[ForceElement, ...] = ()
+    end_stops: tuple[EndStop, ...] = ()
+    tip: str | None = None
+    tasks: Mapping[str, Task] = field(default_factory=dict)
+    control: Mapping[str, PIGains] = field(default_factory=dict)
+    where: Mapping[str, str] = field(default_factory=dict)  # section -> "file:line"

@@ -1,0 +1,73 @@
+"""Every exception and warning of the package.
+
+A message is one line that says what is wrong, where, and what to do about it.
+"""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class CraneError(Exception):
+    """Base class of everything this package raises on purpose."""
+
+
+class DescriptionError(CraneError):
+    """A machine file or a URDF says something that cannot be."""
+
+
+class MechanismError(CraneError):
+    """The parts are well described, but do not make a machine that can be driven."""
+
+
+class InputError(CraneError):
+    """An argument has a wrong shape, is not finite, or names something unknown."""
+
+
+class LimitError(CraneError):
+    """A commanded active coordinate lies outside of its limits."""
+
+
+class ClosureError(CraneError):
+    """The loops cannot be closed as asked."""
+
+
+class OutOfReachError(ClosureError):
+    """No posture closes the loops at these active coordinates."""
+
+
+class BranchEdgeError(ClosureError):
+    """The loops close, but at a posture where the passive joints are not determined."""
+
+
+class WrongBranchError(ClosureError):
+    """The loops close, but in another assembly branch than the home posture's."""
+
+
+class UnreachableTipError(CraneError):
+    """No active coordinates within their limits put the tip where it was asked to be."""
+
+
+class RecordingError(CraneError):
+    """A recording is malformed."""
+
+
+class SimulationError(CraneError):
+    """A simulation could not go on."""
+
+
+class OutputError(CraneError):
+    """A result cannot be written where it was asked to be."""
+
+
+class CraneWarning(UserWarning):
+    """Something is unusual enough to be told, and not wrong enough to refuse."""
+
+
+def known(names: Iterable[str], wanted: str | None = None) -> str:
+    """Words an error ends with: the nearest of the names that exist, or all of them."""
+    names = list(names)
+    if not names:
+        return "there are none"
+    if wanted is not None and (near := get_close_matches(wanted, names, 1, 0.75)):
+        return f"did you mean '{near[0]}'?"
+    return "known: " + ", ".join(sorted(names))

@@ -1,0 +1,140 @@
+"""Reference motions: piecewise polynomials in the active coordinates or in the tip's space."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import BPoly, PPoly
+
+from crane.errors import InputError, known
+from crane.kinematics import Kinematics
+from crane.machine import Machine
+from crane.samples import Array, as_samples
+
+_KNOTS_PER_SECOND = 100
+
+
+class Path:
+    """A motion with two derivatives; before its start and after its end it stands still.
+
+    Args:
+        curve: Piecewise polynomial of time from 0 [s], values (n,).
+        tip: The same motion of the tip, values (3,) [m], where the path was given there.
+
+    Attributes:
+        duration: [s].
+        tip: See above.
+    """
+
+    def __init__(self, curve: PPoly | BPoly, tip: "Path | None" = None):
+        self.duration = float(curve.x[-1])
+        self.tip = tip
+        self._curves = (curve, curve.derivative(), curve.derivative(2))
+
+    def __call__(self, time: ArrayLike) -> tuple[Array, Array, Array]:
+        """Coordinates, velocities and accelerations.
+
+        Args:
+            time: () or (N,) [s].
+
+        Returns:
+            Three arrays (n,) or (N, n).
+        """
+        time = np.asarray(time, dtype=np.float64)
+        inside = (time >= 0) & (time <= self.duration)
+        position, velocity, acceleration = (
+            np.asarray(curve(np.clip(time, 0.0, self.duration))) for curve in self._curves
+        )
+        moving = inside[..., None]
+        return position, np.where(moving, velocity, 0.0), np.where(moving, acceleration, 0.0)
+
+
+def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Path:
+    """Polynomials in time.
+
+    Args:
+        coefficients: Per coordinate, lowest power first.
+        duration: [s].
+
+    Raises:
+        InputError: No coordinates, not finite, or no duration.
+    """
+    if not (np.isfinite(duration) and duration > 0):
+        raise InputError(f"the path's duration is {duration} s, give a positive number")
+    size = max((len(row) for row in coefficients), default=0)
+    if not size or not all(np.isfinite(row).all() for row in coefficients):
+        raise InputError("the path's coefficients are not finite numbers, give a list per coordinate")
+    table = np.zeros((size, 1, len(coefficients)))
+    for column, row in enumerate(coefficients):
+        table[size - len(row) :, 0, column] = row[::-1]
+    return Path(PPoly(table, [0.0, duration]))
+
+
+def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Path:
+    """Straight line from rest to rest with least jerk: s = 10 u^3 - 15 u^4 + 6 u^5, u = t/T.
+
+    Args:
+        start: (n,) active coordinates or (3,) tip position.
+        end: The same shape.
+        duration: T [s].
+
+    Raises:
+        InputError: Different shapes or not finite.
+    """
+    first = np.atleast_1d(np.asarray(start, dtype=np.float64))
+    last = as_samples(np.atleast_1d(end), len(first), "end")
+    as_samples(first, len(first), "start")
+    shape = np.array([0, 0, 0, 10.0, -15.0, 6.0]) / duration ** np.arange(6)
+    return polynomial(
+        [[a, *((b - a) * shape[1:])] for a, b in zip(first, last, strict=True)], duration
+    )
+
+
+def tip_path(machine: Machine, tip: Path, guess: ArrayLike | None = None) -> Path:
+    """The motion of the active joints that moves the tip along a path.
+
+    Positions, velocities and accelerations are exact at knots every 10 ms (inverse kinematics,
+    v_A = J^-1 x', a_A = J^-1 (x'' - bias)); quintics join them.
+
+    Args:
+        machine: The machine.
+        tip: Path of the tip in the world [m].
+        guess: (n,) active coordinates near the start.
+
+    Returns:
+        Path of q_A, with `tip` set.
+
+    Raises:
+        UnreachableTipError: The path leaves the reach.
+    """
+    kinematics = Kinematics(machine)
+    count = max(2, int(np.ceil(tip.duration * _KNOTS_PER_SECOND)) + 1)
+    time = np.linspace(0.0, tip.duration, count)
+    x, x_rate, x_second = tip(time)
+    q_a = kinematics.inverse(x, guess)
+    jacobian = np.linalg.pinv(kinematics.jacobian(q_a))
+    v_a = np.einsum("ijk,ik->ij", jacobian, x_rate)
+    a_a = np.einsum("ijk,ik->ij", jacobian, x_second - kinematics.bias(q_a, v_a))
+    knots = np.stack([q_a, v_a, a_a], axis=1)
+    return Path(BPoly.from_derivatives(time, knots), tip)
+
+
+def task_path(machine: Machine, task: str) -> Path:
+    """Path of the active joints of a named task of the machine.
+
+    Raises:
+        InputError: The machine has no such task.
+        UnreachableTipError: It leaves the reach.
+        LimitError: It leaves the limits of an active joint.
+    """
+    if task not in machine.tasks:
+        raise InputError(
+            f"machine '{machine.name}' has no task '{task}', {known(machine.tasks, task)}"
+        )
+    chosen = machine.tasks[task]
+    if chosen.space == "tip":
+        rows = [chosen.coefficients[axis] for axis in ("x", "y", "z")]
+        return tip_path(machine, polynomial(rows, chosen.duration))
+    path = polynomial([chosen.coefficients[name] for name in machine.active], chosen.duration)
+    machine.check_limits(path(np.linspace(0, path.duration, 501))[0], f"task '{task}'")
+    return path

@@ -1,0 +1,248 @@
+"""What a machine did: time series of its active joints, and whatever else was recorded.
+
+As a file it is a CSV of SI units (see crane.timeseries):
+
+    # crane recording
+    # machine: mini_forwarder
+    # task: loading
+    time [s],q1 [rad],X1 [m],q1_velocity [rad/s],X1_velocity [m/s],q1_force [N m],X1_force [N],...
+
+A column X is an active joint if and only if X_velocity and X_force exist; two of the three without
+the third are an error. Every other column is a channel. The order of the columns is free, the
+joints come in the order of their displacements. The comment lines may be left out.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane import timeseries
+from crane.errors import RecordingError, known
+from crane.timeseries import TIME, Array, Table
+
+VELOCITY_UNITS = {"rad": "rad/s", "m": "m/s"}
+FORCE_UNITS = {"rad": "N m", "m": "N"}
+
+_VELOCITY, _FORCE = "_velocity", "_force"
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Samples of N instants of a machine with n active joints.
+
+    The arrays are copied to contiguous float64 and checked: shapes, finite numbers, time
+    strictly increasing. Treat them as constants.
+
+    Attributes:
+        time: Instants (N,) [s], N >= 1.
+        joints: Names of the active joints, in the order of the columns below.
+        q: Active coordinates (N, n) [rad or m].
+        v: Their velocities (N, n) [rad/s or m/s].
+        tau: Their generalized forces (N, n) [N m or N].
+        units: Unit of each joint's coordinate, "rad" or "m".
+        channels: Further columns (N,) by name.
+        channel_units: Their units; "" where none is given.
+        machine: Name of the bundled machine or path of the machine file, "" if not known.
+        task: What it was doing, "" if not known.
+    """
+
+    time: Array
+    joints: tuple[str, ...]
+    q: Array
+    v: Array
+    tau: Array
+    units: dict[str, str]
+    channels: dict[str, Array] = field(default_factory=dict)
+    channel_units: dict[str, str] = field(default_factory=dict)
+    machine: str = ""
+    task: str = ""
+
+    def __post_init__(self) -> None:
+        joints = tuple(self.joints)
+        count = np.size(self.time)
+        shape = (count, len(joints))
+        for name in self.channel_units:
+            if name not in self.channels:
+                raise RecordingError(f"unit of the channel '{name}', {known(self.channels, name)}")
+        if set(self.units) != set(joints):
+            raise RecordingError(f"units are for {_listed(self.units)}, give {_listed(joints)}")
+        checked = {
+            "joints": joints,
+            "units": {x: self.units[x] for x in joints},
+            "time": _array(TIME, self.time, (count,)),
+            "q": _array("q", self.q, shape, joints),
+            "v": _array("v", self.v, shape, joints),
+            "tau": _array("tau", self.tau, shape, joints),
+            "channels": {
+                name: _array(f"channel '{name}'", values, (count,))
+                for name, values in self.channels.items()
+            },
+            "channel_units": {name: self.channel_units.get(name, "") for name in self.channels},
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        self._check_names()
+        self._check_values()
+
+    def _check_names(self) -> None:
+        names = self._names()
+        for name in names:
+            if names.count(name) > 1:
+                raise RecordingError(f"column '{name}' is there twice, rename or remove one")
+        if _find_joints(names) != self.joints:
+            raise RecordingError(
+                f"channels {_listed(self.channels)} hold an active joint, "
+                f"rename those that end in {_VELOCITY} and {_FORCE}"
+            )
+        units = self._units()
+        for name, unit in units.items():
+            timeseries.check_column(name, unit)
+        for name in ("machine", "task"):
+            text = getattr(self, name)
+            if text != text.strip() or not text.isprintable():
+                raise RecordingError(f"{name} {text!r} is not one line of text, give one")
+
+    def _check_values(self) -> None:
+        if not len(self.time):
+            raise RecordingError("no samples, give at least one")
+        for name, values in zip(self._names(), self._values().T, strict=True):
+            if not np.isfinite(values).all():
+                sample = int(np.argmin(np.isfinite(values)))
+                raise RecordingError(
+                    f"'{name}' is {values[sample]} at sample {sample}, give finite numbers"
+                )
+        if (back := np.diff(self.time) <= 0).any():
+            sample = int(np.argmax(back)) + 1
+            before, now = self.time[sample - 1 : sample + 1]
+            raise RecordingError(
+                f"time goes from {before} to {now} s at sample {sample}, "
+                f"give strictly increasing times"
+            )
+
+    def _names(self) -> list[str]:
+        """Names of all columns, in the order in which they are written."""
+        joints = [x + suffix for suffix in ("", _VELOCITY, _FORCE) for x in self.joints]
+        return [TIME, *joints, *self.channels]
+
+    def _units(self) -> dict[str, str]:
+        """Units of all columns.
+
+        Raises:
+            RecordingError: A joint has a unit other than rad or m.
+        """
+        for joint, unit in self.units.items():
+            _check_unit(joint, unit, VELOCITY_UNITS)
+        return (
+            {TIME: "s"}
+            | self.units
+            | {x + _VELOCITY: VELOCITY_UNITS[unit] for x, unit in self.units.items()}
+            | {x + _FORCE: FORCE_UNITS[unit] for x, unit in self.units.items()}
+            | self.channel_units
+        )
+
+    def _values(self) -> Array:
+        """All columns (N, 1 + 3 n + channels)."""
+        return np.column_stack([self.time, self.q, self.v, self.tau, *self.channels.values()])
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the recording as CSV, whole or not at all.
+
+        Raises:
+            OutputError: It cannot be written there.
+        """
+        notes = {"crane recording": "", "machine": self.machine, "task": self.task}
+        timeseries.write(path, Table(self._units(), self._values(), notes))
+
+    @classmethod
+    def from_csv(cls, path: str | Path) -> "Recording":
+        """Read a recording.
+
+        Raises:
+            RecordingError: The file does not exist or is not such a CSV; the message names the
+                file, the line or column, and what to change.
+        """
+        table = timeseries.read(path)
+        try:
+            return cls._from_table(table)
+        except RecordingError as error:
+            raise RecordingError(f"{path}: {error}") from None
+
+    @classmethod
+    def _from_table(cls, table: Table) -> "Recording":
+        units, column = table.units, dict(zip(table.units, table.values.T, strict=True))
+        joints = _find_joints(list(units))
+        for joint in joints:
+            _check_unit(joint, unit := units[joint], VELOCITY_UNITS)
+            _check_unit(joint + _VELOCITY, units[joint + _VELOCITY], [VELOCITY_UNITS[unit]])
+            _check_unit(joint + _FORCE, units[joint + _FORCE], [FORCE_UNITS[unit]])
+        q, v, tau = (
+            np.column_stack([column[x + suffix] for x in joints])
+            for suffix in ("", _VELOCITY, _FORCE)
+        )
+        used = {TIME} | {x + suffix for x in joints for suffix in ("", _VELOCITY, _FORCE)}
+        channels = {x: values for x, values in column.items() if x not in used}
+        return cls(
+            time=column[TIME],
+            joints=joints,
+            q=q,
+            v=v,
+            tau=tau,
+            units={x: units[x] for x in joints},
+            channels=channels,
+            channel_units={x: units[x] for x in channels},
+            machine=table.notes.get("machine", ""),
+            task=table.notes.get("task", ""),
+        )
+
+
+def _array(
+    what: str, value: ArrayLike, shape: tuple[int, ...], names: Sequence[str] = ()
+) -> Array:
+    """A float64 copy of that shape."""
+    try:
+        array = np.array(value, dtype=np.float64, order="C")
+    except (TypeError, ValueError):
+        raise RecordingError(f"{what} is not an array of numbers, give {shape}") from None
+    if array.shape != shape:
+        columns = f", a column each for {_listed(names)}" if names else ""
+        raise RecordingError(f"{what} has the shape {array.shape}, give {shape}{columns}")
+    return array
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names) or "none"
+
+
+def _find_joints(names: Sequence[str]) -> tuple[str, ...]:
+    """The active joints among the columns, by the rule in the module's docstring."""
+    stems = dict.fromkeys(names)
+    for suffix in (_VELOCITY, _FORCE):
+        stems |= dict.fromkeys(x.removesuffix(suffix) for x in names if x.endswith(suffix))
+    joints = []
+    for stem in stems:
+        parts = (stem, stem + _VELOCITY, stem + _FORCE)
+        missing = [part for part in parts if part not in names]
+        if not missing:
+            joints.append(stem)
+        elif len(missing) == 1:
+            there = _listed(part for part in parts if part in names)
+            raise RecordingError(
+                f"column '{missing[0]}' is missing beside {there}, "
+                f"add it, or rename those if '{stem}' is not an active joint"
+            )
+    if not joints:
+        raise RecordingError(
+            f"no active joint among the columns {_listed(names)}, give for each joint "
+            f"its displacement, velocity and force, as in q1, q1{_VELOCITY}, q1{_FORCE}"
+        )
+    return tuple(joints)
+
+
+def _check_unit(column: str, unit: str, allowed: Iterable[str]) -> None:
+    if unit not in allowed:
+        found = f"is in [{unit}]" if unit else "has no unit"
+        wanted = " or ".join(f"'{column} [{x}]'" for x in allowed)
+        raise RecordingError(f"column '{column}' {found}, give {wanted}")

@@ -1,0 +1,68 @@
+"""One sample (n,) or a stack of them (N, n): every public function takes both."""
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from crane.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+def as_samples(value: ArrayLike, size: int, what: str, names: Sequence[str] = ()) -> Array:
+    """A finite float64 array (size,) or (N, size).
+
+    Args:
+        value: What the user gave.
+        size: Length of one sample.
+        what: Its name, for errors.
+        names: Names of the columns, for errors.
+
+    Raises:
+        InputError: Wrong shape, not numbers, or not finite.
+    """
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} is not an array of numbers, give {size} per sample") from None
+    if array.ndim not in (1, 2) or array.shape[-1] != size:
+        columns = f" ({', '.join(names)})" if names else ""
+        raise InputError(
+            f"{what} has the shape {array.shape}, give ({size},) or (N, {size}){columns}"
+        )
+    bad = ~np.isfinite(array)
+    if bad.any():
+        index = tuple(int(i) for i in np.argwhere(bad)[0])
+        column = names[index[-1]] if names else f"column {index[-1]}"
+        sample = f" of sample {index[0]}" if len(index) == 2 else ""
+        raise InputError(f"{what} is {array[index]} at {column}{sample}, give finite numbers")
+    return array
+
+
+def per_sample(function: Callable[..., Array], *arrays: Array) -> Array:
+    """Apply a function of single samples to single samples or row by row to stacks.
+
+    Single samples among stacks hold for every row.
+
+    Raises:
+        InputError: The stacks differ in length.
+    """
+    lengths = {len(array) for array in arrays if array.ndim == 2}
+    if not lengths:
+        return function(*arrays)
+    if len(lengths) > 1:
+        raise InputError(f"stacks of {sorted(lengths)} samples do not go together, give equal N")
+    (count,) = lengths
+    rows: Iterable[Array] = (
+        function(*(array[i] if array.ndim == 2 else array for array in arrays))
+        for i in range(count)
+    )
+    first = next(iter(rows), None)
+    if first is None:
+        raise InputError("the stack is empty, give at least one sample")
+    out = np.empty((count, *np.shape(first)))
+    out[0] = first
+    for i, row in enumerate(rows, start=1):
+        out[i] = row
+    return out

@@ -1,0 +1,241 @@
+"""Motion in time: Runge-Kutta of fourth order on the active coordinates."""
+
+import warnings
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.control import Controller, Feedback
+from crane.dynamics import Dynamics
+from crane.errors import ClosureError, CraneWarning, InputError, SimulationError
+from crane.kinematics import Kinematics
+from crane.machine import Machine
+from crane.recording import Recording
+from crane.samples import Array, as_samples
+
+Force = Callable[[float, Array, Array], Array]
+Progress = Callable[[float], None]
+
+
+def simulate(
+    machine: Machine,
+    controller: Controller | Force | None = None,
+    initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
+    duration: float | None = None,
+    step: float = 1e-3,
+    *,
+    task: str = "",
+    progress: Progress | None = None,
+) -> Recording:
+    """Simulate a machine with its friction, passive forces and end stops.
+
+    M_A a_A = tau_A - bias - friction, integrated as an ordinary differential equation in
+    (q_A, v_A), the controller's states and the energies by the classical fourth-order
+    Runge-Kutta method with a fixed step (as the reduced-scale forwarder paper does). The loops
+    are closed to rounding in every stage.
+
+    Args:
+        machine: The machine.
+        controller: A controller, a function (t, q_a, v_a) -> tau_a, or None for no force.
+        initial: Active coordinates (n,) to start at rest from, or a pair (q_a, v_a); the start of
+            the controller's path, at rest, or else the home posture.
+        duration: [s]; that of the controller's path if not given.
+        step: [s].
+        task: Name to put into the recording.
+        progress: Called with the finished share, 0 to 1.
+
+    Returns:
+        Recording with channels for every passive joint, the tip, the references of the path,
+        friction_<joint>, and the energies kinetic, potential, work (of the active forces) and
+        dissipated [J]; work = change of (kinetic + potential) + dissipated.
+
+    Raises:
+        InputError: Arguments of wrong shape or value.
+        LimitError: The start lies outside of the limits.
+        SimulationError: The machine reached a posture it cannot go on from.
+    """
+    control = _as_controller(controller, machine)
+    path = control.path if control is not None else None
+    if duration is None:
+        if path is None:
+            raise InputError("no duration and no path to take it from, give a duration")
+        duration = path.duration
+    steps = _count(duration, step)
+    q_a, v_a = _start(machine, initial, path)
+    run = _Run(machine, control)
+    state = np.concatenate([q_a, v_a, np.zeros(run.controller_states + 2)])
+    states = np.empty((steps + 1, len(state)))
+    forces = np.empty((steps + 1, len(q_a)))
+    observed: list[tuple[Array, Array, tuple[float, float]]] = []  # q, friction, energies
+    for i in range(steps + 1):
+        time = i * step
+        states[i] = state
+        try:
+            rate, forces[i] = run.rate(time, state)
+            observed.append(run.observe())
+            if i < steps:
+                state = run.advance(time, state, rate, step)
+        except ClosureError as error:
+            raise SimulationError(f"at t = {time:.6g} s: {error}") from None
+        if not np.isfinite(state).all():
+            raise SimulationError(
+                f"at t = {time + step:.6g} s the state is not finite any more: the step of "
+                f"{step:g} s is too long for this machine, shorten it"
+            )
+        if progress is not None:
+            progress((i + 1) / (steps + 1))
+    return _recording(machine, path, step, states, observed, forces, task)
+
+
+class _Run:
+    """The right-hand side of the state (q_A, v_A, controller's states, work, dissipated)."""
+
+    def __init__(self, machine: Machine, control: Controller | None):
+        self.machine, self.control = machine, control
+        self.dynamics = Dynamics(machine)
+        self.size = len(machine.active)
+        self.controller_states = control.states if control is not None else 0
+        self.motion = self.dynamics.motion(np.array(machine.home), np.zeros(self.size))
+
+    def rate(self, time: float, state: Array) -> tuple[Array, Array]:
+        """Time derivative of the state, and the active forces (n,)."""
+        n = self.size
+        q_a, v_a = state[:n], state[n : 2 * n]
+        own = state[2 * n : 2 * n + self.controller_states]
+        if self.control is None:
+            tau, own_rate = np.zeros(n), own
+        else:
+            tau, own_rate = self.control(time, q_a, v_a, own)
+        q = self.machine.closure.solve(q_a, guess=self.motion.q)
+        self.motion = self.dynamics.motion(q, v_a)
+        a_a = self.dynamics.accelerate(self.motion, tau, friction=True)
+        powers = [tau @ v_a, self.dynamics.dissipation(self.motion)]
+        return np.concatenate([v_a, a_a, own_rate, powers]), tau
+
+    def observe(self) -> tuple[Array, Array, tuple[float, float]]:
+        """Posture, active friction forces and energies where `rate` was last asked."""
+        q, v = self.motion.q, self.motion.v
+        friction = self.motion.gamma.T @ self.dynamics.forces.friction(v)
+        return q, friction, self.dynamics.energy_at(q, v)
+
+    def advance(self, time: float, state: Array, first: Array, step: float) -> Array:
+        """One step of the classical Runge-Kutta method, its first stage given."""
+        half = step / 2
+        second, _ = self.rate(time + half, state + half * first)
+        third, _ = self.rate(time + half, state + half * second)
+        fourth, _ = self.rate(time + step, state + step * third)
+        return state + step / 6 * (first + 2 * second + 2 * third + fourth)
+
+
+def _as_controller(
+    controller: Controller | Force | None, machine: Machine
+) -> Controller | None:
+    if controller is None or hasattr(controller, "states"):
+        return controller  # type: ignore[return-value]
+    if not callable(controller):
+        raise InputError(
+            f"the controller is a {type(controller).__name__}, give a function (t, q_a, v_a) -> "
+            "tau_a or a controller object"
+        )
+    return Feedback(controller, machine)
+
+
+def _count(duration: float, step: float) -> int:
+    for name, value in (("duration", duration), ("step", step)):
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"the {name} is {value} s, give a positive number")
+    steps = round(duration / step)
+    if steps < 1 or abs(steps * step - duration) > 1e-9 * duration:
+        raise InputError(
+            f"the duration {duration:g} s is no whole number of steps of {step:g} s, change one"
+        )
+    return steps
+
+
+def _start(
+    machine: Machine, initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None, path: object
+) -> tuple[Array, Array]:
+    size, rest = len(machine.active), np.zeros(len(machine.active))
+    if initial is None:
+        if callable(path):
+            return machine.check_limits(path(0.0)[0], "the start of the path"), rest
+        return np.array(machine.home[machine.closure.active]), rest
+    if isinstance(initial, tuple) and len(initial) == 2 and np.ndim(initial[0]) == 1:
+        q_a = machine.check_limits(initial[0], "initial q_a")
+        v_a = as_samples(initial[1], size, "initial v_a", machine.active)
+    else:
+        q_a, v_a = machine.check_limits(initial, "initial"), rest  # type: ignore[arg-type]
+    if q_a.ndim != 1 or v_a.ndim != 1:
+        raise InputError(f"initial is a stack, give one sample ({size},)")
+    return q_a, v_a
+
+
+def _recording(
+    machine: Machine,
+    path: object,
+    step: float,
+    states: Array,
+    observed: list[tuple[Array, Array, tuple[float, float]]],
+    forces: Array,
+    task: str,
+) -> Recording:
+    n = len(machine.active)
+    postures, friction, energies = (np.array(part) for part in zip(*observed, strict=True))
+    time = step * np.arange(len(states))
+    q_a, v_a = states[:, :n], states[:, n : 2 * n]
+    _warn_of_limits(machine, time, q_a)
+    channels: dict[str, Array] = {}
+    units: dict[str, str] = {}
+
+    def add(name: str, values: Array, unit: str) -> None:
+        channels[name], units[name] = values, unit
+
+    for column in machine.closure.passive:
+        joint = machine.joints[column]
+        add(joint, postures[:, column], machine.unit(joint))
+    if machine.tip is not None:
+        kinematics = Kinematics(machine)
+        tip = np.array([kinematics.position_at(q) for q in postures])
+        for axis, values in zip("xyz", tip.T, strict=True):
+            add(f"tip_{axis}", values, "m")
+    if path is not None and callable(path):
+        reference, reference_rate, _ = path(time)
+        for i, joint in enumerate(machine.active):
+            add(f"reference_{joint}", reference[:, i], machine.unit(joint))
+            rate_unit = machine.unit(joint) + "/s"
+            add(f"reference_velocity_{joint}", reference_rate[:, i], rate_unit)
+        if (tip_reference := getattr(path, "tip", None)) is not None:
+            for axis, values in zip("xyz", tip_reference(time)[0].T, strict=True):
+                add(f"reference_tip_{axis}", values, "m")
+    for i, joint in enumerate(machine.active):
+        add(f"friction_{joint}", friction[:, i], "N" if machine.unit(joint) == "m" else "N m")
+    add("kinetic", energies[:, 0], "J")
+    add("potential", energies[:, 1], "J")
+    add("work", states[:, -2], "J")
+    add("dissipated", states[:, -1], "J")
+    return Recording(
+        time=time,
+        joints=machine.active,
+        q=q_a,
+        v=v_a,
+        tau=forces,
+        units={joint: machine.unit(joint) for joint in machine.active},
+        channels=channels,
+        channel_units=units,
+        machine=machine.reference,
+        task=task,
+    )
+
+
+def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
+    stopped = {stop.joint for stop in machine.end_stops}
+    for i, joint in enumerate(machine.active):
+        outside = (q_a[:, i] < machine.lower[i]) | (q_a[:, i] > machine.upper[i])
+        if outside.any() and joint not in stopped:
+            warnings.warn(
+                f"'{joint}' leaves its limits {machine.lower[i]:g} to {machine.upper[i]:g} at "
+                f"t = {time[outside.argmax()]:.4g} s, it has no end stop",
+                CraneWarning,
+                stacklevel=4,
+            )

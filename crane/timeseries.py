@@ -1,0 +1,191 @@
+"""Time series as a CSV: a table of columns with names and units, the first of them time.
+
+Comment lines `# key: value`, then one header row `time [s],name [unit],...`, then one row per
+sample. A unit may be left out, for all columns but time. Numbers are written with the fewest
+digits that give the same float64 again.
+"""
+
+import csv
+import re
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crane.errors import RecordingError
+from crane.output import replacing
+
+Array = NDArray[np.float64]
+
+TIME = "time"
+_WORD = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
+_HEADING = re.compile(r"\s*([^\[\]]*?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*")
+_ROWS_AT_ONCE = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Columns of a file.
+
+    Attributes:
+        units: Unit of each column by its name, in the order of the columns; "" where not given.
+        values: Samples (N, columns).
+        notes: Comment lines by their key.
+    """
+
+    units: dict[str, str]
+    values: Array
+    notes: dict[str, str]
+
+
+def check_column(name: str, unit: str) -> None:
+    """See that a header can hold this name and unit.
+
+    Raises:
+        RecordingError: It cannot.
+    """
+    words = {"name": name, "unit": unit} if unit else {"name": name}
+    for what, text in words.items():
+        if not _WORD.fullmatch(text) or not text.isprintable():
+            raise RecordingError(
+                f"column '{name}': {text!r} cannot be the {what} of a column, "
+                f"use no commas, brackets, quotes or outer blanks"
+            )
+
+
+def write(path: str | Path, table: Table) -> None:
+    """Write a table, whole or not at all.
+
+    Raises:
+        OutputError: It cannot be written there.
+    """
+    head = [f"# {key}: {value}" if value else f"# {key}" for key, value in table.notes.items()]
+    head.append(",".join(f"{x} [{unit}]" if unit else x for x, unit in table.units.items()))
+    with replacing(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
+        file.write("\n".join(head) + "\n")
+        for start in range(0, len(table.values), _ROWS_AT_ONCE):
+            rows = table.values[start : start + _ROWS_AT_ONCE].tolist()
+            file.write("".join([",".join(map(repr, row)) + "\n" for row in rows]))
+
+
+def read(path: str | Path) -> Table:
+    """Read a table: columns named once, finite numbers, time strictly increasing.
+
+    Raises:
+        RecordingError: The file does not exist or is not such a table; the message names the
+            file, the line or column, and what to change.
+    """
+    path = Path(path)
+    try:
+        notes, heading, line = _head(path)
+        units = _units(heading)
+        return Table(units, _values(path, line, list(units)), notes)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: is not text, give a CSV in UTF-8") from None
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(f"{path}: {reason}, give the path of a CSV file") from None
+
+
+def _head(path: Path) -> tuple[dict[str, str], str, int]:
+    """Notes, the header row, and its line number."""
+    notes: dict[str, str] = {}
+    with path.open(encoding="utf-8-sig") as file:
+        for line, text in enumerate(file, start=1):
+            text = text.strip()
+            if text.startswith("#"):
+                key, _, value = text.removeprefix("#").partition(":")
+                notes[key.strip()] = value.strip()
+            elif text:
+                return notes, text, line
+    raise RecordingError("is empty, write a header row and one row per sample")
+
+
+def _units(heading: str) -> dict[str, str]:
+    """Names and units of the columns from the header row."""
+    cells = next(csv.reader([heading]))
+    if all(_number(cell) is not None for cell in cells):
+        raise RecordingError(
+            "has no header, name the columns in the first row (without '#'), "
+            "as in 'time [s],q1 [rad],q1_velocity [rad/s],q1_force [N m]'"
+        )
+    units: dict[str, str] = {}
+    for position, cell in enumerate(cells, start=1):
+        match = _HEADING.fullmatch(cell)
+        if match is None or not match[1]:
+            raise RecordingError(f"column {position} is headed '{cell}', write 'name [unit]'")
+        name, unit = match[1], match[2] or ""
+        if name in units:
+            raise RecordingError(f"column '{name}' is there twice, rename or remove one")
+        check_column(name, unit)
+        units[name] = unit
+    if TIME not in units:
+        other = next((x for x in ";\t" if heading.count(x) > heading.count(",")), None)
+        hint = f"separate columns by commas, not {other!r}" if other else f"add '{TIME} [s]'"
+        raise RecordingError(f"no column '{TIME}' in the header, {hint}")
+    if units[TIME] != "s":
+        found = f"is in [{units[TIME]}]" if units[TIME] else "has no unit"
+        raise RecordingError(f"column '{TIME}' {found}, give '{TIME} [s]'")
+    return units
+
+
+def _values(path: Path, header: int, names: Sequence[str]) -> Array:
+    """Numbers (N, columns) below the header row, which is line `header`."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about a file without samples
+            values = np.loadtxt(
+                path, delimiter=",", comments=None, skiprows=header, ndmin=2, encoding="utf-8"
+            )
+    except ValueError as error:
+        _find_fault(path, header, names)
+        raise RecordingError(f"{error}, correct the file") from None
+    if not values.size:
+        raise RecordingError("has a header and no samples, write one row per sample")
+    if (
+        values.shape[1] != len(names)
+        or not np.isfinite(values).all()
+        or (np.diff(values[:, names.index(TIME)]) <= 0).any()
+    ):
+        _find_fault(path, header, names)
+    return values
+
+
+def _number(cell: str) -> float | None:
+    try:
+        return float(cell) if "_" not in cell else None
+    except ValueError:
+        return None
+
+
+def _find_fault(path: Path, header: int, names: Sequence[str]) -> None:
+    """Raise an error about the first line that is wrong."""
+    last = -np.inf
+    with path.open(encoding="utf-8-sig") as file:
+        for line, text in enumerate(file, start=1):
+            if line <= header or not text.strip():
+                continue
+            cells = text.rstrip("\n").split(",")
+            if len(cells) != len(names):
+                raise RecordingError(
+                    f"line {line} has {len(cells)} cells, give {len(names)} as in the header"
+                )
+            for name, cell in zip(names, cells, strict=True):
+                value = _number(cell)
+                if value is None or not np.isfinite(value):
+                    raise RecordingError(
+                        f"line {line}, column '{name}': '{cell.strip()}' is not a finite number, "
+                        f"correct or remove the line"
+                    )
+            now = float(cells[names.index(TIME)])
+            if now <= last:
+                raise RecordingError(
+                    f"line {line}: time goes from {last} to {now} s, "
+                    f"give strictly increasing times"
+                )
+            last = now

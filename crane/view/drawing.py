@@ -1,0 +1,100 @@
+"""Meshcat's commands for shapes, lines, the ground and motion, kept instead of sent."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from crane.samples import Array
+from crane.view.visuals import Box, Cylinder, Mesh, Sphere, Visual
+
+_SKY, _HAZE, _GRID = [0.80, 0.87, 0.93], [0.97, 0.97, 0.95], 0xB4BAC0
+_UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+
+
+@dataclass
+class Recorder:
+    """Stands in for meshcat's window: no server, no port, only a list of commands."""
+
+    commands: list[dict[str, Any]] = field(default_factory=list)
+
+    def send(self, command: Any) -> None:
+        """Keep a command."""
+        self.commands.append(command.lower())
+
+
+def draw_visuals(viewer: Any, visuals: Sequence[Visual]) -> None:
+    """Put the visuals of each link into the group of that link."""
+    import meshcat.geometry as g
+
+    for index, visual in enumerate(visuals):
+        red, green, blue, opacity = (min(max(value, 0.0), 1.0) for value in visual.colour)
+        colour = (round(255 * red) << 16) + (round(255 * green) << 8) + round(255 * blue)
+        placement = visual.placement
+        match visual.shape:
+            case Box(size):
+                geometry = g.Box(list(size))
+            case Cylinder(radius, length):
+                geometry = g.Cylinder(length, radius)
+                placement = placement @ _UPRIGHT  # meshcat's cylinder lies along y
+            case Sphere(radius):
+                geometry = g.Sphere(radius)
+            case Mesh(vertices, faces):
+                geometry = g.TriangularMeshGeometry(vertices, faces)
+        shape = viewer[visual.link][f"visual_{index}"]
+        shape.set_object(geometry, g.MeshPhongMaterial(color=colour, opacity=opacity))
+        shape.set_transform(placement)
+
+
+def draw_line(viewer: Any, points: Array, colour: int) -> None:
+    """Draw a line through points (N, 3)."""
+    import meshcat.geometry as g
+
+    viewer.set_object(g.Line(_points(points), g.LineBasicMaterial(color=colour)))
+    viewer["<object>"].set_property("castShadow", False)
+
+
+def draw_surroundings(viewer: Any, lower: Array, upper: Array) -> None:
+    """Background and a grid with round spacing on the ground, around a box (3,), (3,)."""
+    import meshcat.geometry as g
+
+    viewer["/Background"].set_property("top_color", _SKY)
+    viewer["/Background"].set_property("bottom_color", _HAZE)
+    viewer["/Grid"].set_property("visible", False)
+    viewer["/Axes"].set_property("visible", False)
+    size = float(np.linalg.norm(upper - lower))
+    decade = 10.0 ** np.floor(np.log10(size / 12))
+    spacing = decade * min((1, 2, 5, 10), key=lambda step: abs(np.log(12 * step * decade / size)))
+    count = int(np.ceil(size / spacing))
+    ticks, end = np.arange(-count, count + 1) * spacing, count * spacing
+    along = np.array([[(tick, -end), (tick, end)] for tick in ticks]).reshape(-1, 2)
+    centre = np.round((lower + upper)[:2] / 2 / spacing) * spacing
+    level = np.concatenate([along, along[:, ::-1]]) + centre
+    points = np.column_stack([level, np.full(len(level), lower[2])])
+    viewer.set_object(g.LineSegments(_points(points), g.LineBasicMaterial(color=_GRID)))
+    viewer["<object>"].set_property("castShadow", False)
+
+
+def animate(viewer: Any, poses: Mapping[str, Array], time: Array) -> None:
+    """Move the group of each link through poses (N, 4, 4) at times (N,) [s], again and again."""
+    from meshcat.animation import Animation, AnimationClip, AnimationTrack
+
+    keys = time.tolist()  # one "frame" per second, so that keys are times
+    animation = Animation()
+    for link, pose in poses.items():
+        positions = pose[:, :3, 3].tolist()
+        turns = [pin.Quaternion(matrix[:3, :3]).coeffs().tolist() for matrix in pose]
+        tracks = {
+            "position": AnimationTrack("position", "vector3", keys, positions),
+            "quaternion": AnimationTrack("quaternion", "quaternion", keys, turns),
+        }
+        animation.clips[viewer[link].path] = AnimationClip(tracks, fps=1)
+    viewer.set_animation(animation, play=True, repetitions=10**6)
+
+
+def _points(points: Array) -> Any:
+    import meshcat.geometry as g
+
+    return g.PointsGeometry(np.ascontiguousarray(points.T, dtype=np.float32))

@@ -1,0 +1,205 @@
+"""What the URDFs of a machine look like: primitives and meshes with colours."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from crane.errors import CraneWarning
+from crane.machine import Machine
+from crane.samples import Array
+
+Colour = tuple[float, float, float, float]
+
+PLAIN: Colour = (0.62, 0.64, 0.67, 1.0)  # where a URDF names no colour
+
+
+@dataclass(frozen=True)
+class Box:
+    """Box about the origin, edges (3,) [m]."""
+
+    size: tuple[float, float, float]
+
+    @property
+    def half(self) -> Array:
+        """(3,) half edges of the box that encloses it."""
+        return np.array(self.size) / 2
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """Cylinder about the origin along z [m]."""
+
+    radius: float
+    length: float
+
+    @property
+    def half(self) -> Array:
+        """(3,) half edges of the box that encloses it."""
+        return np.array([self.radius, self.radius, self.length / 2])
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """Sphere about the origin [m]."""
+
+    radius: float
+
+    @property
+    def half(self) -> Array:
+        """(3,) half edges of the box that encloses it."""
+        return np.full(3, self.radius)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles: vertices (V, 3) [m], faces (F, 3)."""
+
+    vertices: Array
+    faces: np.ndarray
+
+    @property
+    def half(self) -> Array:
+        """(3,) half edges of the box about the origin that encloses it."""
+        return np.abs(self.vertices).max(axis=0)
+
+
+Shape = Box | Cylinder | Sphere | Mesh
+
+
+@dataclass(frozen=True)
+class Visual:
+    """One coloured shape on a link.
+
+    Attributes:
+        link: Name of the link.
+        shape: What is drawn.
+        placement: (4, 4) pose of the shape in the link's frame.
+        colour: Red, green, blue, opacity, 0 to 1.
+    """
+
+    link: str
+    shape: Shape
+    placement: Array
+    colour: Colour
+
+    def corners(self) -> Array:
+        """(8, 3) corners, in the link's frame, of a box that encloses the shape."""
+        signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(8, 3)
+        return signs * self.shape.half @ self.placement[:3, :3].T + self.placement[:3, 3]
+
+
+def read_visuals(machine: Machine) -> list[Visual]:
+    """The visuals of every link, or a skeleton where no URDF has any.
+
+    Meshes whose files are missing are left out with a warning.
+    """
+    import yourdfpy
+
+    visuals: list[Visual] = []
+    missing: list[str] = []
+    for chain in machine.chains:
+        robot = yourdfpy.URDF.load(
+            str(chain.urdf),
+            build_scene_graph=False,
+            build_collision_scene_graph=False,
+            load_meshes=False,
+        ).robot
+        colours = {m.name: _colour(m) for m in robot.materials}
+        for link in robot.links:
+            for visual in link.visuals:
+                placement = np.eye(4) if visual.origin is None else visual.origin
+                named = visual.material
+                colour = None if named is None else _colour(named) or colours.get(named.name)
+                for shape, own in _shapes(visual.geometry, chain.urdf, missing):
+                    visuals.append(Visual(link.name, shape, placement, colour or own or PLAIN))
+    if missing:
+        warnings.warn(
+            f"{machine.name}: {len(missing)} mesh files are not there and are left out "
+            f"({missing[0]}), install the package that has them",
+            CraneWarning,
+            stacklevel=2,
+        )
+    return visuals or skeleton(machine)
+
+
+def skeleton(machine: Machine) -> list[Visual]:
+    """Bars from joint to joint and on to the tip: a machine without visuals."""
+    model = machine.model
+    links: dict[int, str] = {}  # joint -> the link that it moves
+    for frame in model.frames:
+        if frame.type == pin.FrameType.BODY:
+            links.setdefault(frame.parentJoint, frame.name)
+    bars = [
+        (model.parents[j], model.jointPlacements[j].translation) for j in range(1, model.njoints)
+    ]
+    if machine.tip is not None:
+        tip = model.frames[machine.frame(machine.tip)]
+        bars.append((tip.parentJoint, tip.placement.translation))
+    radius = 0.03 * max((float(np.linalg.norm(end)) for _, end in bars), default=0.0) or 0.02
+    visuals = [Visual(links[0], Sphere(1.5 * radius), np.eye(4), PLAIN)]
+    for body, end in bars:
+        inverse = model.frames[machine.frame(links[body])].placement.inverse()
+        start, end = inverse.translation, inverse.act(end)
+        length = float(np.linalg.norm(end - start))
+        turn = pin.Quaternion.FromTwoVectors(pin.ZAxis, end - start) if length else None
+        ball, bar = np.eye(4), np.eye(4)
+        ball[:3, 3] = end
+        bar[:3, 3] = (start + end) / 2
+        visuals.append(Visual(links[body], Sphere(1.5 * radius), ball, PLAIN))
+        if turn is not None:
+            bar[:3, :3] = turn.matrix()
+            visuals.append(Visual(links[body], Cylinder(radius, length), bar, PLAIN))
+    return visuals
+
+
+def _colour(material: Any) -> Colour | None:
+    if material.color is None:
+        return None
+    red, green, blue, opacity = (float(value) for value in material.color.rgba)
+    return red, green, blue, opacity
+
+
+def _shapes(geometry: Any, urdf: Path, missing: list[str]) -> list[tuple[Shape, Colour | None]]:
+    """The shapes of a geometry, each with its own colour if its file has one."""
+    if geometry.box is not None:
+        x, y, z = (float(value) for value in geometry.box.size)
+        return [(Box((x, y, z)), None)]
+    if geometry.cylinder is not None:
+        cylinder = geometry.cylinder
+        return [(Cylinder(float(cylinder.radius), float(cylinder.length)), None)]
+    if geometry.sphere is not None:
+        return [(Sphere(float(geometry.sphere.radius)), None)]
+    return _meshes(geometry.mesh, urdf, missing)
+
+
+def _meshes(mesh: Any, urdf: Path, missing: list[str]) -> list[tuple[Shape, Colour | None]]:
+    import trimesh
+    from yourdfpy.urdf import filename_handler_magic
+
+    file = Path(filename_handler_magic(mesh.filename, dir=str(urdf.parent)))
+    if not file.is_file():
+        missing.append(mesh.filename)
+        return []
+    # unmerged vertices keep the edges of the drawing sharp
+    scene = trimesh.load_scene(file, process=False)
+    scale = np.eye(4)
+    scale[:3, :3] *= 1.0 if mesh.scale is None else np.asarray(mesh.scale, dtype=float)
+    found: list[tuple[Shape, Colour | None]] = []
+    for node in scene.graph.nodes_geometry:
+        placement, name = scene.graph[node]
+        part = scene.geometry[name]
+        if not isinstance(part, trimesh.Trimesh):
+            continue
+        vertices = trimesh.transform_points(part.vertices, scale @ placement)
+        look: Any = part.visual
+        colour = None
+        if look.defined:
+            painted = getattr(look, "material", look)
+            red, green, blue, opacity = (float(value) / 255 for value in painted.main_color)
+            colour = (red, green, blue, opacity)
+        found.append((Mesh(vertices, np.asarray(part.faces)), colour))
+    return found
