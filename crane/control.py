@@ -4,13 +4,14 @@ from collections.abc import Callable, Mapping
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from crane.description import PIGains
 from crane.dynamics import Dynamics
 from crane.errors import InputError, known
 from crane.machine import Machine
 from crane.paths import Path
-from crane.samples import Array
+from crane.samples import Array, as_samples
 
 
 class Controller(Protocol):
@@ -18,11 +19,12 @@ class Controller(Protocol):
 
     Attributes:
         path: The reference motion, or None.
-        states: Number of the controller's own states, integrated with the machine's.
     """
 
     path: Path | None
-    states: int
+
+    def start(self, q_a: Array) -> Array:
+        """The controller's own states (k,) at the start, integrated with the machine's."""
 
     def __call__(
         self, time: float, q_a: Array, v_a: Array, state: Array
@@ -39,12 +41,21 @@ class PI:
         machine: The machine.
         path: Reference of the active joints.
         gains: By active joint; those of the machine file if not given.
+        integral: (n,) int e dt at the start [m s], [rad s]. If not given, it carries the
+            machine's weight, as it does when a machine under control stands still; with zeros
+            the machine falls until the integrals have grown.
 
     Raises:
         InputError: No gains for a joint.
     """
 
-    def __init__(self, machine: Machine, path: Path, gains: Mapping[str, PIGains] | None = None):
+    def __init__(
+        self,
+        machine: Machine,
+        path: Path,
+        gains: Mapping[str, PIGains] | None = None,
+        integral: ArrayLike | None = None,
+    ):
         gains = machine.control if gains is None else gains
         for joint in machine.active:
             if joint not in gains:
@@ -53,10 +64,23 @@ class PI:
                     "under 'control' of the machine file"
                 )
         self.path: Path | None = path
-        self.states = len(machine.active)
-        self._reference = path
+        self._machine, self._reference = machine, path
+        names = machine.active
+        self._integral = (
+            None if integral is None else as_samples(integral, len(names), "integral", names)
+        )
         self._kp = np.array([gains[joint].kp for joint in machine.active])
         self._ki = np.array([gains[joint].ki for joint in machine.active])
+
+    def start(self, q_a: Array) -> Array:
+        """See `Controller`."""
+        if self._integral is not None:
+            return self._integral
+        rest = np.zeros_like(q_a)
+        weight = Dynamics(self._machine).inverse(q_a, rest, rest, friction=True)
+        error = self._reference(0.0)[0] - q_a
+        able = self._ki > 0
+        return np.where(able, weight - self._kp * error, 0.0) / np.where(able, self._ki, 1.0)
 
     def __call__(
         self, time: float, q_a: Array, v_a: Array, state: Array
@@ -81,9 +105,12 @@ class ComputedTorque:
         if not (np.isfinite(bandwidth) and bandwidth > 0):
             raise InputError(f"the bandwidth is {bandwidth} rad/s, give a positive number")
         self.path: Path | None = path
-        self.states = 0
         self._reference, self._bandwidth = path, bandwidth
         self._dynamics = Dynamics(machine)
+
+    def start(self, q_a: Array) -> Array:
+        """See `Controller`."""
+        return np.zeros(0)
 
     def __call__(
         self, time: float, q_a: Array, v_a: Array, state: Array
@@ -106,8 +133,11 @@ class Feedback:
 
     def __init__(self, function: Callable[[float, Array, Array], Array], machine: Machine):
         self.path: Path | None = None
-        self.states = 0
         self._function, self._active = function, machine.active
+
+    def start(self, q_a: Array) -> Array:
+        """See `Controller`."""
+        return np.zeros(0)
 
     def __call__(
         self, time: float, q_a: Array, v_a: Array, state: Array

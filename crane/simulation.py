@@ -7,12 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.control import Controller, Feedback
-from crane.dynamics import Dynamics
+from crane.dynamics import Dynamics, Motion
 from crane.errors import ClosureError, CraneWarning, InputError, SimulationError
 from crane.kinematics import Kinematics
 from crane.machine import Machine
 from crane.recording import Recording
 from crane.samples import Array, as_samples
+
+_IMBALANCE = 1e-3
 
 Force = Callable[[float, Array, Array], Array]
 Progress = Callable[[float], None]
@@ -32,8 +34,9 @@ def simulate(
 
     M_A a_A = tau_A - bias - friction, integrated as an ordinary differential equation in
     (q_A, v_A), the controller's states and the energies by the classical fourth-order
-    Runge-Kutta method with a fixed step (as the reduced-scale forwarder paper does). The loops
-    are closed to rounding in every stage.
+    Runge-Kutta method with a fixed step (as the reduced-scale forwarder paper does). Within a
+    step the passive joints move with gamma v_A; after every step the loops are closed to
+    rounding.
 
     Args:
         machine: The machine.
@@ -64,16 +67,16 @@ def simulate(
     steps = _count(duration, step)
     q_a, v_a = _start(machine, initial, path)
     run = _Run(machine, control)
-    state = np.concatenate([q_a, v_a, np.zeros(run.controller_states + 2)])
+    state = run.start(q_a, v_a)
     states = np.empty((steps + 1, len(state)))
-    forces = np.empty((steps + 1, len(q_a)))
-    observed: list[tuple[Array, Array, tuple[float, float]]] = []  # q, friction, energies
+    forces, friction = np.empty((steps + 1, len(q_a))), np.empty((steps + 1, len(q_a)))
+    energies = np.empty((steps + 1, 2))
     for i in range(steps + 1):
         time = i * step
         states[i] = state
         try:
-            rate, forces[i] = run.rate(time, state)
-            observed.append(run.observe())
+            rate, forces[i], motion = run.rate(time, state)
+            friction[i], energies[i] = run.observe(motion)
             if i < steps:
                 state = run.advance(time, state, rate, step)
         except ClosureError as error:
@@ -85,53 +88,60 @@ def simulate(
             )
         if progress is not None:
             progress((i + 1) / (steps + 1))
-    return _recording(machine, path, step, states, observed, forces, task)
+    _warn_of_imbalance(states[:, -2], energies.sum(axis=1), states[:, -1], step)
+    return _recording(machine, path, step, states, forces, friction, energies, task)
 
 
 class _Run:
-    """The right-hand side of the state (q_A, v_A, controller's states, work, dissipated)."""
+    """The right-hand side of the state (q, v_A, controller's states, work, dissipated)."""
 
     def __init__(self, machine: Machine, control: Controller | None):
         self.machine, self.control = machine, control
         self.dynamics = Dynamics(machine)
-        self.size = len(machine.active)
-        self.controller_states = control.states if control is not None else 0
-        self.motion = self.dynamics.motion(np.array(machine.home), np.zeros(self.size))
+        self._joints, self._active = machine.model.nq, machine.closure.active
+        self._velocities = slice(self._joints, self._joints + len(machine.active))
 
-    def rate(self, time: float, state: Array) -> tuple[Array, Array]:
-        """Time derivative of the state, and the active forces (n,)."""
-        n = self.size
-        q_a, v_a = state[:n], state[n : 2 * n]
-        own = state[2 * n : 2 * n + self.controller_states]
+    def start(self, q_a: Array, v_a: Array) -> Array:
+        """The state at the start."""
+        q = self.machine.closure.solve(q_a)
+        own = self.control.start(q_a) if self.control is not None else np.zeros(0)
+        return np.concatenate([q, v_a, own, np.zeros(2)])
+
+    def rate(self, time: float, state: Array) -> tuple[Array, Array, Motion]:
+        """Time derivative of the state, active forces (n,), and the motion they act on."""
+        q, v_a = state[: self._joints], state[self._velocities]
+        own = state[self._velocities.stop : -2]
         if self.control is None:
-            tau, own_rate = np.zeros(n), own
+            tau, own_rate = np.zeros_like(v_a), own
         else:
-            tau, own_rate = self.control(time, q_a, v_a, own)
-        q = self.machine.closure.solve(q_a, guess=self.motion.q)
-        self.motion = self.dynamics.motion(q, v_a)
-        a_a = self.dynamics.accelerate(self.motion, tau, friction=True)
-        powers = [tau @ v_a, self.dynamics.dissipation(self.motion)]
-        return np.concatenate([v_a, a_a, own_rate, powers]), tau
-
-    def observe(self) -> tuple[Array, Array, tuple[float, float]]:
-        """Posture, active friction forces and energies where `rate` was last asked."""
-        q, v = self.motion.q, self.motion.v
-        friction = self.motion.gamma.T @ self.dynamics.forces.friction(v)
-        return q, friction, self.dynamics.energy_at(q, v)
+            tau, own_rate = self.control(time, q[self._active], v_a, own)
+        motion = self.dynamics.motion(q, v_a)
+        a_a = self.dynamics.accelerate(motion, tau, friction=True)
+        powers = [tau @ v_a, self.dynamics.dissipation(motion)]
+        return np.concatenate([motion.v, a_a, own_rate, powers]), tau, motion
 
     def advance(self, time: float, state: Array, first: Array, step: float) -> Array:
         """One step of the classical Runge-Kutta method, its first stage given."""
         half = step / 2
-        second, _ = self.rate(time + half, state + half * first)
-        third, _ = self.rate(time + half, state + half * second)
-        fourth, _ = self.rate(time + step, state + step * third)
-        return state + step / 6 * (first + 2 * second + 2 * third + fourth)
+        second = self.rate(time + half, state + half * first)[0]
+        third = self.rate(time + half, state + half * second)[0]
+        fourth = self.rate(time + step, state + step * third)[0]
+        state = state + step / 6 * (first + 2 * second + 2 * third + fourth)
+        if np.isfinite(state).all():
+            q = state[: self._joints]
+            state[: self._joints] = self.machine.closure.solve(q[self._active], guess=q)
+        return state
+
+    def observe(self, motion: Motion) -> tuple[Array, tuple[float, float]]:
+        """Friction forces at the active joints (n,), kinetic and potential energy."""
+        friction = motion.gamma.T @ self.dynamics.forces.friction(motion.v)
+        return friction, self.dynamics.energy_at(motion.q, motion.v)
 
 
 def _as_controller(
     controller: Controller | Force | None, machine: Machine
 ) -> Controller | None:
-    if controller is None or hasattr(controller, "states"):
+    if controller is None or hasattr(controller, "start"):
         return controller  # type: ignore[return-value]
     if not callable(controller):
         raise InputError(
@@ -176,14 +186,15 @@ def _recording(
     path: object,
     step: float,
     states: Array,
-    observed: list[tuple[Array, Array, tuple[float, float]]],
     forces: Array,
+    friction: Array,
+    energies: Array,
     task: str,
 ) -> Recording:
-    n = len(machine.active)
-    postures, friction, energies = (np.array(part) for part in zip(*observed, strict=True))
     time = step * np.arange(len(states))
-    q_a, v_a = states[:, :n], states[:, n : 2 * n]
+    nq = machine.model.nq
+    postures, v_a = states[:, :nq], states[:, nq : nq + len(machine.active)]
+    q_a = postures[:, machine.closure.active]
     _warn_of_limits(machine, time, q_a)
     channels: dict[str, Array] = {}
     units: dict[str, str] = {}
@@ -239,3 +250,16 @@ def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
                 CraneWarning,
                 stacklevel=4,
             )
+
+
+def _warn_of_imbalance(work: Array, energy: Array, dissipated: Array, step: float) -> None:
+    """The energies are integrated with the motion, so they tell when the step is too long."""
+    gap = float(np.abs(work - (energy - energy[0]) - dissipated).max())
+    throughput = float(max(np.ptp(work), np.ptp(energy), np.ptp(dissipated)))
+    if gap > _IMBALANCE * throughput:
+        warnings.warn(
+            f"work, energy and dissipation differ by {gap:.2g} J of {throughput:.2g} J, so the "
+            f"step of {step:g} s is too long: shorten it, or smooth the friction more",
+            CraneWarning,
+            stacklevel=3,
+        )

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.recording import Recording
+from crane.recording import FORCE_UNITS, Recording
 from crane.timeseries import Array
 
 # Unit to read a coordinate in, and how many of it make one rad or m.
@@ -68,7 +68,7 @@ class Summary:
         rows = [head, ("---",) + ("---:",) * (len(head) - 1)]
         for joint in self.joints:
             unit, scale = READING_UNITS[joint.unit]
-            force = "N m" if joint.unit == "rad" else "N"
+            force = FORCE_UNITS[joint.unit]
             rows.append(
                 (
                     joint.name,

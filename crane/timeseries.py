@@ -108,6 +108,9 @@ def _head(path: Path) -> tuple[dict[str, str], str, int]:
 
 def _units(heading: str) -> dict[str, str]:
     """Names and units of the columns from the header row."""
+    for other in (";", "\t"):
+        if heading.count(other) > heading.count(","):
+            raise RecordingError(f"separates columns by {other!r}, use commas")
     cells = next(csv.reader([heading]))
     if all(_number(cell) is not None for cell in cells):
         raise RecordingError(
@@ -125,9 +128,7 @@ def _units(heading: str) -> dict[str, str]:
         check_column(name, unit)
         units[name] = unit
     if TIME not in units:
-        other = next((x for x in ";\t" if heading.count(x) > heading.count(",")), None)
-        hint = f"separate columns by commas, not {other!r}" if other else f"add '{TIME} [s]'"
-        raise RecordingError(f"no column '{TIME}' in the header, {hint}")
+        raise RecordingError(f"no column '{TIME}' in the header, add '{TIME} [s]'")
     if units[TIME] != "s":
         found = f"is in [{units[TIME]}]" if units[TIME] else "has no unit"
         raise RecordingError(f"column '{TIME}' {found}, give '{TIME} [s]'")

@@ -35,7 +35,7 @@ def main() -> None:
                 look(camera);
                 viewer.camera.zoom = zoom;
                 viewer.gui.hide();
-                document.querySelectorAll(".panel").forEach((e) => bare && e.remove());
+                if (bare) document.querySelectorAll(".panel").forEach((panel) => { panel.hidden = true; });
                 viewer.render();
             }""",
             [options.time, options.camera, options.zoom, options.bare],

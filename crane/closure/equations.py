@@ -116,7 +116,7 @@ class LoopEquations:
         if not self.loops:
             return np.zeros(0), np.zeros((0, self.model.nv))
         jacobian = pin.computeJointJacobians(self.model, self.data, q)
-        a, b, p1, p2 = self._geometry()
+        self._last = a, b, p1, p2 = self._geometry()
         phi = np.einsum("ij,ij->i", a, np.where(self.is_translation[:, None], p2 - p1, b))
         return phi, self._row_sign * (self._wrenches(a, b, p2) @ jacobian)
 
@@ -138,35 +138,32 @@ class LoopEquations:
                 return loop.name
         return None
 
-    def evaluate_rate(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Jacobian and second derivative of phi at zero joint acceleration.
+    def curvature(self, q: Array, v: Array) -> Array:
+        """Second derivative of phi at zero joint acceleration, (d/dt dphi/dq) v.
 
         Args:
-            q: (nq,) [m], [rad].
+            q: (nq,) [m], [rad], the posture `evaluate` was last called with.
             v: (nv,) [m/s], [rad/s].
 
         Returns:
-            dphi/dq (m, nv) and (d/dt dphi/dq) v (m,).
+            (m,).
         """
         if not self.loops:
-            return np.zeros((0, self.model.nv)), np.zeros(0)
+            return np.zeros(0)
+        a, b, _, p2 = self._last
         rate = pin.computeJointJacobiansTimeVariation(self.model, self.data, q, v)
-        a, b, _, p2 = self._geometry()
         velocity = np.array([self.data.ov[joint].vector for joint, _ in self._frames])
         one = 2 * self.loop_of_row
         v2, w1, w2 = velocity[one + 1, :3], velocity[one, 3:], velocity[one + 1, 3:]
         moved = self.is_translation[:, None]
-        a_rate = _cross(w1, a)
         arm = np.where(moved, p2, b)
         arm_rate = _cross(w2, arm) + np.where(moved, v2, 0.0)
+        a_rate = _cross(w1, a)
         wrench_rate = np.zeros((len(a), 6))
         wrench_rate[self.is_translation, :3] = a_rate[self.is_translation]
         wrench_rate[:, 3:] = _cross(arm_rate, a) + _cross(arm, a_rate)
         split = self._row_sign * v  # (m, nv): v of frame 2 minus v of frame 1
-        relative = split @ self.data.J.T
-        bias = split @ rate.T
-        wrenches = self._wrenches(a, b, p2)
-        second = np.einsum("ij,ij->i", wrench_rate, relative) + np.einsum(
-            "ij,ij->i", wrenches, bias
+        relative, bias = split @ self.data.J.T, split @ rate.T
+        return np.einsum("ij,ij->i", wrench_rate, relative) + np.einsum(
+            "ij,ij->i", self._wrenches(a, b, p2), bias
         )
-        return self._row_sign * (wrenches @ self.data.J), second

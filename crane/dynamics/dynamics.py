@@ -125,9 +125,8 @@ class Dynamics:
             q: (nq,) closed posture.
             v_a: (n,) [m/s], [rad/s].
         """
-        gamma = self._closure.gamma(q)
-        v = gamma @ v_a
-        return Motion(q, v_a, gamma, v, self._closure.drift(q, v))
+        gamma, v, drift = self._closure.motion(q, v_a)
+        return Motion(q, v_a, gamma, v, drift)
 
     def accelerate(self, motion: Motion, tau_a: Array, friction: bool = False) -> Array:
         """`forward` of one sample whose posture is closed already.

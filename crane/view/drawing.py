@@ -53,7 +53,6 @@ def draw_line(viewer: Any, points: Array, colour: int) -> None:
     import meshcat.geometry as g
 
     viewer.set_object(g.Line(_points(points), g.LineBasicMaterial(color=colour)))
-    viewer["<object>"].set_property("castShadow", False)
 
 
 def draw_surroundings(viewer: Any, lower: Array, upper: Array) -> None:
@@ -74,7 +73,6 @@ def draw_surroundings(viewer: Any, lower: Array, upper: Array) -> None:
     level = np.concatenate([along, along[:, ::-1]]) + centre
     points = np.column_stack([level, np.full(len(level), lower[2])])
     viewer.set_object(g.LineSegments(_points(points), g.LineBasicMaterial(color=_GRID)))
-    viewer["<object>"].set_property("castShadow", False)
 
 
 def animate(viewer: Any, poses: Mapping[str, Array], time: Array) -> None:

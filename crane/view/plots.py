@@ -49,6 +49,7 @@ STYLE: Any = {
     "xtick.labelsize": 7.5,
     "ytick.labelsize": 7.5,
     "legend.frameon": False,
+    "savefig.bbox": "tight",
     "pdf.fonttype": 42,
     "svg.hashsalt": "crane",
 }
@@ -95,7 +96,7 @@ def recording_figure(recording: Recording) -> Figure:
     """
     tip, joints = points(recording, "tip"), recording.joints
     with mpl.rc_context(STYLE):
-        widths = [1.0] * len(joints) + [1.5] * (tip is not None)
+        widths = [1.0] * len(joints) + [1.6] * (tip is not None)
         figure = Figure(figsize=(2.4 * sum(widths) + 0.3, 6.0), layout="constrained")
         grid = figure.add_gridspec(3, len(widths), width_ratios=widths)
         for column, name in enumerate(joints):
@@ -191,13 +192,13 @@ def _draw_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
         axes.text(*end, f" {name}", fontsize=7.5, va="bottom")
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="path of the tip")
-    axes.set_box_aspect(span, zoom=0.8)
+    axes.set_box_aspect(span, zoom=0.92)
     axes.view_init(elev=24, azim=-60)
     for axis, length in zip((axes.xaxis, axes.yaxis, axes.zaxis), span, strict=True):
         axis.set_major_locator(MaxNLocator(4 if length > 0.5 * span.max() else 2))
         axis.set_pane_color("#fafafa")
-        axis.labelpad = 0
     axes.tick_params(pad=0)
+    axes.zaxis.labelpad = 0
 
 
 def _letter(axes: Axes, index: int) -> None:

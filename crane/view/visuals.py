@@ -23,11 +23,6 @@ class Box:
 
     size: tuple[float, float, float]
 
-    @property
-    def half(self) -> Array:
-        """(3,) half edges of the box that encloses it."""
-        return np.array(self.size) / 2
-
 
 @dataclass(frozen=True)
 class Cylinder:
@@ -36,22 +31,12 @@ class Cylinder:
     radius: float
     length: float
 
-    @property
-    def half(self) -> Array:
-        """(3,) half edges of the box that encloses it."""
-        return np.array([self.radius, self.radius, self.length / 2])
-
 
 @dataclass(frozen=True)
 class Sphere:
     """Sphere about the origin [m]."""
 
     radius: float
-
-    @property
-    def half(self) -> Array:
-        """(3,) half edges of the box that encloses it."""
-        return np.full(3, self.radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +45,6 @@ class Mesh:
 
     vertices: Array
     faces: np.ndarray
-
-    @property
-    def half(self) -> Array:
-        """(3,) half edges of the box about the origin that encloses it."""
-        return np.abs(self.vertices).max(axis=0)
 
 
 Shape = Box | Cylinder | Sphere | Mesh
@@ -88,8 +68,18 @@ class Visual:
 
     def corners(self) -> Array:
         """(8, 3) corners, in the link's frame, of a box that encloses the shape."""
-        signs = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(8, 3)
-        return signs * self.shape.half @ self.placement[:3, :3].T + self.placement[:3, 3]
+        match self.shape:
+            case Box(size):
+                high = np.array(size) / 2
+            case Cylinder(radius, length):
+                high = np.array([radius, radius, length / 2])
+            case Sphere(radius):
+                high = np.full(3, radius)
+            case Mesh(vertices):
+                high = vertices.max(axis=0)
+        low = self.shape.vertices.min(axis=0) if isinstance(self.shape, Mesh) else -high
+        corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(8, 3)
+        return corners @ self.placement[:3, :3].T + self.placement[:3, 3]
 
 
 def read_visuals(machine: Machine) -> list[Visual]:
@@ -127,31 +117,26 @@ def read_visuals(machine: Machine) -> list[Visual]:
 
 
 def skeleton(machine: Machine) -> list[Visual]:
-    """Bars from joint to joint and on to the tip: a machine without visuals."""
+    """Bars from each joint to the joints and frames of the body it moves."""
     model = machine.model
-    links: dict[int, str] = {}  # joint -> the link that it moves
+    links: dict[int, str] = {}  # joint -> the first link of the body it moves
+    ends: list[tuple[int, Array]] = []
     for frame in model.frames:
         if frame.type == pin.FrameType.BODY:
             links.setdefault(frame.parentJoint, frame.name)
-    bars = [
-        (model.parents[j], model.jointPlacements[j].translation) for j in range(1, model.njoints)
-    ]
-    if machine.tip is not None:
-        tip = model.frames[machine.frame(machine.tip)]
-        bars.append((tip.parentJoint, tip.placement.translation))
-    radius = 0.03 * max((float(np.linalg.norm(end)) for _, end in bars), default=0.0) or 0.02
-    visuals = [Visual(links[0], Sphere(1.5 * radius), np.eye(4), PLAIN)]
-    for body, end in bars:
-        inverse = model.frames[machine.frame(links[body])].placement.inverse()
-        start, end = inverse.translation, inverse.act(end)
-        length = float(np.linalg.norm(end - start))
-        turn = pin.Quaternion.FromTwoVectors(pin.ZAxis, end - start) if length else None
-        ball, bar = np.eye(4), np.eye(4)
-        ball[:3, 3] = end
-        bar[:3, 3] = (start + end) / 2
+            ends.append((frame.parentJoint, frame.placement.translation))
+    for joint in range(1, model.njoints):
+        ends.append((model.parents[joint], model.jointPlacements[joint].translation))
+    radius = 0.03 * max(float(np.linalg.norm(end)) for _, end in ends) or 0.02
+    visuals = []
+    for body, end in ends:
+        in_link = model.frames[machine.frame(links[body])].placement.inverse()
+        ball = in_link.homogeneous
+        ball[:3, 3] = in_link.act(end)
         visuals.append(Visual(links[body], Sphere(1.5 * radius), ball, PLAIN))
-        if turn is not None:
-            bar[:3, :3] = turn.matrix()
+        if length := float(np.linalg.norm(end)):
+            along = pin.Quaternion.FromTwoVectors(pin.ZAxis, end)
+            bar = (in_link * pin.SE3(along, end / 2)).homogeneous
             visuals.append(Visual(links[body], Cylinder(radius, length), bar, PLAIN))
     return visuals
 

@@ -1,0 +1,278 @@
+"""The command line: crane list, info, check, simulate, view, plot, demo."""
+
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from crane.errors import CraneError, CraneWarning, InputError
+
+if TYPE_CHECKING:
+    from crane.machine import Machine
+    from crane.recording import Recording
+
+# Commands import what they need when they run, so that `crane --help` answers at once.
+
+app = typer.Typer(
+    help="Machines with closed kinematic chains: simulate, identify, show. "
+    "Add --debug to any command to see where an error comes from.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+MachineName = Annotated[
+    str,
+    typer.Argument(metavar="MACHINE", help="A bundled name, a machine file, or a URDF."),
+]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite what is there.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
+OutFile = Annotated[Path | None, typer.Option("--out", help="The file to write.")]
+NoOpen = Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")]
+
+
+def main() -> None:
+    """Run the command line: errors are one line, exit status 2."""
+    arguments = [word for word in sys.argv[1:] if word != "--debug"]
+    debug = len(arguments) < len(sys.argv) - 1
+    warnings.showwarning = _show_warning
+    warnings.simplefilter("once", CraneWarning)
+    try:
+        status = app(args=arguments, standalone_mode=False, prog_name="crane")
+    except CraneError as error:
+        if debug:
+            raise
+        _say(f"error: {error}")
+        sys.exit(2)
+    except KeyboardInterrupt:
+        _say("error: interrupted, nothing was written")
+        sys.exit(130)
+    except Exception as error:
+        # the command line parser's own errors, whose class is not public
+        message = getattr(error, "format_message", None)
+        if debug or message is None:
+            raise
+        if text := message():
+            _say(f"error: {' '.join(text.split())} (crane --help shows the commands)")
+        sys.exit(2)
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+@app.command("list")
+def list_machines() -> None:
+    """List the machines that can be named."""
+    from crane.description import bundled, examples
+
+    print("Bundled machines:")
+    for name in bundled():
+        print(f"  {name}")
+    if examples():
+        print("Robots of example-robot-data (open chains):")
+        print(f"  {', '.join(examples())}")
+
+
+@app.command()
+def info(machine: MachineName) -> None:
+    """Show what a machine consists of."""
+    for line in _describe(_load(machine)):
+        print(line)
+
+
+@app.command()
+def check(file: MachineName) -> None:
+    """Read a machine and say what is wrong; exit status 0, 1 with warnings, 2 with an error."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CraneWarning)
+        loaded = _load(file)
+    for warning in caught:
+        _say(f"warning: {warning.message}")
+    residual = float(loaded.closure.residual(loaded.home))
+    print(
+        f"{loaded.name}: {len(loaded.joints)} joints, {len(loaded.closure.equations.loops)} loops, "
+        f"{len(loaded.active)} degrees of freedom, loops closed to {residual:.1e} m at home"
+    )
+    if caught:
+        raise typer.Exit(1)
+
+
+@app.command()
+def simulate(
+    machine: MachineName,
+    out: Out,
+    task: Annotated[str | None, typer.Option(help="A task of the machine.")] = None,
+    controller: Annotated[
+        str | None, typer.Option(help="pi or computed-torque; pi if the machine has gains.")
+    ] = None,
+    duration: Annotated[float | None, typer.Option(help="[s], the task's if not given.")] = None,
+    step: Annotated[float, typer.Option(help="Step of the integration [s].")] = 1e-3,
+    force: Force = False,
+) -> None:
+    """Simulate a task, or without one the free motion from the home posture."""
+    from crane.control import controller as make_controller
+    from crane.paths import task_path
+    from crane.runs import prepare_folder, write_run
+    from crane.simulation import simulate as run
+
+    loaded = _load(machine)
+    control = None
+    if task is not None:
+        name = controller or ("pi" if loaded.control else "computed-torque")
+        control = make_controller(name, loaded, task_path(loaded, task))
+    elif controller is not None:
+        raise InputError(f"controller '{controller}' has nothing to follow, name a --task")
+    elif duration is None:
+        tasks = ", ".join(loaded.tasks) or "none"
+        raise InputError(f"no task: name a --task ({tasks}), or a --duration to let it go")
+    with _progress("simulating") as progress:
+        recording = run(
+            loaded, control, duration=duration, step=step, task=task or "", progress=progress
+        )
+    prepare_folder(out, force)
+    title = f"{loaded.name}: {task or 'free motion'}"
+    print(write_run(out, recording, title), end="")
+    print(f"\nwritten to {out}; see it with: crane view {out}")
+
+
+@app.command()
+def view(
+    what: Annotated[
+        str, typer.Argument(metavar="WHAT", help="A machine, a run's folder, or a recording.")
+    ],
+    out: OutFile = None,
+    no_open: NoOpen = False,
+    force: Force = False,
+) -> None:
+    """Write a page that shows a machine or plays a run, and open it."""
+    from crane.runs import PAGE, check_free
+    from crane.view.page import open_in_browser, write_page
+
+    folder, recording = _run_of(what)
+    loaded = _load(what) if recording is None else _machine_of(recording, what)
+    page = out or (folder / PAGE if folder else Path(f"{loaded.name}.html"))
+    check_free(page, force)
+    write_page(loaded, page, recording)
+    print(f"written to {page}")
+    if not no_open and not open_in_browser(page):
+        print("no browser found here, open the page yourself")
+
+
+@app.command()
+def plot(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder or a recording.")],
+    out: OutFile = None,
+    force: Force = False,
+) -> None:
+    """Plot displacements, velocities, forces and tip path of a run (png, svg or pdf)."""
+    from crane.runs import FIGURE, check_free, read_run
+    from crane.view.plots import plot_recording
+
+    recording = read_run(run)
+    figure = out or (run if run.is_dir() else run.parent) / FIGURE
+    check_free(figure, force)
+    plot_recording(recording, figure)
+    print(f"written to {figure}")
+
+
+@app.command()
+def demo(out: Out = Path("demo-output"), force: Force = False) -> None:
+    """Simulate the three published trajectories of the reduced-scale forwarder."""
+    from crane.demo import run_demo
+    from crane.runs import FIGURE, PAGE, prepare_folder
+
+    prepare_folder(out, force)
+    with _progress("simulating") as progress:
+        text = run_demo(out, progress)
+    print(text)
+    print(f"figures:    {out}/*/{FIGURE}\nanimations: {out}/*/{PAGE} (open them in a browser)")
+
+
+def _load(name: str) -> "Machine":
+    from crane.machine import load
+
+    return load(name)
+
+
+def _run_of(what: str) -> tuple[Path | None, "Recording | None"]:
+    """Folder and recording where a run is meant; nothing where a machine is."""
+    from crane.runs import read_run
+
+    path = Path(what)
+    if path.is_dir():
+        return path, read_run(path)
+    if path.suffix.lower() == ".csv":
+        return path.parent, read_run(path)
+    return None, None
+
+
+def _machine_of(recording: "Recording", what: str) -> "Machine":
+    if not recording.machine:
+        raise InputError(
+            f"{what}: does not name its machine, write '# machine: NAME' above its header row"
+        )
+    return _load(recording.machine)
+
+
+def _describe(machine: "Machine") -> Iterator[str]:
+    closure = machine.closure
+    structure = closure.structure
+    mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
+    yield f"{machine.name}"
+    if machine.source:
+        yield f"  source      {machine.source}"
+    yield f"  file        {machine.path}"
+    yield f"  chains      {', '.join(chain.name for chain in machine.chains)}"
+    yield (
+        f"  joints      {len(machine.joints)}, of which {len(machine.active)} active; "
+        f"moving mass {mass:.4g} kg"
+    )
+    for i, joint in enumerate(machine.active):
+        home = machine.home[closure.active[i]]
+        yield (
+            f"    {joint:<10}{machine.lower[i]:.5g} to {machine.upper[i]:.5g} "
+            f"{machine.unit(joint)}, home {home:.5g}"
+        )
+    if len(closure.passive):
+        names = [machine.joints[i] for i in closure.passive]
+        yield f"    passive   {', '.join(names)}"
+    loops = closure.equations.loops
+    yield (
+        f"  loops       {len(loops)}: {len(structure.rows)} independent equations, "
+        f"{len(structure.redundant)} redundant"
+    )
+    for loop in loops:
+        yield f"    {loop.name:<10}{loop.type}, {loop.predecessor} to {loop.successor}"
+    if structure.blocks:
+        order = [
+            "+".join(machine.joints[closure.passive[i]] for i in columns)
+            for _, columns in structure.blocks
+        ]
+        yield f"  solved as   {', then '.join(order)}"
+    yield f"  tip         {machine.tip or 'none'}"
+    for task in machine.tasks.values():
+        yield f"  task        {task.name}: {task.description or 'no description'}, {task.duration:g} s"
+
+
+@contextmanager
+def _progress(what: str) -> Iterator[Callable[[float], None]]:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        job = bar.add_task(what, total=1.0)
+
+        def report(share: float) -> None:
+            bar.update(job, completed=share)
+
+        yield report
+
+
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    _say(f"warning: {message}")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)

@@ -1,0 +1,184 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from crane.errors import OutputError
+from crane.recording import Recording
+from crane.view.plots import plot_recording, recording_figure
+
+SIGNATURES = {".png": b"\x89PNG\r\n", ".svg": b"<?xml", ".pdf": b"%PDF"}
+
+
+@pytest.fixture
+def recording():
+    """A joint that turns and one that slides, both with references, and the tip with its own."""
+    time = np.linspace(0, 2, 201)
+    q = np.column_stack([np.sin(time), 0.02 + 0.01 * np.cos(time)])
+    v = np.column_stack([np.cos(time), -0.01 * np.sin(time)])
+    tip = np.column_stack([np.cos(time), np.sin(time), 0.1 * time])
+    channels = {"reference_q1": q[:, 0] + 0.1, "reference_X1": q[:, 1] - 0.001}
+    channels |= {"reference_velocity_q1": v[:, 0] + 0.2}
+    channels |= {f"tip_{axis}": tip[:, i] for i, axis in enumerate("xyz")}
+    channels |= {f"reference_tip_{axis}": tip[:, i] - 0.01 for i, axis in enumerate("xyz")}
+    return Recording(
+        time=time,
+        joints=("q1", "X1"),
+        q=q,
+        v=v,
+        tau=np.column_stack([0.3 * time, -20 * time]),
+        units={"q1": "rad", "X1": "m"},
+        channels=channels,
+        machine="mini_forwarder",
+        task="loading",
+    )
+
+
+def without(recording, *prefixes):
+    channels = {x: y for x, y in recording.channels.items() if not x.startswith(prefixes)}
+    return Recording(
+        recording.time,
+        recording.joints,
+        recording.q,
+        recording.v,
+        recording.tau,
+        recording.units,
+        channels,
+    )
+
+
+def panels(figure):
+    """Axes over time by their place in the grid (row, column)."""
+    flat = [axes for axes in figure.axes if axes.name == "rectilinear"]
+    return {
+        (axes.get_subplotspec().rowspan.start, axes.get_subplotspec().colspan.start): axes
+        for axes in flat
+    }
+
+
+def curve(axes, label):
+    (line,) = (line for line in axes.get_lines() if line.get_label() == label)
+    return np.asarray(line.get_data())
+
+
+def test_displacements_velocities_and_forces(recording):
+    grid = panels(recording_figure(recording))
+    expected = {
+        (0, 0): ("angle [deg]", np.rad2deg(recording.q[:, 0])),
+        (0, 1): ("displacement [mm]", 1e3 * recording.q[:, 1]),
+        (1, 0): ("velocity [deg/s]", np.rad2deg(recording.v[:, 0])),
+        (1, 1): ("velocity [mm/s]", 1e3 * recording.v[:, 1]),
+        (2, 0): ("torque [N m]", recording.tau[:, 0]),
+        (2, 1): ("force [N]", recording.tau[:, 1]),
+    }
+    for place, (label, values) in expected.items():
+        assert grid[place].get_ylabel() == label
+        time, drawn = curve(grid[place], "recording")
+        np.testing.assert_array_equal(time, recording.time)
+        np.testing.assert_allclose(drawn, values, rtol=1e-14)
+        low, high = grid[place].get_ylim()
+        assert low < values.min() and values.max() < high
+        assert grid[place].get_xlim() == (recording.time[0], recording.time[-1])
+    assert [grid[0, i].get_title() for i in (0, 1)] == ["$q_{1}$", "$X_{1}$"]
+    assert [grid[2, i].get_xlabel() for i in (0, 1)] == ["time [s]"] * 2
+    assert [grid[0, i].get_xlabel() for i in (0, 1)] == [""] * 2
+
+
+def test_references_are_dashed_and_told_apart(recording):
+    figure = recording_figure(recording)
+    grid = panels(figure)
+    expected = {
+        (0, 0): np.rad2deg(recording.channels["reference_q1"]),
+        (0, 1): 1e3 * recording.channels["reference_X1"],
+        (1, 0): np.rad2deg(recording.channels["reference_velocity_q1"]),
+    }
+    for place, axes in grid.items():
+        references = [line for line in axes.get_lines() if line.get_label() == "reference"]
+        assert len(references) == (place in expected)
+        for line in references:
+            np.testing.assert_allclose(line.get_ydata(), expected[place], rtol=1e-14)
+            assert line.is_dashed()
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["recording", "reference"]
+    assert figure.get_suptitle() == "mini forwarder: loading"
+
+
+def test_path_of_the_tip(recording):
+    figure = recording_figure(recording)
+    (space,) = (axes for axes in figure.axes if axes.name == "3d")
+    assert (space.get_xlabel(), space.get_ylabel(), space.get_zlabel()) == (
+        "x [m]",
+        "y [m]",
+        "z [m]",
+    )
+    lines = {line.get_label(): line.get_data_3d() for line in space.get_lines()}
+    for label, prefix in (("recording", "tip"), ("reference", "reference_tip")):
+        for axis, values in zip("xyz", lines[label], strict=True):
+            np.testing.assert_array_equal(values, recording.channels[f"{prefix}_{axis}"])
+    assert np.ravel(lines["start"]) == pytest.approx([1, 0, 0])
+    assert np.ravel(lines["end"]) == pytest.approx([np.cos(2), np.sin(2), 0.2])
+    limits = np.diff([space.get_xlim(), space.get_ylim(), space.get_zlim()]).ravel()
+    aspect = space._box_aspect / space._box_aspect[0]
+    np.testing.assert_allclose(aspect, limits / limits[0])
+    error = panels(figure)[2, 2]
+    assert error.get_ylabel() == "tip to reference [mm]"
+    np.testing.assert_allclose(curve(error, "recording")[1], 10 * np.sqrt(3))
+
+
+def test_without_tip_or_references(recording):
+    figure = recording_figure(without(recording, "reference"))
+    assert sorted(panels(figure)) == [(row, i) for row in range(3) for i in range(2)]
+    assert [axes.name for axes in figure.axes].count("3d") == 1
+    assert figure.legends == []
+    figure = recording_figure(without(recording, "reference", "tip"))
+    assert [axes.name for axes in figure.axes] == ["rectilinear"] * 6
+    assert figure.get_suptitle() == ""
+
+
+def test_a_joint_at_rest_looks_at_rest(recording):
+    noise = 1e-15 * np.sin(40 * recording.time)
+    still = Recording(
+        recording.time, ("q1",), *np.tile(noise[:, None], (3, 1, 1)), units={"q1": "rad"}
+    )
+    for axes in panels(recording_figure(still)).values():
+        low, high = axes.get_ylim()
+        assert high - low >= 0.01
+        assert low < 0 < high
+
+
+def test_names_that_are_not_a_letter_and_a_number_stay_as_they_are():
+    names = ("boom_lift", "A$1", "X12")
+    zeros = np.zeros((2, 3))
+    recording = Recording([0, 1], names, zeros, zeros, zeros, dict.fromkeys(names, "m"))
+    grid = panels(recording_figure(recording))
+    assert [grid[0, i].get_title() for i in range(3)] == ["boom_lift", r"A\$1", "$X_{12}$"]
+
+
+def test_one_sample_can_be_seen():
+    recording = Recording([1.0], ("q1",), [[1.0]], [[0.0]], [[0.0]], {"q1": "rad"})
+    (line,) = panels(recording_figure(recording))[0, 0].get_lines()
+    assert line.get_marker() == "o"
+
+
+@pytest.mark.parametrize("suffix", SIGNATURES)
+def test_formats(tmp_path, recording, suffix):
+    path = tmp_path / f"run{suffix}"
+    plot_recording(recording, path)
+    first = path.read_bytes()
+    assert first.startswith(SIGNATURES[suffix])
+    plot_recording(recording, path)
+    assert path.read_bytes() == first
+
+
+@pytest.mark.parametrize("name", ["run.gif", "run", "run.png.txt"])
+def test_unknown_format_writes_nothing(tmp_path, recording, name):
+    with pytest.raises(OutputError, match=r"end the name in \.png, \.svg or \.pdf"):
+        plot_recording(recording, tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_global_state_of_pyplot():
+    code = "import sys, crane.view.plots; print('matplotlib.pyplot' in sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "False"

@@ -1,0 +1,279 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crane.errors import OutputError, RecordingError
+from crane.recording import Recording
+
+
+def make(**changes):
+    """Three samples of a joint that turns and one that slides, with a tip and a reference."""
+    values = {
+        "time": [0.0, 0.1, 0.3],
+        "joints": ("q1", "X1"),
+        "q": [[0.0, 0.01], [0.1, 0.02], [0.2, 0.03]],
+        "v": [[1.0, 0.1], [1.0, 0.1], [0.5, 0.05]],
+        "tau": [[0.3, -16.0], [0.2, -17.0], [0.1, -18.0]],
+        "units": {"q1": "rad", "X1": "m"},
+        "channels": {"tip_x": [0.4, 0.5, 0.6], "valve": [0.0, 1.0, 0.0]},
+        "channel_units": {"tip_x": "m"},
+        "machine": "mini_forwarder",
+        "task": "lift",
+    }
+    return Recording(**values | changes)
+
+
+def assert_equal(one, two):
+    assert one.joints == two.joints
+    assert one.units == two.units
+    assert one.channel_units == two.channel_units
+    assert (one.machine, one.task) == (two.machine, two.task)
+    for name in ("time", "q", "v", "tau"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    assert list(one.channels) == list(two.channels)
+    for name in one.channels:
+        np.testing.assert_array_equal(one.channels[name], two.channels[name])
+
+
+def test_arrays_are_own_contiguous_copies():
+    table = np.arange(12.0).reshape(3, 4)
+    recording = make(q=table[:, :2], time=[0, 1, 2])
+    table[:] = -1.0
+    np.testing.assert_array_equal(recording.q, [[0, 1], [4, 5], [8, 9]])
+    for array in (recording.time, recording.q, recording.v, *recording.channels.values()):
+        assert array.dtype == np.float64
+        assert array.flags.c_contiguous
+    assert recording.channel_units == {"tip_x": "m", "valve": ""}
+
+
+def test_written_file(tmp_path):
+    make().to_csv(tmp_path / "run.csv")
+    assert (tmp_path / "run.csv").read_text().splitlines() == [
+        "# crane recording",
+        "# machine: mini_forwarder",
+        "# task: lift",
+        "time [s],q1 [rad],X1 [m],q1_velocity [rad/s],X1_velocity [m/s],"
+        "q1_force [N m],X1_force [N],tip_x [m],valve",
+        "0.0,0.0,0.01,1.0,0.1,0.3,-16.0,0.4,0.0",
+        "0.1,0.1,0.02,1.0,0.1,0.2,-17.0,0.5,1.0",
+        "0.3,0.2,0.03,0.5,0.05,0.1,-18.0,0.6,0.0",
+    ]
+
+
+def test_round_trip(tmp_path):
+    recording = make()
+    recording.to_csv(tmp_path / "run.csv")
+    assert_equal(Recording.from_csv(tmp_path / "run.csv"), recording)
+
+
+def test_one_sample_without_channels_or_notes(tmp_path):
+    recording = Recording(
+        time=[2.5], joints=["q1"], q=[[0.1]], v=[[0.0]], tau=[[1e-300]], units={"q1": "rad"}
+    )
+    recording.to_csv(tmp_path / "run.csv")
+    assert_equal(Recording.from_csv(tmp_path / "run.csv"), recording)
+
+
+words = st.text(
+    st.characters(exclude_characters=',[]"#', categories=("L", "N", "P", "S", "Zs")),
+    min_size=1,
+    max_size=8,
+).filter(lambda text: text == text.strip() and text.isprintable())
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@st.composite
+def recordings(draw):
+    suffixes = ("_velocity", "_force")
+    names = words.filter(lambda name: name != "time" and not name.endswith(suffixes))
+    names = draw(st.lists(names, min_size=1, max_size=6, unique=True))
+    split = draw(st.integers(1, len(names)))
+    joints, channels = tuple(names[:split]), names[split:]
+    count = draw(st.integers(1, 5))
+
+    def table(width):
+        row = st.lists(numbers, min_size=width, max_size=width)
+        return draw(st.lists(row, min_size=count, max_size=count))
+
+    return Recording(
+        time=sorted(draw(st.lists(numbers, min_size=count, max_size=count, unique=True))),
+        joints=joints,
+        q=table(split),
+        v=table(split),
+        tau=table(split),
+        units={name: draw(st.sampled_from(["rad", "m"])) for name in joints},
+        channels={name: [row[0] for row in table(1)] for name in channels},
+        channel_units={name: draw(words | st.just("")) for name in channels},
+        machine=draw(words | st.just("")),
+        task=draw(words | st.just("")),
+    )
+
+
+@given(recordings())
+def test_any_recording_survives_the_round_trip(tmp_path_factory, recording):
+    path = tmp_path_factory.mktemp("run") / "run.csv"
+    recording.to_csv(path)
+    assert_equal(Recording.from_csv(path), recording)
+
+
+def test_failed_writing_leaves_nothing(tmp_path):
+    with pytest.raises(OutputError, match="there is no folder"):
+        make().to_csv(tmp_path / "missing" / "run.csv")
+    assert list(tmp_path.iterdir()) == []
+
+
+BROKEN = {
+    "q transposed": ({"q": np.zeros((2, 3))}, "q has the shape (2, 3), give (3, 2), a column"),
+    "short v": ({"v": np.zeros((2, 2))}, "v has the shape (2, 2), give (3, 2)"),
+    "flat tau": ({"tau": [1.0, 2.0, 3.0]}, "tau has the shape (3,), give (3, 2)"),
+    "time in a column": ({"time": [[0.0], [1.0], [2.0]]}, "time has the shape (3, 1), give (3,)"),
+    "text": ({"tau": [["a", "b"]] * 3}, "tau is not an array of numbers, give (3, 2)"),
+    "short channel": ({"channels": {"valve": [1.0]}, "channel_units": {}}, "channel 'valve' has"),
+    "nan": ({"q": [[0, 0], [0, np.nan], [0, 0]]}, "'X1' is nan at sample 1, give finite numbers"),
+    "inf": ({"v": [[0, 0], [0, 0], [np.inf, 0]]}, "'q1_velocity' is inf at sample 2"),
+    "nan in a channel": (
+        {"channels": {"tip_x": [np.nan, 0, 0]}},
+        "'tip_x' is nan at sample 0, give finite numbers",
+    ),
+    "nan in time": ({"time": [0.0, np.nan, 1.0]}, "'time' is nan at sample 1"),
+    "time stands": ({"time": [0.0, 0.1, 0.1]}, "time goes from 0.1 to 0.1 s at sample 2"),
+    "time goes back": ({"time": [0.0, -1.0, 2.0]}, "time goes from 0.0 to -1.0 s at sample 1"),
+    "no joints": (
+        {"joints": (), "units": {}, **dict.fromkeys(("q", "v", "tau"), np.zeros((3, 0)))},
+        "no active joint among the columns",
+    ),
+    "a joint twice": (
+        {"joints": ("X1", "X1"), "units": {"X1": "m"}},
+        "column 'X1' is there twice, rename or remove one",
+    ),
+    "no unit": ({"units": {"q1": "rad"}}, "units are for 'q1', give 'q1', 'X1'"),
+    "degrees": (
+        {"units": {"q1": "deg", "X1": "m"}},
+        "column 'q1' is in [deg], give 'q1 [rad]' or 'q1 [m]'",
+    ),
+    "unit of nothing": ({"channel_units": {"tipx": "m"}}, "unit of the channel 'tipx', did you"),
+    "a channel named time": (
+        {"channels": {"time": [0, 1, 2]}, "channel_units": {}},
+        "column 'time' is there twice",
+    ),
+    "a channel named as a joint": (
+        {"channels": {"q1": [0, 1, 2]}, "channel_units": {}},
+        "column 'q1' is there twice",
+    ),
+    "channels like a joint": (
+        {
+            "channels": dict.fromkeys(("q2", "q2_velocity", "q2_force"), [0, 1, 2]),
+            "channel_units": {},
+        },
+        "channels 'q2', 'q2_velocity', 'q2_force' hold an active joint, rename those",
+    ),
+    "channels like part of a joint": (
+        {"channels": dict.fromkeys(("q2", "q2_velocity"), [0, 1, 2]), "channel_units": {}},
+        "column 'q2_force' is missing beside 'q2', 'q2_velocity', add it, or rename",
+    ),
+    "comma in a name": (
+        {"channels": {"a,b": [0, 1, 2]}, "channel_units": {}},
+        "'a,b' cannot be the name of a column",
+    ),
+    "bracket in a unit": ({"channel_units": {"tip_x": "m]"}}, "'m]' cannot be the unit of a"),
+    "two lines": ({"task": "lift\nreturn"}, "task 'lift\\nreturn' is not one line of text"),
+}
+
+
+@pytest.mark.parametrize(("changes", "message"), BROKEN.values(), ids=BROKEN.keys())
+def test_broken_recordings(changes, message):
+    with pytest.raises(RecordingError) as caught:
+        make(**changes)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_samples():
+    empty = np.zeros((0, 2))
+    with pytest.raises(RecordingError, match="no samples, give at least one"):
+        make(time=[], q=empty, v=empty, tau=empty, channels={}, channel_units={})
+
+
+def test_changed_copies_are_checked_too():
+    assert replace(make(), task="return").task == "return"
+    with pytest.raises(RecordingError, match="time goes from"):
+        replace(make(), time=[2.0, 1.0, 0.0])
+
+
+HEAD = "time [s],q1 [rad],q1_velocity [rad/s],q1_force [N m]"
+
+
+def from_text(tmp_path, text):
+    path = tmp_path / "run.csv"
+    path.write_text(text)
+    return Recording.from_csv(path)
+
+
+def test_order_of_columns_is_free(tmp_path):
+    recording = from_text(
+        tmp_path,
+        "b_force [N],a_velocity [rad/s],load,b [m],time [s],a [rad],b_velocity [m/s],"
+        "a_force [N m]\n"
+        "1,2,3,4,5,6,7,8\n",
+    )
+    assert recording.joints == ("b", "a")
+    assert recording.time == [5]
+    np.testing.assert_array_equal(recording.q, [[4, 6]])
+    np.testing.assert_array_equal(recording.v, [[7, 2]])
+    np.testing.assert_array_equal(recording.tau, [[1, 8]])
+    assert recording.units == {"b": "m", "a": "rad"}
+    assert list(recording.channels) == ["load"]
+    assert (recording.machine, recording.task) == ("", "")
+
+
+def test_single_suffixed_columns_are_channels(tmp_path):
+    recording = from_text(tmp_path, f"{HEAD},wind_force [N],flow_velocity [m/s]\n0,1,2,3,4,5\n")
+    assert recording.joints == ("q1",)
+    assert recording.channel_units == {"wind_force": "N", "flow_velocity": "m/s"}
+
+
+BROKEN_FILES = {
+    "no velocity": (
+        "time [s],q1 [rad],q1_force [N m]\n0,1,2\n",
+        "column 'q1_velocity' is missing beside 'q1', 'q1_force', add it, or rename those",
+    ),
+    "no force": (
+        "time [s],q1 [rad],q1_velocity [rad/s]\n0,1,2\n",
+        "column 'q1_force' is missing beside 'q1', 'q1_velocity'",
+    ),
+    "no displacement": (
+        "time [s],q1_velocity [rad/s],q1_force [N m]\n0,1,2\n",
+        "column 'q1' is missing beside 'q1_velocity', 'q1_force'",
+    ),
+    "no joint": ("time [s],q1 [rad]\n0,1\n", "no active joint among the columns 'time', 'q1'"),
+    "degrees": (
+        f"{HEAD}\n0,1,2,3\n".replace("[rad]", "[deg]"),
+        "column 'q1' is in [deg], give 'q1 [rad]' or 'q1 [m]'",
+    ),
+    "no unit": (
+        f"{HEAD}\n0,1,2,3\n".replace(" [rad]", ""),
+        "column 'q1' has no unit, give 'q1 [rad]' or 'q1 [m]'",
+    ),
+    "velocity of another kind": (
+        f"{HEAD}\n0,1,2,3\n".replace("[rad/s]", "[m/s]"),
+        "column 'q1_velocity' is in [m/s], give 'q1_velocity [rad/s]'",
+    ),
+    "force of another kind": (
+        f"{HEAD}\n0,1,2,3\n".replace("[N m]", "[N]"),
+        "column 'q1_force' is in [N], give 'q1_force [N m]'",
+    ),
+    "not a number": (f"{HEAD}\n0,1,2,three\n", "line 2, column 'q1_force': 'three' is not a"),
+    "tab in a note": (f"# task: a\tb\n{HEAD}\n0,1,2,3\n", "task 'a\\tb' is not one line of text"),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), BROKEN_FILES.values(), ids=BROKEN_FILES.keys())
+def test_broken_files(tmp_path, text, message):
+    with pytest.raises(RecordingError) as caught:
+        from_text(tmp_path, text)
+    assert str(caught.value).startswith(f"{tmp_path / 'run.csv'}: ")
+    assert str(caught.value).count("run.csv") == 1
+    assert message in str(caught.value)

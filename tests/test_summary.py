@@ -1,0 +1,79 @@
+import numpy as np
+import pytest
+
+from crane.recording import Recording
+from crane.summary import points, rms, summarize
+
+
+def make(time, **channels):
+    """q1 swings as sin t against a torque 2 cos t, X1 rests under a force of 50 N."""
+    time = np.asarray(time)
+    rest = np.zeros_like(time)
+    return Recording(
+        time=time,
+        joints=("q1", "X1"),
+        q=np.column_stack([np.sin(time), rest + 0.02]),
+        v=np.column_stack([np.cos(time), rest]),
+        tau=np.column_stack([2 * np.cos(time), rest - 50.0]),
+        units={"q1": "rad", "X1": "m"},
+        channels=channels,
+    )
+
+
+def test_extremes_of_a_swing():
+    time = np.linspace(0, 2 * np.pi, 4001)
+    turn, slide = summarize(make(time)).joints
+    assert (turn.lowest, turn.highest) == pytest.approx((-1, 1), abs=1e-6)
+    assert turn.peak_speed == pytest.approx(1)
+    assert turn.peak_force == pytest.approx(2)
+    assert turn.rms_force == pytest.approx(np.sqrt(2), rel=1e-6)
+    assert (slide.lowest, slide.highest, slide.peak_speed) == (0.02, 0.02, 0)
+    assert (slide.peak_force, slide.rms_force) == pytest.approx((50, 50))
+    assert turn.peak_error is None and turn.rms_error is None
+
+
+def test_rms_weighs_by_time_not_by_sample():
+    time = np.r_[np.linspace(0, 1, 1001), 2.0, 3.0]
+    values = np.where(time <= 1, 1.0, 3.0)
+    assert rms(time, values) == pytest.approx(np.sqrt((1 + (1 + 9) / 2 + 9) / 3))
+    assert rms(np.array([4.0]), np.array([-3.0])) == 3
+
+
+def test_tracking_errors():
+    time = np.linspace(0, 2 * np.pi, 4001)
+    tip = np.column_stack([np.cos(time), np.sin(time), time])
+    shift = np.array([0.003, 0.0, 0.004])
+    channels = {"reference_q1": np.sin(time) - 0.1 * np.sin(3 * time)}
+    channels |= {f"tip_{axis}": tip[:, i] for i, axis in enumerate("xyz")}
+    channels |= {f"reference_tip_{axis}": tip[:, i] - shift[i] for i, axis in enumerate("xyz")}
+    summary = summarize(make(time, **channels))
+    turn, slide = summary.joints
+    assert turn.peak_error == pytest.approx(0.1, rel=1e-5)
+    assert turn.rms_error == pytest.approx(0.1 / np.sqrt(2), rel=1e-6)
+    assert slide.peak_error is None
+    assert (summary.tip_peak_error, summary.tip_rms_error) == pytest.approx((0.005, 0.005))
+    assert summary.duration == pytest.approx(2 * np.pi)
+
+
+def test_points_need_all_three_axes():
+    recording = make([0.0, 1.0], tip_x=[1.0, 2.0], tip_y=[3.0, 4.0])
+    assert points(recording, "tip") is None
+    assert summarize(recording).tip_rms_error is None
+    recording = make([0.0, 1.0], tip_x=[1.0, 2.0], tip_y=[3.0, 4.0], tip_z=[5.0, 6.0])
+    np.testing.assert_array_equal(points(recording, "tip"), [[1, 3, 5], [2, 4, 6]])
+
+
+def test_markdown():
+    zero = {f"tip_{axis}": [0.0, 0.0] for axis in "xyz"}
+    away = {f"reference_tip_{axis}": [0.0, 0.0] for axis in "yz"} | {
+        "reference_tip_x": [0.002] * 2
+    }
+    recording = make([0.0, np.pi / 2], reference_X1=[0.0195, 0.02], **zero, **away)
+    rms_error = 0.5 * np.sqrt(0.5)
+    assert summarize(recording).to_markdown().splitlines() == [
+        "| joint | range | peak speed | peak force | RMS force | peak error | RMS error |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
+        "| q1 | 0.00 to 57.30 deg | 57.30 deg/s | 2 N m | 1.414 N m |  |  |",
+        f"| X1 | 20.00 to 20.00 mm | 0.00 mm/s | 50 N | 50 N | 0.5 mm | {rms_error:.4g} mm |",
+        "| tip |  |  |  |  | 2 mm | 2 mm |",
+    ]

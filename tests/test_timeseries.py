@@ -1,0 +1,129 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from crane.errors import RecordingError
+from crane.timeseries import Table, read, write
+
+GOOD = "time [s],a [m],b\n0,1,2\n0.5,3,4\n"
+
+
+def read_text(tmp_path, text, **kwargs):
+    path = tmp_path / "table.csv"
+    path.write_text(text, **kwargs)
+    return read(path)
+
+
+def test_reads_names_units_and_numbers(tmp_path):
+    table = read_text(tmp_path, GOOD)
+    assert table.units == {"time": "s", "a": "m", "b": ""}
+    np.testing.assert_array_equal(table.values, [[0, 1, 2], [0.5, 3, 4]])
+    assert table.notes == {}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        GOOD.replace("\n", "\r\n"),
+        GOOD + "\n\n",
+        "\n" + GOOD,
+        GOOD.replace(",", " , "),
+        '"time [s]","a [m]","b"\n0,1,2\n0.5,3,4\n',
+        "\ufeff" + GOOD,
+        GOOD.rstrip("\n"),
+    ],
+    ids=["crlf", "blank end", "blank start", "blanks", "quotes", "byte order mark", "no newline"],
+)
+def test_other_ways_to_write_the_same(tmp_path, text):
+    table = read_text(tmp_path, text, encoding="utf-8", newline="")
+    assert table.units == {"time": "s", "a": "m", "b": ""}
+    np.testing.assert_array_equal(table.values, [[0, 1, 2], [0.5, 3, 4]])
+
+
+def test_notes_keep_what_follows_the_first_colon(tmp_path):
+    notes = read_text(tmp_path, "# machine: C:\\cranes\\big.yaml\n#task:lift\n" + GOOD).notes
+    assert notes == {"machine": "C:\\cranes\\big.yaml", "task": "lift"}
+
+
+# What is written, and the line that the user sees after the name of the file.
+BROKEN = {
+    "empty": ("", "is empty, write a header row and one row per sample"),
+    "comments only": ("# machine: x\n\n", "is empty, write a header row"),
+    "no header": ("0,1,2\n", "has no header, name the columns in the first row"),
+    "no samples": ("time [s],a [m]\n\n", "has a header and no samples, write one row per sample"),
+    "no time": ("t [s],a [m]\n0,1\n", "no column 'time' in the header, add 'time [s]'"),
+    "semicolons": ("time [s];a [m]\n0;1\n", "separates columns by ';', use commas"),
+    "tabs": ("time [s]\ta [m]\n0\t1\n", r"separates columns by '\t', use commas"),
+    "time without unit": ("time,a\n0,1\n", "column 'time' has no unit, give 'time [s]'"),
+    "milliseconds": ("time [ms],a\n0,1\n", "column 'time' is in [ms], give 'time [s]'"),
+    "twice": ("time [s],a [m],a [m]\n0,1,1\n", "column 'a' is there twice, rename or remove one"),
+    "nameless": ("time [s],,b\n0,1,2\n", "column 2 is headed '', write 'name [unit]'"),
+    "brackets": ("time [s],a [m\n0,1\n", "column 2 is headed 'a [m', write 'name [unit]'"),
+    "comma in a name": ('time [s],"a,b"\n0,1\n', "'a,b' cannot be the name of a column"),
+    "short row": (GOOD + "1,2\n", "line 4 has 2 cells, give 3 as in the header"),
+    "long row": (GOOD + "1,2,3,\n", "line 4 has 4 cells, give 3 as in the header"),
+    "all rows short": ("time [s],a,b\n0,1\n1,2\n", "line 2 has 2 cells, give 3"),
+    "text": ("# x\n" + GOOD + "1,two,3\n", "line 5, column 'a': 'two' is not a finite number"),
+    "blank cell": (GOOD + "1,,3\n", "line 4, column 'a': '' is not a finite number"),
+    "underscore": (GOOD + "1,2_0,3\n", "line 4, column 'a': '2_0' is not a finite number"),
+    "nan": (GOOD + "\n1,2,nan\n", "line 5, column 'b': 'nan' is not a finite number"),
+    "infinite": (GOOD + "1,-inf,3\n", "line 4, column 'a': '-inf' is not a finite number"),
+    "too large": (GOOD + "1,1e999,3\n", "line 4, column 'a': '1e999' is not a finite number"),
+    "time stands": (GOOD + "0.5,5,6\n", "line 4: time goes from 0.5 to 0.5 s, give strictly"),
+    "time goes back": (GOOD + "\n0.25,5,6\n", "line 5: time goes from 0.5 to 0.25 s, give"),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), BROKEN.values(), ids=BROKEN.keys())
+def test_broken_files(tmp_path, text, message):
+    with pytest.raises(RecordingError) as caught:
+        read_text(tmp_path, text)
+    line = str(caught.value)
+    assert line.startswith(f"{tmp_path / 'table.csv'}: ")
+    assert message in line
+    assert "\n" not in line
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(RecordingError, match="no such file or directory, give the path of a CSV"):
+        read(tmp_path / "none.csv")
+
+
+def test_folder(tmp_path):
+    with pytest.raises(RecordingError, match="is a directory, give the path of a CSV file"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize("rows", [b"", b"time [s],a\n0,1\n"], ids=["at once", "below the header"])
+def test_binary_file(tmp_path, rows):
+    path = tmp_path / "table.csv"
+    path.write_bytes(rows + b"\x1f\x8b\xff\xfe\x00\n")
+    with pytest.raises(RecordingError, match="is not text, give a CSV in UTF-8"):
+        read(path)
+
+
+@given(
+    st.lists(
+        st.floats(allow_nan=False, allow_infinity=False),
+        min_size=1,
+        max_size=30,
+    )
+)
+def test_numbers_survive_bit_by_bit(tmp_path_factory, numbers):
+    path = tmp_path_factory.mktemp("table") / "table.csv"
+    values = np.column_stack([np.arange(len(numbers), dtype=float), numbers])
+    write(path, Table({"time": "s", "a": ""}, values, {}))
+    back = read(path).values
+    assert [math.copysign(1.0, x) for x in back[:, 1]] == [math.copysign(1.0, x) for x in numbers]
+    np.testing.assert_array_equal(back, values)
+
+
+def test_long_tables_are_written_whole(tmp_path):
+    values = np.column_stack([np.arange(10_001.0), np.sqrt(np.arange(10_001.0))])
+    write(tmp_path / "table.csv", Table({"time": "s", "a": "m"}, values, {"task": "count"}))
+    table = read(tmp_path / "table.csv")
+    np.testing.assert_array_equal(table.values, values)
+    assert table.notes == {"task": "count"}
