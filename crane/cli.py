@@ -91,9 +91,10 @@ def check(file: MachineName) -> None:
     for warning in caught:
         _say(f"warning: {warning.message}")
     residual = float(loaded.closure.residual(loaded.home))
+    loops = len(loaded.closure.equations.loops)
     print(
-        f"{loaded.name}: {len(loaded.joints)} joints, {len(loaded.closure.equations.loops)} loops, "
-        f"{len(loaded.active)} degrees of freedom, loops closed to {residual:.1e} m at home"
+        f"{loaded.name}: {len(loaded.joints)} joints, {loops} loops, {len(loaded.active)} "
+        f"degrees of freedom, loops closed to {residual:.1e} m at home"
     )
     if caught:
         raise typer.Exit(1)
@@ -114,9 +115,10 @@ def simulate(
     """Simulate a task, or without one the free motion from the home posture."""
     from crane.control import controller as make_controller
     from crane.paths import task_path
-    from crane.runs import prepare_folder, write_run
+    from crane.runs import check_folder, write_run
     from crane.simulation import simulate as run
 
+    check_folder(out, force)
     loaded = _load(machine)
     control = None
     if task is not None:
@@ -131,7 +133,6 @@ def simulate(
         recording = run(
             loaded, control, duration=duration, step=step, task=task or "", progress=progress
         )
-    prepare_folder(out, force)
     title = f"{loaded.name}: {task or 'free motion'}"
     print(write_run(out, recording, title), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")
@@ -181,9 +182,9 @@ def plot(
 def demo(out: Out = Path("demo-output"), force: Force = False) -> None:
     """Simulate the three published trajectories of the reduced-scale forwarder."""
     from crane.demo import run_demo
-    from crane.runs import FIGURE, PAGE, prepare_folder
+    from crane.runs import FIGURE, PAGE, check_folder
 
-    prepare_folder(out, force)
+    check_folder(out, force)
     with _progress("simulating") as progress:
         text = run_demo(out, progress)
     print(text)
@@ -253,7 +254,7 @@ def _describe(machine: "Machine") -> Iterator[str]:
         yield f"  solved as   {', then '.join(order)}"
     yield f"  tip         {machine.tip or 'none'}"
     for task in machine.tasks.values():
-        yield f"  task        {task.name}: {task.description or 'no description'}, {task.duration:g} s"
+        yield f"  task        {task.name}, {task.duration:g} s: {task.description}"
 
 
 @contextmanager
@@ -261,7 +262,8 @@ def _progress(what: str) -> Iterator[Callable[[float], None]]:
     from rich.console import Console
     from rich.progress import Progress
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         job = bar.add_task(what, total=1.0)
 
         def report(share: float) -> None:

@@ -26,9 +26,7 @@ class Controller(Protocol):
     def start(self, q_a: Array) -> Array:
         """The controller's own states (k,) at the start, integrated with the machine's."""
 
-    def __call__(
-        self, time: float, q_a: Array, v_a: Array, state: Array
-    ) -> tuple[Array, Array]:
+    def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
         """Active forces (n,) [N], [N m], and the rate of the controller's states."""
 
 
@@ -82,9 +80,7 @@ class PI:
         able = self._ki > 0
         return np.where(able, weight - self._kp * error, 0.0) / np.where(able, self._ki, 1.0)
 
-    def __call__(
-        self, time: float, q_a: Array, v_a: Array, state: Array
-    ) -> tuple[Array, Array]:
+    def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
         """See `Controller`; the states are the integrals of the errors."""
         error = self._reference(time)[0] - q_a
         return self._kp * error + self._ki * state, error
@@ -112,14 +108,10 @@ class ComputedTorque:
         """See `Controller`."""
         return np.zeros(0)
 
-    def __call__(
-        self, time: float, q_a: Array, v_a: Array, state: Array
-    ) -> tuple[Array, Array]:
+    def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
         """See `Controller`."""
         q_ref, v_ref, a_ref = self._reference(time)
-        wanted = (
-            a_ref + 2 * self._bandwidth * (v_ref - v_a) + self._bandwidth**2 * (q_ref - q_a)
-        )
+        wanted = a_ref + 2 * self._bandwidth * (v_ref - v_a) + self._bandwidth**2 * (q_ref - q_a)
         return self._dynamics.inverse(q_a, v_a, wanted, friction=True), state
 
 
@@ -139,15 +131,19 @@ class Feedback:
         """See `Controller`."""
         return np.zeros(0)
 
-    def __call__(
-        self, time: float, q_a: Array, v_a: Array, state: Array
-    ) -> tuple[Array, Array]:
+    def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
         """See `Controller`."""
         tau = np.asarray(self._function(time, q_a.copy(), v_a.copy()), dtype=np.float64)
         if tau.shape != (len(self._active),):
             raise InputError(
                 f"the controller gave the shape {tau.shape} at t = {time:g} s, return one force "
                 f"per active joint ({', '.join(self._active)})"
+            )
+        if not np.isfinite(tau).all():
+            joint = self._active[int(np.argmin(np.isfinite(tau)))]
+            raise InputError(
+                f"the controller gave {tau[self._active.index(joint)]} for {joint} at "
+                f"t = {time:g} s, return finite forces"
             )
         return tau, state
 

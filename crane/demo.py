@@ -23,7 +23,7 @@ def run_demo(folder: Path, progress: Progress) -> str:
     """Simulate the three published trajectories of the reduced-scale forwarder.
 
     Args:
-        folder: Where results go, one folder per task; it exists.
+        folder: Where results go, one folder per task; created where there is none.
         progress: Called with the finished share, 0 to 1.
 
     Returns:
@@ -62,8 +62,9 @@ def _run_task(task: str, folder: Path, queue: Any) -> str:
     with warnings.catch_warnings():  # the caller has told them
         warnings.simplefilter("ignore", CraneWarning)
         machine = load(MACHINE)
-    recording = simulate(machine, PI(machine, task_path(machine, task)), task=task, progress=report)
-    (folder / task).mkdir(exist_ok=True)
+    recording = simulate(
+        machine, PI(machine, task_path(machine, task)), task=task, progress=report
+    )
     text = write_run(folder / task, recording, f"{machine.name}: {task}")
     write_views(folder / task, machine, recording)
     queue.put((task, 1.0))

@@ -8,7 +8,14 @@ from difflib import get_close_matches
 
 
 class CraneError(Exception):
-    """Base class of everything this package raises on purpose."""
+    """Base class of everything this package raises on purpose.
+
+    Args:
+        message: One line; what cannot be printed in it (a name may hold it) becomes a space.
+    """
+
+    def __init__(self, message: str):
+        super().__init__("".join(c if c.isprintable() else " " for c in message))
 
 
 class DescriptionError(CraneError):
@@ -16,7 +23,16 @@ class DescriptionError(CraneError):
 
 
 class MechanismError(CraneError):
-    """The parts are well described, but do not make a machine that can be driven."""
+    """The parts are well described, but do not make a machine that can be driven.
+
+    Args:
+        message: See `CraneError`.
+        about: What of the description it is about: "active", "home", or "loop" and its name.
+    """
+
+    def __init__(self, message: str, about: str = ""):
+        super().__init__(message)
+        self.about = about
 
 
 class InputError(CraneError):

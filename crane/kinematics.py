@@ -112,6 +112,8 @@ class Kinematics:
         start = None if guess is None else self.machine.check_limits(guess, "guess")
         if targets.ndim == 1:
             return self._inverse(targets, start, "")
+        if len(targets) == 0:
+            raise InputError("position is an empty stack, give at least one sample")
         out = np.empty((len(targets), len(self.machine.active)))
         for i, target in enumerate(targets):
             start = out[i] = self._inverse(target, start, f" (sample {i})")
@@ -131,7 +133,9 @@ class Kinematics:
         home = machine.home[machine.closure.active]
         axes = [
             (low + span * np.array([0.2, 0.5, 0.8]) if np.isfinite(span) else [at])
-            for low, span, at in zip(machine.lower, machine.upper - machine.lower, home, strict=True)
+            for low, span, at in zip(
+                machine.lower, machine.upper - machine.lower, home, strict=True
+            )
         ]
         found = [(np.array(machine.home), self.position_at(machine.home))]
         for q_a in itertools.islice(itertools.product(*axes), 243):
@@ -175,7 +179,7 @@ class Kinematics:
         distance = float(np.linalg.norm(error))
         damping = 1e-6
         for _ in range(100):
-            if distance < 1e-16:
+            if distance < 1e-15:  # [m] rounding
                 break
             q_a = q[closure.active]
             jacobian = self._jacobian(q) * self._scale

@@ -146,8 +146,8 @@ class Machine:
             joint = index[-1]
             sample = f" in sample {index[0]}" if q_a.ndim == 2 else ""
             raise LimitError(
-                f"{what}: {self.active[joint]} = {q_a[index]:.6g}{sample} is outside of its limits "
-                f"{self.lower[joint]:.6g} to {self.upper[joint]:.6g} "
+                f"{what}: {self.active[joint]} = {q_a[index]:.6g}{sample} is outside of its "
+                f"limits {self.lower[joint]:.6g} to {self.upper[joint]:.6g} "
                 f"{self.unit(self.active[joint])}, choose one within them"
             )
         return q_a
@@ -166,12 +166,13 @@ class Machine:
         """
         for joint in friction or {}:
             self.column(joint)
-        for element in (*(forces or ()), *(end_stops or ())):
-            column = self.column(element.joint)
-            if isinstance(element, EndStop) and not np.isfinite(
-                self.model.upperPositionLimit[column] - self.model.lowerPositionLimit[column]
-            ):
-                raise InputError(f"joint '{element.joint}' has no limits to stop at")
+        for force in forces or ():
+            self.column(force.joint)
+        for stop in end_stops or ():
+            column = self.column(stop.joint)
+            limits = self.model.lowerPositionLimit[column], self.model.upperPositionLimit[column]
+            if not np.isfinite(limits).all():
+                raise InputError(f"joint '{stop.joint}' has no limits to stop at, give it some")
         return dataclasses.replace(
             self,
             friction=self.friction if friction is None else dict(friction),
@@ -219,22 +220,12 @@ def load(name: str | Path) -> Machine:
     spec = read(name)
     model = _assemble(spec)
     active = tuple(model.names)[1:] if spec.active is None else spec.active
-    lower, upper = model.lowerPositionLimit, model.upperPositionLimit
-    guess = np.clip(np.zeros(model.nq), lower, upper)
-    for joint, value in spec.home.items():
-        column = model.joints[model.getJointId(joint)].idx_q
-        if joint in active and not lower[column] <= value <= upper[column]:
-            raise DescriptionError(
-                f"{spec.where['home']}: home of '{joint}' is {value:g}, outside of its limits "
-                f"{lower[column]:g} to {upper[column]:g}"
-            )
-        guess[column] = value
     try:
-        closure = Closure(model, spec.loops, active, guess)
+        closure = Closure(model, spec.loops, active, _home_guess(spec, model, active))
     except MechanismError as error:
-        text = str(error)
-        where = spec.where.get("active", spec.path.name)
-        raise MechanismError(text if text.split(":")[0].endswith("yaml") else f"{where}: {text}") from None
+        where = spec.where.get(error.about, spec.path.name)
+        raise MechanismError(f"{where}: {error}", error.about) from None
+    lower, upper = model.lowerPositionLimit, model.upperPositionLimit
     return Machine(
         name=spec.name,
         source=spec.source,
@@ -254,6 +245,21 @@ def load(name: str | Path) -> Machine:
     )
 
 
+def _home_guess(spec: MachineSpec, model: pin.Model, active: tuple[str, ...]) -> Array:
+    """(nq,) coordinates under `home`, of other joints zero or the limit nearest to it."""
+    lower, upper = model.lowerPositionLimit, model.upperPositionLimit
+    guess = np.clip(np.zeros(model.nq), lower, upper)
+    for joint, value in spec.home.items():
+        column = model.joints[model.getJointId(joint)].idx_q
+        if joint in active and not lower[column] <= value <= upper[column]:
+            raise DescriptionError(
+                f"{spec.where[f'home {joint}']}: home of '{joint}' is {value:g}, outside of its "
+                f"limits {lower[column]:g} to {upper[column]:g}, choose one within them"
+            )
+        guess[column] = value
+    return guess
+
+
 def _assemble(spec: MachineSpec) -> pin.Model:
     """Pinocchio's model of the merged chains.
 
@@ -261,29 +267,35 @@ def _assemble(spec: MachineSpec) -> pin.Model:
     chain by chain make its crba wrong without a word.
     """
     robot = copy.deepcopy(spec.tree)
-    endless = []
     for joint in robot.iter("joint"):
         if joint.get("type") == "continuous":
-            endless.append(joint.get("name"))
-            joint.set("type", "revolute")
-            for limit in joint.findall("limit"):
-                joint.remove(limit)
-            attributes = {"lower": -_NO_LIMIT, "upper": _NO_LIMIT, "effort": 0, "velocity": 0}
-            etree.SubElement(joint, "limit", {key: str(v) for key, v in attributes.items()})
+            joint.set("type", "revolute")  # Pinocchio's continuous joint has two coordinates
+        if joint.get("type") != "fixed":
+            limit = joint.find("limit")
+            if limit is None:
+                limit = etree.SubElement(joint, "limit")
+            for key, sign in (("lower", "-"), ("upper", ""), ("effort", ""), ("velocity", "")):
+                limit.set(key, limit.get(key, f"{sign}{_NO_LIMIT}"))
     model = pin.buildModelFromXML(etree.tostring(robot).decode())
-    for name in endless:
-        column = model.joints[model.getJointId(name)].idx_q
-        model.lowerPositionLimit[column] = -np.inf
-        model.upperPositionLimit[column] = np.inf
+    for limits in (
+        model.lowerPositionLimit, model.upperPositionLimit, model.effortLimit, model.velocityLimit,
+    ):  # fmt: skip
+        endless = np.abs(limits) >= _NO_LIMIT
+        limits[endless] = np.copysign(np.inf, limits[endless])
     model.name = spec.name
+    moved = {joint.get("name"): joint.find("child").get("link") for joint in robot.iter("joint")}
     for index in range(1, model.njoints):
         name = model.names[index]
-        where = spec.where[f"joint {name}"]
         inertia = model.inertias[index]
+        link = moved[name]
+        where = spec.where[f"link {link}"]
         if not inertia.mass > 0:
             raise DescriptionError(
-                f"{where}: joint '{name}' moves a link without mass, give it an <inertial>"
+                f"{where}: joint '{name}' moves link '{link}', which has no mass, give it an "
+                "<inertial>"
             )
         if problem := inertia_problem(inertia.mass, inertia.inertia):
-            raise DescriptionError(f"{where}: what joint '{name}' moves has {problem}")
+            raise DescriptionError(
+                f"{where}: link '{link}' with what is fixed to it has {problem}"
+            )
     return model

@@ -59,13 +59,18 @@ def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Path
     Raises:
         InputError: No coordinates, not finite, or no duration.
     """
-    if not (np.isfinite(duration) and duration > 0):
-        raise InputError(f"the path's duration is {duration} s, give a positive number")
-    size = max((len(row) for row in coefficients), default=0)
-    if not size or not all(np.isfinite(row).all() for row in coefficients):
-        raise InputError("the path's coefficients are not finite numbers, give a list per coordinate")
-    table = np.zeros((size, 1, len(coefficients)))
-    for column, row in enumerate(coefficients):
+    _check_duration(duration)
+    try:
+        rows = [np.asarray(row, dtype=np.float64) for row in coefficients]
+    except (TypeError, ValueError):
+        rows = []
+    size = max((row.size for row in rows if row.ndim == 1), default=0)
+    if not size or not all(row.ndim == 1 and np.isfinite(row).all() for row in rows):
+        raise InputError(
+            "the path's coefficients are not finite numbers, give a list per coordinate"
+        )
+    table = np.zeros((size, 1, len(rows)))
+    for column, row in enumerate(rows):
         table[size - len(row) :, 0, column] = row[::-1]
     return Path(PPoly(table, [0.0, duration]))
 
@@ -79,11 +84,11 @@ def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Path:
         duration: T [s].
 
     Raises:
-        InputError: Different shapes or not finite.
+        InputError: Different sizes, not finite, or no duration.
     """
-    first = np.atleast_1d(np.asarray(start, dtype=np.float64))
-    last = as_samples(np.atleast_1d(end), len(first), "end")
-    as_samples(first, len(first), "start")
+    _check_duration(duration)
+    first = as_samples(np.ravel(start), np.size(start), "start")
+    last = as_samples(np.ravel(end), len(first), "end")
     shape = np.array([0, 0, 0, 10.0, -15.0, 6.0]) / duration ** np.arange(6)
     return polynomial(
         [[a, *((b - a) * shape[1:])] for a, b in zip(first, last, strict=True)], duration
@@ -138,3 +143,8 @@ def task_path(machine: Machine, task: str) -> Path:
     path = polynomial([chosen.coefficients[name] for name in machine.active], chosen.duration)
     machine.check_limits(path(np.linspace(0, path.duration, 501))[0], f"task '{task}'")
     return path
+
+
+def _check_duration(duration: float) -> None:
+    if not (np.isfinite(duration) and duration > 0):
+        raise InputError(f"the path's duration is {duration} s, give a positive number")

@@ -21,7 +21,8 @@ from numpy.typing import ArrayLike
 
 from crane import timeseries
 from crane.errors import RecordingError, known
-from crane.timeseries import TIME, Array, Table
+from crane.samples import Array
+from crane.timeseries import TIME, Table
 
 VELOCITY_UNITS = {"rad": "rad/s", "m": "m/s"}
 FORCE_UNITS = {"rad": "N m", "m": "N"}

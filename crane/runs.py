@@ -11,19 +11,36 @@ from crane.summary import summarize
 RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
 
 
-def prepare_folder(folder: Path, force: bool) -> None:
-    """Create a folder for results.
+def check_folder(folder: Path, force: bool) -> None:
+    """See that results may go to a folder, before they are computed.
 
     Raises:
-        OutputError: It holds something already and `force` is off, or it cannot be created.
+        OutputError: It holds something already and `force` is off, or it is a file.
     """
     try:
         if folder.is_dir() and any(folder.iterdir()) and not force:
             raise OutputError(f"{folder}: is not empty, choose another folder or add --force")
+    except OSError as error:
+        raise _no_folder(folder, error) from None
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file, give the name of a folder")
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder where there is none.
+
+    Raises:
+        OutputError: It cannot be created.
+    """
+    try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise OutputError(f"{folder}: cannot be a folder ({reason}), choose another") from None
+        raise _no_folder(folder, error) from None
+
+
+def _no_folder(folder: Path, error: OSError) -> OutputError:
+    reason = (error.strerror or str(error)).lower()
+    return OutputError(f"{folder}: cannot be a folder ({reason}), choose another")
 
 
 def check_free(file: Path, force: bool) -> None:
@@ -37,11 +54,15 @@ def check_free(file: Path, force: bool) -> None:
 
 
 def write_run(folder: Path, recording: Recording, title: str) -> str:
-    """Write a recording and its summary into a folder.
+    """Write a recording and its summary into a folder, created where there is none.
 
     Returns:
         The summary, Markdown.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
     """
+    make_folder(folder)
     text = f"# {title}\n\n{summarize(recording).to_markdown()}"
     recording.to_csv(folder / RECORDING)
     with replacing(folder / SUMMARY) as part:

@@ -40,6 +40,11 @@ def as_samples(value: ArrayLike, size: int, what: str, names: Sequence[str] = ()
     return array
 
 
+def solve(matrix: Array, right: Array) -> Array:
+    """Solution x of matrix x = right, float64 for the type checker too."""
+    return np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
+
+
 def per_sample(function: Callable[..., Array], *arrays: Array) -> Array:
     """Apply a function of single samples to single samples or row by row to stacks.
 

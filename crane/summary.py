@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.recording import FORCE_UNITS, Recording
-from crane.timeseries import Array
+from crane.samples import Array
 
 # Unit to read a coordinate in, and how many of it make one rad or m.
 READING_UNITS = {"rad": ("deg", 180.0 / np.pi), "m": ("mm", 1000.0)}
@@ -72,7 +72,7 @@ class Summary:
             rows.append(
                 (
                     joint.name,
-                    f"{scale * joint.lowest:.2f} to {scale * joint.highest:.2f} {unit}",
+                    f"{scale * joint.lowest:z.2f} to {scale * joint.highest:z.2f} {unit}",
                     f"{scale * joint.peak_speed:.2f} {unit}/s",
                     f"{joint.peak_force:.4g} {force}",
                     f"{joint.rms_force:.4g} {force}",
@@ -148,4 +148,4 @@ def _peak(values: Array) -> float:
 
 
 def _measure(value: float | None, scale: float, unit: str) -> str:
-    return "" if value is None else f"{scale * value:.4g} {unit}"
+    return "" if value is None else f"{scale * value:.3f} {unit}"

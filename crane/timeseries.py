@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from crane.errors import RecordingError
 from crane.output import replacing
-
-Array = NDArray[np.float64]
+from crane.samples import Array
 
 TIME = "time"
 _WORD = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
@@ -109,7 +107,7 @@ def _head(path: Path) -> tuple[dict[str, str], str, int]:
 def _units(heading: str) -> dict[str, str]:
     """Names and units of the columns from the header row."""
     for other in (";", "\t"):
-        if heading.count(other) > heading.count(","):
+        if other in heading and "," not in heading:
             raise RecordingError(f"separates columns by {other!r}, use commas")
     cells = next(csv.reader([heading]))
     if all(_number(cell) is not None for cell in cells):

@@ -35,7 +35,9 @@ def main() -> None:
                 look(camera);
                 viewer.camera.zoom = zoom;
                 viewer.gui.hide();
-                if (bare) document.querySelectorAll(".panel").forEach((panel) => { panel.hidden = true; });
+                for (const panel of bare ? document.querySelectorAll(".panel") : []) {
+                    panel.hidden = true;
+                }
                 viewer.render();
             }""",
             [options.time, options.camera, options.zoom, options.bare],

@@ -2,7 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crane.errors import OutputError, RecordingError
@@ -39,7 +39,7 @@ def assert_equal(one, two):
 
 
 def test_arrays_are_own_contiguous_copies():
-    table = np.arange(12.0).reshape(3, 4)
+    table = np.asfortranarray(np.arange(12.0).reshape(3, 4))
     recording = make(q=table[:, :2], time=[0, 1, 2])
     table[:] = -1.0
     np.testing.assert_array_equal(recording.q, [[0, 1], [4, 5], [8, 9]])
@@ -112,6 +112,7 @@ def recordings(draw):
     )
 
 
+@settings(deadline=None)
 @given(recordings())
 def test_any_recording_survives_the_round_trip(tmp_path_factory, recording):
     path = tmp_path_factory.mktemp("run") / "run.csv"

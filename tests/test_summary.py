@@ -69,11 +69,20 @@ def test_markdown():
         "reference_tip_x": [0.002] * 2
     }
     recording = make([0.0, np.pi / 2], reference_X1=[0.0195, 0.02], **zero, **away)
-    rms_error = 0.5 * np.sqrt(0.5)
     assert summarize(recording).to_markdown().splitlines() == [
         "| joint | range | peak speed | peak force | RMS force | peak error | RMS error |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
         "| q1 | 0.00 to 57.30 deg | 57.30 deg/s | 2 N m | 1.414 N m |  |  |",
-        f"| X1 | 20.00 to 20.00 mm | 0.00 mm/s | 50 N | 50 N | 0.5 mm | {rms_error:.4g} mm |",
-        "| tip |  |  |  |  | 2 mm | 2 mm |",
+        "| X1 | 20.00 to 20.00 mm | 0.00 mm/s | 50 N | 50 N | 0.500 mm | 0.354 mm |",
+        "| tip |  |  |  |  | 2.000 mm | 2.000 mm |",
     ]
+
+
+def test_rounding_noise_reads_as_zero():
+    noise = np.array([[-1e-18], [2e-18]])
+    recording = Recording(
+        [0, 1], ("q1",), noise, noise, noise, {"q1": "rad"}, {"reference_q1": [0.0, 0.0]}
+    )
+    row = summarize(recording).to_markdown().splitlines()[2]
+    assert row.startswith("| q1 | 0.00 to 0.00 deg | 0.00 deg/s |")
+    assert row.endswith("| 0.000 deg | 0.000 deg |")

@@ -2,7 +2,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crane.errors import RecordingError
@@ -105,6 +105,7 @@ def test_binary_file(tmp_path, rows):
         read(path)
 
 
+@settings(deadline=None)
 @given(
     st.lists(
         st.floats(allow_nan=False, allow_infinity=False),

@@ -31,7 +31,7 @@ def block_triangular(incidence: NDArray[np.bool_]) -> list[Block] | None:
     if (unknown_of < 0).any():
         return None
     needs = incidence[:, unknown_of]  # equation i needs the unknown of equation j
-    count, label = connected_components(csr_array(needs), connection="strong")
+    count, label = connected_components(csr_array(needs.astype(float)), connection="strong")
     order = TopologicalSorter({block: set[int]() for block in range(count)})
     for i, j in np.argwhere(needs):
         if label[i] != label[j]:

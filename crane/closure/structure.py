@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from crane.closure.blocks import Block, block_triangular
@@ -11,7 +12,10 @@ from crane.closure.equations import LoopEquations
 from crane.errors import MechanismError
 from crane.samples import Array
 
+Indices = NDArray[np.intp]
+
 _RANK = 1e-8  # relative size of a pivot that still counts
+_SINGULAR = 1e-5  # the same at home, which closing finds to the root of rounding if singular
 _CLOSED = 1e-9
 
 
@@ -27,11 +31,11 @@ class Structure:
     """
 
     home: Array
-    rows: Array
-    redundant: Array
+    rows: Indices
+    redundant: Indices
     blocks: tuple[Block, ...]
 
-    def by_size(self) -> list[tuple[Array, Array]]:
+    def by_size(self) -> list[tuple[Indices, Indices]]:
         """Blocks of equal size k stacked: rows (b, k, 1) and columns (b, 1, k)."""
         out = []
         for size in sorted({len(rows) for rows, _ in self.blocks}):
@@ -50,11 +54,11 @@ def least_squares_step(jacobian: Array, phi: Array) -> Array:
     damping = 1e-12 + 1e-3 * float(phi @ phi)
     gram = jacobian.T @ jacobian
     step = np.linalg.solve(gram + damping * np.eye(len(gram)), -jacobian.T @ phi)
-    largest = np.abs(step).max(initial=0.0)
-    return step * min(1.0, 0.3 / largest) if largest > 0 else step
+    largest = float(np.abs(step).max(initial=0.0))
+    return np.asarray(step * min(1.0, 0.3 / largest) if largest > 0 else step, dtype=np.float64)
 
 
-def _close(equations: LoopEquations, q: Array, free: Array) -> Array:
+def _close(equations: LoopEquations, q: Array, free: Indices) -> Array:
     """Close all loops by moving the free joints; the residual tells whether that worked."""
     q = q.copy()
     for _ in range(200):
@@ -66,7 +70,7 @@ def _close(equations: LoopEquations, q: Array, free: Array) -> Array:
 
 
 def analyse(
-    equations: LoopEquations, active: Array, passive: Array, guess: Array
+    equations: LoopEquations, active: Indices, passive: Indices, guess: Array
 ) -> Structure:
     """Close the machine at home and find out what its equations determine.
 
@@ -88,11 +92,14 @@ def analyse(
     everything = np.arange(model.nv)
     if not equations.loops:
         if len(passive):
-            raise MechanismError(_missing(names, active, passive, model.nv))
+            raise MechanismError(_miscounted(names, active, passive, model.nv), "active")
         none = np.zeros(0, dtype=np.intp)
         return Structure(guess.copy(), none, none, ())
     somewhere = _close(equations, guess, everything)
-    _check_closed(equations, somewhere, names, active, guess, "from the guess under 'home'")
+    given = _at(names, active, guess)
+    _check_closed(
+        equations, somewhere, f"from the home guess ({given})", "correct the frames or the guess"
+    )
     random = np.random.default_rng(0)
     postures = [somewhere]
     for _ in range(4):
@@ -100,37 +107,48 @@ def analyse(
         near = _close(equations, moved, everything)
         if np.abs(equations.evaluate(near)[0]).max() < _CLOSED:
             postures.append(near)
-    rank = max(_rank(equations.evaluate(q)[1]) for q in postures)
+    jacobians = [equations.evaluate(q)[1] for q in postures]
+    for index, loop in enumerate(equations.loops):
+        rows = equations.loop_of_row == index
+        if max(np.abs(jacobian[rows]).max() for jacobian in jacobians) < _CLOSED:
+            raise MechanismError(
+                f"loop '{loop.name}' locks nothing that the joints do not lock already: remove it",
+                f"loop {loop.name}",
+            )
+    rank = max(_rank(jacobian) for jacobian in jacobians)
     freedom = model.nv - rank
     if freedom != len(active):
-        stuck = _undetermined(equations, postures, passive)
-        raise MechanismError(_missing(names, active, stuck, freedom))
-    drivable = max(_rank(equations.evaluate(q)[1][:, passive]) for q in postures)
+        stuck = _undetermined(jacobians, passive)
+        raise MechanismError(_miscounted(names, active, stuck, freedom), "active")
+    drivable = max(_rank(jacobian[:, passive]) for jacobian in jacobians)
     if drivable < rank:
-        stuck = _undetermined(equations, postures, passive)
+        stuck = _undetermined(jacobians, passive)
         raise MechanismError(
             f"the active joints {_list(names, active)} cannot drive {_list(names, stuck)}: "
-            "choose others"
+            "choose others",
+            "active",
         )
     home = _close(equations, guess, passive)
     _check_closed(
-        equations, home, names, active, guess,
-        "at the active coordinates under 'home' (guess more passive joints there)",
-    )  # fmt: skip
+        equations, home, f"at home ({given})", "choose other values or guess more passive joints"
+    )
     turned = equations.turned_over(home)
     if turned is not None:
         raise MechanismError(
-            f"loop '{turned}' closes with its frames turned over at home: guess its joints better"
+            f"loop '{turned}' closes at home with its axes opposed: turn a frame over, or guess "
+            "its joints better",
+            f"loop {turned}",
         )
     jacobian = equations.evaluate(home)[1][:, passive]
     _, upper, pivots = qr(jacobian.T, mode="economic", pivoting=True)
     diagonal = np.abs(np.diag(upper))
-    if (diagonal > _RANK * diagonal[0]).sum() < rank:
+    if (diagonal > _SINGULAR * diagonal[0]).sum() < rank:
         raise MechanismError(
             f"the home posture ({_at(names, active, home)}) is at the edge of the assembly "
-            "branch: choose another under 'home'"
+            "branch: choose another under 'home'",
+            "home",
         )
-    rows, redundant = np.sort(pivots[:rank]), np.sort(pivots[rank:])
+    rows, redundant = (np.sort(part).astype(np.intp) for part in np.split(pivots, [rank]))
     incidence = np.zeros((rank, rank), dtype=bool)
     for _ in range(3):  # open postures: an entry that is zero only on closed ones must count
         q = home + random.uniform(-0.3, 0.3, model.nv)
@@ -148,42 +166,49 @@ def _rank(jacobian: Array) -> int:
     return int((values > _RANK * values[0]).sum())
 
 
-def _undetermined(equations: LoopEquations, postures: Sequence[Array], passive: Array) -> Array:
+def _undetermined(jacobians: Sequence[Array], passive: Indices) -> Indices:
     """Passive joints that the loops leave free at held active joints."""
     free = np.zeros(len(passive))
-    for q in postures:
-        jacobian = equations.evaluate(q)[1][:, passive]
-        _, values, right = np.linalg.svd(jacobian)
+    for jacobian in jacobians:
+        _, values, right = np.linalg.svd(jacobian[:, passive])
         rank = int((values > _RANK * values.max(initial=0.0)).sum())
         free = np.maximum(free, np.abs(right[rank:]).max(axis=0, initial=0.0))
     return passive[free > 1e-6]
 
 
-def _check_closed(
-    equations: LoopEquations, q: Array, names: Sequence[str], active: Array, guess: Array, how: str
-) -> None:
+def _check_closed(equations: LoopEquations, q: Array, where: str, hint: str) -> None:
     phi, _ = equations.evaluate(q)
     worst = int(np.abs(phi).argmax())
-    if abs(phi[worst]) > _CLOSED:
+    if not abs(phi[worst]) <= _CLOSED:  # also NaN
         loop = equations.loops[equations.loop_of_row[worst]]
+        unit = "m" if equations.is_translation[worst] else "rad"
         raise MechanismError(
-            f"{loop.where}: loop '{loop.name}' stays {abs(phi[worst]):.3g} m open {how}, at "
-            f"{_at(names, active, guess)}: change 'home' or the frames"
+            f"loop '{loop.name}' cannot be closed {where}: it stays {abs(phi[worst]):.3g} {unit} "
+            f"open, {hint}",
+            f"loop {loop.name}",
         )
 
 
-def _list(names: Sequence[str], columns: Array) -> str:
+def _list(names: Sequence[str], columns: Indices) -> str:
     return ", ".join(names[int(i)] for i in columns)
 
 
-def _at(names: Sequence[str], active: Array, q: Array) -> str:
+def _at(names: Sequence[str], active: Indices, q: Array) -> str:
     return ", ".join(f"{names[int(i)]} = {q[int(i)]:.6g}" for i in active)
 
 
-def _missing(names: Sequence[str], active: Array, stuck: Array, freedom: int) -> str:
+def _miscounted(names: Sequence[str], active: Indices, stuck: Indices, freedom: int) -> str:
+    if freedom == 0:
+        return (
+            f"the loops leave {_list(names, active)} no freedom to move: check the types and axes "
+            "of the loops, and the axes of the joints"
+        )
     text = (
-        f"{len(active)} active joints ({_list(names, active)}) for {freedom} degrees of freedom: "
+        f"{len(active)} active joint{'s' * (len(active) != 1)} ({_list(names, active)}) for "
+        f"{freedom} degree{'s' * (freedom != 1)} of freedom: "
     )
-    if len(active) < freedom:
-        return text + f"activate {freedom - len(active)} of {_list(names, stuck)} too"
-    return text + f"name only {freedom} of them"
+    missing = freedom - len(active)
+    if missing < 0:
+        return text + f"name only {freedom} of them"
+    some = "" if missing == len(stuck) else f"{missing} of "
+    return text + f"activate {some}{_list(names, stuck)} too"

@@ -1,5 +1,6 @@
 """Reading and checking what the user wrote: machine files and URDFs."""
 
+from crane.description.inertia import inertia_problem
 from crane.description.machine_file import read
 from crane.description.sources import bundled, examples
 from crane.description.spec import (
@@ -13,7 +14,6 @@ from crane.description.spec import (
     PIGains,
     Task,
 )
-from crane.description.urdf import inertia_problem
 
 __all__ = [
     "LOOP_TYPES", "Chain", "EndStop", "ForceElement", "Friction", "LoopSpec", "MachineSpec",

@@ -1,9 +1,9 @@
 """Strict reading of YAML: every key known, every value of its kind, every error with its line."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import yaml
 
@@ -22,17 +22,34 @@ class _Map(dict[str, Any]):
 class _Loader(yaml.SafeLoader):
     """SafeLoader with lines, and without silently taking the last of equal keys."""
 
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """A value; what cannot be one (a 13th month, 0x without digits) is an error of YAML."""
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, KeyError, AttributeError, TypeError, OverflowError):
+            problem = f"'{node.value}' is no value of its kind, quote it if it is text"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
+
 
 def _construct_map(loader: _Loader, node: yaml.MappingNode) -> _Map:
     data = _Map(node.start_mark.line + 1)
     for key_node, value_node in node.value:
-        key = loader.construct_object(key_node, deep=True)
         line = key_node.start_mark.line + 1
         where = f"{Path(loader.name).name}:{line}"
+        if key_node.tag == "tag:yaml.org,2002:merge":
+            raise DescriptionError(f"{where}: '<<' is not supported, write the keys out")
+        key = loader.construct_object(key_node, deep=True)
         if not isinstance(key, str):
-            raise DescriptionError(f"{where}: key {key!r} is not a name, write it in quotes")
+            number = isinstance(key, int) and not isinstance(key, bool)
+            hint = ", and decimals with a point" if number else ""
+            raise DescriptionError(
+                f"{where}: key {_shown(key)} is not a name, write names in quotes{hint}"
+            )
         if key in data:
-            raise DescriptionError(f"{where}: key '{key}' is there twice, keep one")
+            first = data.lines[key]
+            raise DescriptionError(
+                f"{where}: key '{key}' is there twice (first in line {first}), keep one"
+            )
         data[key] = loader.construct_object(value_node, deep=True)
         data.lines[key] = line
     return data
@@ -43,47 +60,79 @@ _Loader.add_constructor("tag:yaml.org,2002:map", _construct_map)
 _MISSING: Any = object()
 
 
+def _shown(value: Any) -> str:
+    """A value in an error: short, whatever it is."""
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, list | tuple | set):
+        return "a list"
+    if isinstance(value, bool):
+        return f"{value} (in YAML, yes, no, on and off mean true and false)"
+    text = repr(value) if isinstance(value, str) else str(value)
+    return text if len(text) < 60 else f"{text[:60]}..."
+
+
 class Section:
-    """A mapping of a machine file, of which every key must be asked for.
+    """A mapping of a machine file.
 
     Args:
         data: The mapping.
         title: What it is, for errors ("loop 'A1_eye'").
         file: The file it stands in.
+        line: Its line, if not the mapping's own.
     """
 
-    def __init__(self, data: _Map, title: str, file: Path):
+    def __init__(self, data: _Map, title: str, file: Path, line: int | None = None):
         self._data, self._title, self._file = data, title, file
-        self._asked: list[str] = []
+        self._line = data.line if line is None else line
 
     @classmethod
-    def read(cls, file: Path) -> "Section":
+    def read(cls, file: Path, keys: Iterable[str]) -> "Section":
         """The top level of a YAML file.
 
         Raises:
-            DescriptionError: The file is missing, not YAML, or not a mapping.
+            DescriptionError: The file is missing, not YAML, or not a mapping of these keys.
         """
         try:
             with file.open(encoding="utf-8") as stream:
                 data = yaml.load(stream, _Loader)  # noqa: S506 (a SafeLoader)
-        except FileNotFoundError:
-            raise DescriptionError(f"{file}: no such file, check the path") from None
-        except (OSError, UnicodeDecodeError) as error:
-            raise DescriptionError(f"{file}: cannot be read ({error}), check the file") from None
+        except UnicodeDecodeError:
+            raise DescriptionError(f"{file.name}: not UTF-8, save it as UTF-8 text") from None
+        except OSError as error:
+            raise DescriptionError(
+                f"{file}: cannot be read ({error.strerror}), check the path"
+            ) from None
+        except yaml.reader.ReaderError as error:
+            what = f"it holds the control character number {error.character}"
+            raise DescriptionError(f"{file.name}: not YAML, {what}, remove it") from None
         except yaml.YAMLError as error:
             mark = getattr(error, "problem_mark", None)
             line = f":{mark.line + 1}" if mark else ""
-            problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+            problem = getattr(error, "problem", None) or "broken"
             raise DescriptionError(f"{file.name}{line}: not YAML, {problem}, mend it") from None
         except RecursionError:
             raise DescriptionError(f"{file.name}: nested too deep, simplify it") from None
+        if data is None:
+            raise DescriptionError(f"{file.name}: the file is empty, write a machine in it")
         if not isinstance(data, _Map):
-            raise DescriptionError(f"{file.name}: not a machine file, it must start with 'name:'")
-        return cls(data, "machine file", file)
+            raise DescriptionError(f"{file.name}: not a machine file, write keys such as 'name:'")
+        section = cls(data, "the machine file", file)
+        section.only(*keys)
+        return section
+
+    def only(self, *keys: str) -> None:
+        """Raise for any other key.
+
+        Raises:
+            DescriptionError: There is an unknown key; the nearest known one is named.
+        """
+        for key in self._data:
+            if key not in keys:
+                raise self.fail(key, f"unknown key '{key}' in {self._title}, {known(keys, key)}")
 
     def where(self, key: str | None = None) -> str:
         """File and line of the section or of one of its keys."""
-        line = self._data.lines.get(key, self._data.line) if key else self._data.line
+        line = self._data.lines.get(key, self._line) if key else self._line
         return f"{self._file.name}:{line}"
 
     def fail(self, key: str | None, what: str) -> DescriptionError:
@@ -91,90 +140,137 @@ class Section:
         return DescriptionError(f"{self.where(key)}: {what}")
 
     def _take(self, key: str, default: Any) -> Any:
-        self._asked.append(key)
         value = self._data.get(key, default)
-        if value is _MISSING or (value is None and default is _MISSING):
+        if value is _MISSING:
             raise self.fail(None, f"{self._title} has no '{key}', add it")
-        return default if value is None else value
+        if value is None and default is not None:
+            raise self.fail(key, f"'{key}' of {self._title} is empty, give its value")
+        return value
 
-    def text(self, key: str, default: str | None = _MISSING) -> str:
+    @overload
+    def text(self, key: str, default: str = ...) -> str: ...
+    @overload
+    def text(self, key: str, default: None) -> str | None: ...
+    def text(self, key: str, default: str | None = _MISSING) -> str | None:
         """A non-empty string."""
         value = self._take(key, default)
-        if value is default and default is not _MISSING:
+        if value is default:
             return value
         if not isinstance(value, str) or not value.strip():
-            raise self.fail(key, f"'{key}' of {self._title} must be text, not {value!r}")
+            raise self.fail(
+                key, f"'{key}' of {self._title} is {_shown(value)}, give text (or quote it)"
+            )
+        if not "".join(value.split()).isprintable():
+            raise self.fail(key, f"'{key}' of {self._title} holds control characters, remove them")
         return value
 
     def number(self, key: str, default: float = _MISSING, minimum: float = -math.inf) -> float:
         """A finite number, at least `minimum`."""
         number = self._number(key, self._take(key, default))
         if number < minimum:
-            raise self.fail(key, f"'{key}' of {self._title} is {number}, at least {minimum:g}")
+            raise self.fail(
+                key, f"'{key}' of {self._title} is {number:g}, give at least {minimum:g}"
+            )
         return number
 
     def _number(self, key: str, value: Any) -> float:
+        hint = "give a number"
         # PyYAML reads 2e5 as text
-        if isinstance(value, bool) or not isinstance(value, int | float | str):
-            raise self.fail(key, f"'{key}' of {self._title} must be a number, not {value!r}")
-        try:
-            number = float(value)
-        except (ValueError, OverflowError):
-            number = math.nan
-        if not math.isfinite(number):
-            raise self.fail(key, f"'{key}' of {self._title} must be a number, not {value!r}")
-        return number
+        if isinstance(value, int | float | str) and not isinstance(value, bool):
+            try:
+                number = float(value)
+            except (ValueError, OverflowError):
+                number = math.nan
+                if isinstance(value, str) and "," in value:
+                    hint = "give a number with a decimal point"
+            if math.isfinite(number):
+                return number
+            if isinstance(value, float):
+                hint = "give a finite number"
+        raise self.fail(key, f"'{key}' of {self._title} is {_shown(value)}, {hint}")
 
     def numbers(self, key: str, default: Any = _MISSING) -> tuple[float, ...]:
         """A list of finite numbers."""
         value = self._take(key, default)
         if not isinstance(value, list | tuple) or not value:
+            shown = "empty" if value == [] else _shown(value)
             raise self.fail(
-                key, f"'{key}' of {self._title} must be a list of numbers, not {value!r}"
+                key, f"'{key}' of {self._title} is {shown}, give a list such as [0, 1]"
             )
         return tuple(self._number(key, item) for item in value)
 
     def names(self, key: str) -> tuple[str, ...]:
         """A list of different names."""
         value = self._take(key, _MISSING)
-        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-            raise self.fail(key, f"'{key}' of {self._title} must be a list of names")
-        twice = sorted({item for item in value if value.count(item) > 1})
-        if twice:
-            raise self.fail(key, f"'{key}' names {', '.join(twice)} twice, name it once")
+        if not isinstance(value, list):
+            raise self.fail(
+                key, f"'{key}' of {self._title} is {_shown(value)}, give a list such as [q1, q2]"
+            )
+        for item in value:
+            if not isinstance(item, str):
+                raise self.fail(
+                    key, f"'{key}' lists {_shown(item)}, which is not a name, quote it"
+                )
+            if value.count(item) > 1:
+                raise self.fail(key, f"'{key}' lists '{item}' twice, list it once")
         return tuple(value)
 
-    def section(self, key: str, title: str | None = None) -> "Section | None":
+    def file(self, key: str) -> Path:
+        """A file, named by its path from the folder of the machine file."""
+        text = self.text(key)
+        path = self._file.parent / text
+        try:
+            if path.is_dir():
+                raise self.fail(key, f"'{text}' of {self._title} is a folder, give a file")
+            found = path.is_file()
+        except OSError:  # a name longer than any file's
+            found = False
+        if not found:
+            raise self.fail(
+                key, f"{self._title}: there is no file '{text}', give its path from this folder"
+            )
+        return path.resolve()
+
+    def section(self, key: str, title: str) -> "Section | None":
         """A mapping, or None where the key is absent."""
         value = self._take(key, None)
         if value is None:
             return None
         if not isinstance(value, _Map):
-            raise self.fail(key, f"'{key}' of {self._title} must be a mapping 'name: value'")
-        return Section(value, title or f"'{key}'", self._file)
+            raise self.fail(key, f"{title} is {_shown(value)}, give a mapping 'name: value'")
+        return Section(value, title, self._file, self._data.lines[key])
 
-    def sections(self, key: str, title: str) -> Iterator["Section"]:
-        """The mappings of a list; none where the key is absent."""
-        value = self._take(key, [])
+    def mappings(self, key: str, title: str, *keys: str) -> "Iterator[tuple[str, Section]]":
+        """Names and mappings of a mapping of mappings with these keys."""
+        outer = self.section(key, f"'{key}'")
+        for name in outer._data if outer is not None else ():
+            assert outer is not None
+            inner = outer.section(name, f"{title} '{name}'")
+            if inner is None or not inner._data:
+                raise outer.fail(
+                    name, f"{title} '{name}' is empty, its keys are {', '.join(keys)}"
+                )
+            inner.only(*keys)
+            yield name, inner
+
+    def sections(self, key: str, title: str, *keys: str) -> "Iterator[Section]":
+        """The mappings of a list, with these keys; none where the list is absent."""
+        value = self._take(key, None)
+        if value is None:
+            return
         if not isinstance(value, list):
-            raise self.fail(key, f"'{key}' of {self._title} must be a list, its items with '- '")
+            raise self.fail(key, f"'{key}' is {_shown(value)}, give a list, its items with '- '")
         for item in value:
             if not isinstance(item, _Map):
-                raise self.fail(key, f"'{key}' holds {item!r}, each item must be a mapping")
+                raise self.fail(
+                    key, f"'{key}' lists {_shown(item)}, write each item as {{key: value}}"
+                )
             name = item.get("name", item.get("joint"))
-            yield Section(item, f"{title} '{name}'" if name else f"a {title}", self._file)
+            section = Section(
+                item, f"{title} '{name}'" if isinstance(name, str) else f"a {title}", self._file
+            )
+            section.only(*keys)
+            yield section
 
-    def keys(self) -> list[str]:
-        """The keys that are there."""
-        return list(self._data)
-
-    def done(self) -> None:
-        """Raise for keys that nobody asked for.
-
-        Raises:
-            DescriptionError: There is an unknown key; the nearest known one is named.
-        """
-        for key in self._data:
-            if key not in self._asked:
-                hint = known(self._asked, key)
-                raise self.fail(key, f"unknown key '{key}' in {self._title}, {hint}")
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._data)

@@ -53,19 +53,28 @@ def find(name: str | Path) -> Path:
     Raises:
         DescriptionError: There is none.
     """
-    path = Path(name)
+    path, text = Path(name), str(name)
+    try:
+        is_file, is_folder = path.is_file(), path.is_dir()
+    except OSError as error:  # a name longer than any file's, a folder that may not be entered
+        raise DescriptionError(
+            f"{path}: cannot be read ({error.strerror}), check the path"
+        ) from None
     if path.suffix.lower() in {".yaml", ".yml", ".urdf"}:
-        if not path.is_file():
-            raise DescriptionError(f"{path}: no such file, check the path")
-        return path.resolve()
-    text = str(name)
-    if text in (machines := bundled()):
+        if is_file:
+            return path.resolve()
+        problem = "is a folder, give a file" if is_folder else "no such file, check the path"
+        raise DescriptionError(f"{path}: {problem}")
+    machines, robots = bundled(), examples()
+    if text in machines:
         return machines[text]
-    if text in (robots := examples()):
+    if text in robots:
         return robots[text]
-    if path.exists():
-        raise DescriptionError(f"{path}: not a machine, give a .yaml machine file or a .urdf")
+    if is_file or is_folder:
+        raise DescriptionError(
+            f"{path}: not a machine, give a machine file (.yaml) or a URDF (.urdf)"
+        )
     hint = known([*machines, *robots], text)
     if hint.startswith("known"):
         hint = known(machines)
-    raise DescriptionError(f"{text}: no such machine, {hint}; or give the path of a file")
+    raise DescriptionError(f"no machine and no file is named '{text}', {hint}")

@@ -1,6 +1,7 @@
 """What a user wrote, read and checked, before anything is assembled."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -44,6 +45,16 @@ class LoopSpec:
     successor: str
     axis: tuple[float, float, float]
     where: str
+
+
+def unit_vector(xyz: Sequence[float]) -> tuple[float, float, float] | None:
+    """The direction of three numbers; None if they are not three, or all zero."""
+    largest = max(abs(value) for value in xyz)
+    if len(xyz) != 3 or largest == 0:
+        return None
+    length = math.hypot(*(value / largest for value in xyz))
+    x, y, z = (value / largest / length for value in xyz)
+    return x, y, z
 
 
 # Locked directions of a loop joint whose axis is local z: three translations, three rotations.

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from crane.dynamics.elements import JointForces
 from crane.errors import InputError, known
 from crane.machine import Machine
-from crane.samples import Array, as_samples, per_sample
+from crane.samples import Array, as_samples, per_sample, solve
 
 FORMULATIONS = ("exact",)
 
@@ -140,8 +140,8 @@ class Dynamics:
             a_A (n,) [m/s2], [rad/s2].
         """
         bias = motion.gamma.T @ self._tree_force(motion, motion.drift, friction)
-        a_a: Array = np.linalg.solve(self._mass(motion.q, motion.gamma), tau_a - bias)
-        return a_a
+        mass = self._mass(motion.q, motion.gamma)
+        return solve(mass, tau_a - bias)
 
     def energy_at(self, q: Array, v: Array) -> tuple[float, float]:
         """`energy` of one posture (nq,) with velocities (nv,) of the tree."""
@@ -165,9 +165,7 @@ class Dynamics:
         Returns:
             (n, n) or (N, n, n) [kg], [kg m], [kg m2].
         """
-        return per_sample(
-            lambda q: self._mass(q, self._closure.gamma(q)), *self._arguments(q_a)
-        )
+        return per_sample(lambda q: self._mass(q, self._closure.gamma(q)), *self._arguments(q_a))
 
     def bias(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
         """Active forces at zero acceleration: gamma^T (rnea(q, v, drift) - f).

@@ -10,14 +10,15 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
 from crane.errors import OutputError
 from crane.output import replacing
 from crane.recording import FORCE_UNITS, Recording
+from crane.samples import Array
 from crane.summary import READING_UNITS, points
-from crane.timeseries import Array
 
 FORMATS: dict[str, dict[str, None] | None] = {  # with the date left out of what is written
     "png": None,
@@ -49,7 +50,6 @@ STYLE: Any = {
     "xtick.labelsize": 7.5,
     "ytick.labelsize": 7.5,
     "legend.frameon": False,
-    "savefig.bbox": "tight",
     "pdf.fonttype": 42,
     "svg.hashsalt": "crane",
 }
@@ -97,7 +97,10 @@ def recording_figure(recording: Recording) -> Figure:
     tip, joints = points(recording, "tip"), recording.joints
     with mpl.rc_context(STYLE):
         widths = [1.0] * len(joints) + [1.6] * (tip is not None)
-        figure = Figure(figsize=(2.4 * sum(widths) + 0.3, 6.0), layout="constrained")
+        width = 2.4 * sum(widths) + 0.3
+        margin = 0.2 if tip is not None else 0.0  # the layout overlooks the label of the z axis
+        layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0 - margin / width, 1.0))
+        figure = Figure(figsize=(width, 6.0), layout=layout)
         grid = figure.add_gridspec(3, len(widths), width_ratios=widths)
         for column, name in enumerate(joints):
             for row, panel in enumerate(_panels(recording, column)):
@@ -192,7 +195,7 @@ def _draw_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
         axes.text(*end, f" {name}", fontsize=7.5, va="bottom")
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="path of the tip")
-    axes.set_box_aspect(span, zoom=0.92)
+    axes.set_box_aspect(span, zoom=0.88)
     axes.view_init(elev=24, azim=-60)
     for axis, length in zip((axes.xaxis, axes.yaxis, axes.zaxis), span, strict=True):
         axis.set_major_locator(MaxNLocator(4 if length > 0.5 * span.max() else 2))

@@ -1,0 +1,49 @@
+"""Machines that several modules test with, and how property tests run."""
+
+import warnings
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+
+import crane
+from crane.errors import CraneWarning
+
+DATA = Path(__file__).parent / "data"
+
+# postures take milliseconds, the first one of a machine more: time says nothing
+settings.register_profile("crane", deadline=None, max_examples=60, derandomize=True)
+settings.load_profile("crane")
+
+
+@pytest.fixture(scope="session")
+def mini():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)  # an offset larger than its mean
+        return crane.load("mini_forwarder")
+
+
+@pytest.fixture(scope="session")
+def slider_crank():
+    return crane.load(DATA / "slider_crank.yaml")
+
+
+@pytest.fixture(scope="session")
+def stewart():
+    return crane.load(DATA / "stewart.urdf")
+
+
+@pytest.fixture
+def edited(tmp_path):
+    """Load a machine file of tests/data after replacing some of its text: edited(name, old, new)."""
+
+    def load(name, *changes):
+        text = (DATA / name).read_text().replace("urdf: ", f"urdf: {DATA}/")
+        for old, new in zip(changes[::2], changes[1::2], strict=True):
+            assert old in text
+            text = text.replace(old, new)
+        path = tmp_path / name
+        path.write_text(text)
+        return crane.load(path)
+
+    return load

@@ -1,0 +1,87 @@
+import warnings
+
+import numpy as np
+import pytest
+
+import crane
+from crane.control import CONTROLLERS, controller
+from crane.errors import CraneWarning, InputError
+
+
+@pytest.fixture(scope="module")
+def forwarder():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        return crane.load("mini_forwarder")
+
+
+@pytest.fixture(scope="module")
+def path(forwarder):
+    return crane.point_to_point([0.0, 0.012, 0.010], [0.5, 0.020, 0.014], 1.0)
+
+
+def test_pi_is_equation_7(forwarder, path):
+    pi = crane.PI(forwarder, path, integral=[0.1, 0.002, -0.003])
+    state = pi.start(np.zeros(3))
+    q_a = np.array([0.1, 0.011, 0.0125])
+    tau, rate = pi(0.4, q_a, np.ones(3), state)
+    error = path(0.4)[0] - q_a
+    np.testing.assert_array_equal(rate, error)
+    expected = [15, 5500, 18000] * error + [5, 19500, 20000] * np.array([0.1, 0.002, -0.003])
+    np.testing.assert_allclose(tau, expected, rtol=1e-15)
+
+
+def test_pi_starts_by_holding_the_weight(forwarder, path):
+    pi = crane.PI(forwarder, path)
+    q_a = path(0.0)[0] + [0.0, 1e-4, -1e-4]
+    tau, _ = pi(0.0, q_a, np.zeros(3), pi.start(q_a))
+    a_a = crane.Dynamics(forwarder).forward(q_a, np.zeros(3), tau, friction=True)
+    np.testing.assert_allclose(a_a, 0, atol=1e-9)
+
+
+def test_pi_with_empty_integrals_falls_first(forwarder, path):
+    falling = crane.simulate(
+        forwarder, crane.PI(forwarder, path, integral=np.zeros(3)), duration=0.1
+    )
+    held = crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.1)
+    error = [np.abs(r.q - path(r.time)[0])[:, 1].max() for r in (falling, held)]
+    assert error[0] > 5 * error[1]
+
+
+def test_computed_torque_follows_to_rounding(forwarder, path):
+    recording = crane.simulate(
+        forwarder, crane.ComputedTorque(forwarder, path), duration=0.5, step=2e-3
+    )
+    # the start is on the path at rest, so only the integration's error remains
+    assert np.abs(recording.q - path(recording.time)[0]).max() < 1e-8
+
+
+def test_computed_torque_corrects_like_a_critically_damped_oscillator(forwarder, path):
+    still = crane.point_to_point([0.0, 0.012, 0.010], [0.0, 0.012, 0.010], 1.0)
+    offset, w = np.array([0.02, 5e-4, -5e-4]), 30.0
+    recording = crane.simulate(
+        forwarder,
+        crane.ComputedTorque(forwarder, still, bandwidth=w),
+        initial=still(0.0)[0] + offset,
+        duration=0.3,
+    )
+    t = recording.time[:, None]
+    expected = offset * (1 + w * t) * np.exp(-w * t)
+    np.testing.assert_allclose(recording.q - still(0.0)[0], expected, atol=1e-8)
+
+
+def test_named_controllers(forwarder, path):
+    assert isinstance(controller("pi", forwarder, path), crane.PI)
+    assert isinstance(controller("computed-torque", forwarder, path), crane.ComputedTorque)
+    with pytest.raises(InputError, match=r"controller 'pid' is unknown, did you mean 'pi'\?"):
+        controller("pid", forwarder, path)
+    assert set(CONTROLLERS) == {"pi", "computed-torque"}
+
+
+def test_errors(forwarder, path):
+    with pytest.raises(InputError, match="no PI gains for active joint 'X1'"):
+        crane.PI(forwarder, path, gains={"q1": crane.PIGains(1, 1)})
+    with pytest.raises(InputError, match="the bandwidth is 0 rad/s"):
+        crane.ComputedTorque(forwarder, path, bandwidth=0)
+    with pytest.raises(InputError, match="integral has the shape"):
+        crane.PI(forwarder, path, integral=[0, 0])

@@ -1,0 +1,154 @@
+"""The assembled machine: what it says of itself, and what it refuses."""
+
+import dataclasses
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import crane
+from crane.errors import InputError, LimitError
+
+ELEVEN = {"q1", "q2", "q3", "q4", "X1", "q6", "q7", "q9", "q10", "X2", "q11"}
+
+
+def test_mini_forwarder_is_what_the_paper_describes(mini):
+    assert set(mini.joints) == ELEVEN and mini.active == ("q1", "X1", "X2")
+    assert [chain.name for chain in mini.chains] == ["A", "B1", "C", "B2", "D"]
+    assert [loop.name for loop in mini.closure.equations.loops] == ["A1_eye", "A2_eye", "J", "K"]
+    assert np.array_equal(mini.lower, [-np.pi, 0, 0])
+    assert np.array_equal(mini.upper, [np.pi, 0.030, 0.030])
+    assert {mini.unit(joint) for joint in ("X1", "X2")} == {"m"}
+    assert {mini.unit(joint) for joint in ELEVEN - {"X1", "X2"}} == {"rad"}
+    assert set(mini.tasks) == {"loading", "return", "lift"} and set(mini.control) == {*mini.active}
+    assert mini.tip == "link7_tip" and mini.reference == "mini_forwarder"
+    assert pin.computeTotalMass(mini.model) == pytest.approx(1.2874, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", ["mini", "stewart", "slider_crank"])
+def test_tree_has_one_coordinate_per_joint_and_a_frame_per_link(name, request):
+    machine = request.getfixturevalue(name)
+    model = machine.model
+    assert model.nq == model.nv == len(machine.joints)
+    for joint in machine.joints:
+        assert machine.joints[machine.column(joint)] == joint
+    links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+    assert len(links) == len(set(links))
+    for loop in machine.closure.equations.loops:
+        assert {loop.predecessor, loop.successor} <= set(links)
+    assert machine.home.shape == (model.nq,)
+    # depth-first: a joint's number is larger than its parent's, and subtrees are unbroken
+    for joint in range(1, model.njoints):
+        subtree = list(model.subtrees[joint])
+        assert subtree == list(range(joint, joint + len(subtree)))
+
+
+def test_joints_turn_the_papers_way(mini):
+    """A positive step of each joint alone, seen from the side: which way does its body turn?"""
+    data = mini.model.createData()
+    bodies = {"q2": "link3", "q4": "A1_barrel", "q9": "link2", "q10": "A2_barrel", "q11": "link5",
+              "q3": "link7", "q6": "link4", "q7": "link6"}  # fmt: skip
+    for joint, link in bodies.items():
+        angle = []
+        for step in (0.0, 0.1):
+            q = mini.home.copy()
+            q[mini.column(joint)] += step
+            pin.framesForwardKinematics(mini.model, data, q)
+            x = data.oMf[mini.frame(link)].rotation[:, 0]
+            assert abs(x[1]) < 1e-15  # stays in the plane of the crane
+            angle.append(np.arctan2(x[2], x[0]))
+        clockwise = joint in ("q3", "q6", "q7")
+        assert angle[1] - angle[0] == pytest.approx(-0.1 if clockwise else 0.1, abs=1e-12), joint
+
+
+def test_one_file_with_loops_equals_chains_and_a_machine_file(slider_crank, tmp_path):
+    """The same slider-crank as one URDF with a <loop>, its active joint marked there."""
+    folder = slider_crank.path.parent / "slider_crank"
+    text = "".join(
+        (folder / f"{name}.urdf")
+        .read_text()
+        .split("<robot", 1)[1]
+        .split(">", 1)[1]
+        .rsplit("<", 1)[0]
+        for name in ("crank", "slider")
+    )
+    text = text.replace('name="theta" type', 'name="theta" independent="true" type')
+    text = text.replace('<link name="rail"/>', "").replace('"rail"', '"guide"')
+    loop = (
+        '<loop name="wrist" type="revolute"><predecessor link="slider"/><successor link="rod">'
+        '<origin xyz="0.3 0 0"/></successor><axis xyz="0 1 0"/></loop>'
+    )
+    path = tmp_path / "single.urdf"
+    path.write_text(f'<robot name="single">{text}{loop}</robot>')
+    single = crane.load(path)
+    assert single.active == ("theta",) and single.joints == slider_crank.joints
+    assert single.home[single.column("theta")] == 0.1  # the limit nearest to zero
+    theta = np.linspace(0.2, 2.9, 20)[:, None]
+    q = slider_crank.closure.solve(theta)
+    assert np.abs(single.closure.solve(theta) - q).max() < 1e-13
+    force = [crane.Dynamics(m).inverse(theta, theta, theta) for m in (single, slider_crank)]
+    assert np.abs(force[0] - force[1]).max() < 1e-12
+
+
+def test_a_machine_cannot_be_changed(mini):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        mini.tip = "link3"
+    changed = mini.replace(friction={})
+    assert changed.friction == {} and mini.friction and changed.end_stops == mini.end_stops
+    assert mini.replace(forces=[crane.ForceElement("q3", stiffness=1.0)]).forces[0].joint == "q3"
+
+
+def test_limits_are_checked_where_asked(mini):
+    inside = [[0.1, 0.0, 0.030], [-3.0, 0.03, 0.0]]
+    assert np.array_equal(mini.check_limits(inside), inside)
+    mini.check_limits([0.0, 0.030 + 1e-12, -1e-12])  # rounding counts as on the limit
+    with pytest.raises(LimitError) as error:
+        mini.check_limits([0.0, 0.031, 0.01], "the start")
+    assert str(error.value) == (
+        "the start: X1 = 0.031 is outside of its limits 0 to 0.03 m, choose one within them"
+    )
+    with pytest.raises(LimitError, match=r"q_a: q1 = 3\.2 in sample 1 is outside .* rad"):
+        mini.check_limits([[0.0, 0.01, 0.01], [3.2, 0.01, 0.01]])
+
+
+def test_unknown_names(mini):
+    for call, text in (
+        (lambda: mini.column("X3"), "joint 'X3' is unknown, .*X1.*"),
+        (lambda: mini.unit("q5"), "joint 'q5' is unknown"),
+        (lambda: mini.frame("link7_tipp"), "did you mean 'link7_tip'"),
+        (lambda: mini.frame("q1"), "frame 'q1' is unknown"),  # a joint is not a link
+        (lambda: mini.replace(friction={"q12": crane.Friction()}), "joint 'q12' is unknown"),
+        (lambda: mini.replace(forces=(crane.ForceElement("x1"),)), "joint 'x1' is unknown"),
+        (lambda: mini.replace(end_stops=(crane.EndStop("q2", 1.0),)), "'q2' has no limits"),
+        (lambda: mini.check_limits([0.0, np.nan, 0.0]), "q_a is nan at X1"),
+    ):
+        with pytest.raises(InputError, match=text):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("payload", "text"),
+    [
+        ({"frame": "link8"}, "frame 'link8' is unknown"),
+        ({"mass": -1.0}, r"mass is -1.0 kg, give a positive"),
+        ({"mass": np.nan}, "mass is nan kg"),
+        ({"com": (0.0, 0.1)}, "payload's com has the shape"),
+        ({"com": (0.0, np.inf, 0.0)}, "payload's com is inf"),
+        ({"inertia": np.ones(3)}, "not a symmetric"),
+        ({"inertia": [[1, 1, 0], [0, 1, 0], [0, 0, 1]]}, "not a symmetric"),
+        ({"inertia": np.diag([1.0, 1.0, -0.1])}, "negative principal moment"),
+        ({"inertia": np.diag([1.0, 1.0, 3.0])}, "no possible body"),
+        ({"mass": 0.0, "inertia": np.eye(3)}, "inertia but no mass"),
+    ],
+)
+def test_impossible_payloads(mini, payload, text):
+    given = {"frame": "link7_tip", "mass": 1.0, **payload}
+    with pytest.raises(InputError, match=text):
+        mini.with_payload(crane.Payload(**given))
+
+
+def test_endless_joints_have_infinite_limits(mini):
+    for joint in mini.joints:
+        column = mini.column(joint)
+        limits = mini.model.lowerPositionLimit[column], mini.model.upperPositionLimit[column]
+        assert np.isfinite(limits).all() == (joint in mini.active), joint

@@ -1,0 +1,349 @@
+"""Every line that a user sees for well described parts that make no machine."""
+
+import pytest
+from broken import GROUND, MINI, ROCKER, assert_refused, case, swap
+
+CHAIN_B1 = "urdf/mini_forwarder/chain_b1.urdf"
+CHAIN_C = "urdf/mini_forwarder/chain_c.urdf"
+
+# A wheel that no loop holds.
+WHEEL = """<link name="wheel">
+    <inertial>
+      <mass value="1"/>
+      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>
+    </inertial>
+  </link>
+  <joint name="spin" type="continuous">
+    <parent link="rocker_pin"/>
+    <child link="wheel"/>
+  </joint>
+</robot>"""
+
+ROD_INERTIAL = """    <inertial>
+      <origin xyz="-0.02544736842105262 0 0"/>
+      <mass value="0.00646"/>
+      <inertia ixx="0" ixy="0" ixz="0" iyy="1.3944309649122797e-06" iyz="0"
+               izz="1.3944309649122797e-06"/>
+    </inertial>
+"""
+
+pytestmark = pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+
+# A four-bar linkage.
+MECHANISM = [
+    case(
+        "too many active joints",
+        "four_bar.yaml:12: 2 active joints (crank, coupler) for 1 degree of "
+        "freedom: name only 1 of them",
+        swap("active: [crank]", "active: [crank, coupler]"),
+        swap("control:\n  crank: {kp: 50, ki: 20}\n", ""),
+        swap(
+            "    active:\n      crank: [1.2, 0.4, -0.2]\n", "    tip: {x: [0], y: [0], z: [0]}\n"
+        ),
+    ),
+    case(
+        "too few active joints",
+        "four_bar.yaml:12: 1 active joint (crank) for 2 degrees of freedom: activate spin too",
+        swap("</robot>", WHEEL, ROCKER),
+    ),
+    case(
+        "too few without loops",
+        "four_bar.yaml:10: 1 active joint (crank) for 3 degrees of freedom: "
+        "activate coupler, rocker too",
+        swap(
+            "loops:\n"
+            "  - {name: pin, type: revolute, predecessor: coupler_pin, successor: rocker_pin}\n",
+            "",
+        ),
+    ),
+    case(
+        "active joints that cannot drive",
+        "four_bar.yaml:12: the active joints crank, coupler cannot drive spin: choose others",
+        swap("</robot>", WHEEL, ROCKER),
+        swap("active: [crank]", "active: [crank, coupler]"),
+        swap("control:\n  crank: {kp: 50, ki: 20}\n", ""),
+        swap(
+            "    active:\n      crank: [1.2, 0.4, -0.2]\n", "    tip: {x: [0], y: [0], z: [0]}\n"
+        ),
+    ),
+    case(
+        "no freedom left",
+        "four_bar.yaml:12: the loops leave crank no freedom to move: check the "
+        "types and axes of the loops, and the axes of the joints",
+        swap('<axis xyz="0 0 1"/>\n    <limit', '<axis xyz="0 1 0"/>\n    <limit', GROUND),
+    ),
+    case(
+        "loop that locks nothing",
+        "four_bar.yaml:11: loop 'again' locks nothing that the joints do not lock "
+        "already: remove it",
+        swap(
+            "successor: rocker_pin}\n",
+            "successor: rocker_pin}\n"
+            "  - {name: again, type: revolute, predecessor: pin_B, successor: rocker_arm}\n",
+        ),
+    ),
+    case(
+        "all loops lock nothing",
+        "four_bar.yaml:10: loop 'pin' locks nothing that the joints do not lock "
+        "already: remove it",
+        swap(
+            "predecessor: coupler_pin, successor: rocker_pin}\n",
+            "predecessor: pin_B, successor: rocker_arm}\n",
+        ),
+        swap("active: [crank]", "active: [crank, coupler, rocker]"),
+        swap("control:\n  crank: {kp: 50, ki: 20}\n", ""),
+        swap(
+            "    active:\n      crank: [1.2, 0.4, -0.2]\n", "    tip: {x: [0], y: [0], z: [0]}\n"
+        ),
+    ),
+    case(
+        "loop too tight",
+        "four_bar.yaml:10: loop 'pin' cannot be closed from the home guess (crank ="
+        " 1.2): it stays 0.101 m open, correct the frames or the guess",
+        swap("type: revolute", "type: fixed"),
+    ),
+    case(
+        "links too short",
+        "four_bar.yaml:10: loop 'pin' cannot be closed from the home guess (crank ="
+        " 1.2): it stays 3.35 m open, correct the frames or the guess",
+        swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.05 0 0"/>', ROCKER),
+        swap(
+            '<origin xyz="0.4 0 0"/>\n    <parent link="ground"/>',
+            '<origin xyz="4 0 0"/>\n    <parent link="ground"/>',
+            GROUND,
+        ),
+    ),
+    case(
+        "frames beside each other",
+        "four_bar.yaml:10: loop 'pin' cannot be closed from the home guess (crank ="
+        " 1.2): it stays 0.01 m open, correct the frames or the guess",
+        swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.3 0 0.01"/>', ROCKER),
+    ),
+    case(
+        "axes at an angle",
+        "four_bar.yaml:10: loop 'pin' cannot be closed from the home guess (crank ="
+        " 1.2): it stays 0.0962 rad open, correct the frames or the guess",
+        swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.3 0 0" rpy="0.1 0 0"/>', ROCKER),
+    ),
+    case(
+        "axes opposed",
+        "four_bar.yaml:10: loop 'pin' closes at home with its axes opposed: turn a "
+        "frame over, or guess its joints better",
+        swap(
+            '<origin xyz="0.3 0 0"/>',
+            '<origin xyz="0.3 0 0" rpy="3.141592653589793 0 0"/>',
+            ROCKER,
+        ),
+    ),
+    case(
+        "home out of reach",
+        "four_bar.yaml:10: loop 'pin' cannot be closed at home (crank = 1.2): it "
+        "stays 0.0132 m open, choose other values or guess more passive joints",
+        swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.01 0 0"/>', ROCKER),
+    ),
+    case(
+        "home outside of limits",
+        "four_bar.yaml:15: home of 'crank' is 2.6, outside of its limits -1.5 to "
+        "2.5, choose one within them",
+        swap("  crank: 1.2", "  crank: 2.6"),
+    ),
+    case(
+        "home singular",
+        "four_bar.yaml:14: the home posture (crank = 0) is at the edge of the "
+        "assembly branch: choose another under 'home'",
+        swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.2 0 0"/>', ROCKER),
+        swap(
+            "  crank: 1.2\n  coupler: -1.0\n  rocker: 1.5", "  crank: 0\n  coupler: 0\n  rocker: 0"
+        ),
+    ),
+    case(
+        "home near singular",
+        "four_bar.yaml:14: the home posture (crank = 0) is at the edge of the "
+        "assembly branch: choose another under 'home'",
+        swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.2 0 0"/>', ROCKER),
+        swap(
+            "  crank: 1.2\n  coupler: -1.0\n  rocker: 1.5",
+            "  crank: 0\n  coupler: 0.1\n  rocker: 0.1",
+        ),
+    ),
+]
+
+# The bundled crane.
+MINI_FORWARDER = [
+    case(
+        "chain left out",
+        "mini_forwarder.yaml:{line of - {name: A1}: loop 'A1_eye' has the unknown "
+        "successor 'A1_eye', did you mean 'A2_eye'?",
+        swap(
+            "  - {name: B1, urdf: urdf/mini_forwarder/chain_b1.urdf, parent: link1_B}\n", "", MINI
+        ),
+        machine=MINI,
+    ),
+    case(
+        "chains in a wrong order",
+        "mini_forwarder.yaml:{line of - {name: B2}: chain 'B2' hangs from "
+        "'link2_F', no frame of an earlier chain, known: A1_barrel, A1_base, "
+        "A1_eye, A1_rod, base, link1, link1_B, link1_C, link3, link3_G, link3_H, "
+        "link3_elbow, link7, link7_K, link7_tip",
+        swap(
+            "  - {name: C, urdf: urdf/mini_forwarder/chain_c.urdf, parent: link1_C}\n"
+            "  - {name: B2, urdf: urdf/mini_forwarder/chain_b2.urdf, parent: link2_F}\n",
+            "  - {name: B2, urdf: urdf/mini_forwarder/chain_b2.urdf, parent: link2_F}\n"
+            "  - {name: C, urdf: urdf/mini_forwarder/chain_c.urdf, parent: link1_C}\n",
+            MINI,
+        ),
+        machine=MINI,
+    ),
+    case(
+        "chain on a wrong pin",
+        "mini_forwarder.yaml:{line of active:}: the active joints q1, X1, X2 cannot"
+        " drive q4, q9, q2: choose others",
+        swap("chain_b1.urdf, parent: link1_B", "chain_b1.urdf, parent: link1_C", MINI),
+        machine=MINI,
+    ),
+    case(
+        "loop left out",
+        "mini_forwarder.yaml:{line of active:}: 3 active joints (q1, X1, X2) for 5 "
+        "degrees of freedom: activate q7, q3 too",
+        swap(
+            "  - {name: K, type: revolute, predecessor: link7_K,",
+            "  # - {name: K, type: revolute, predecessor: link7_K,",
+            MINI,
+        ),
+        machine=MINI,
+    ),
+    case(
+        "loop about a wrong axis",
+        "mini_forwarder.yaml:{line of active:}: 3 active joints (q1, X1, X2) for 2 "
+        "degrees of freedom: name only 2 of them",
+        swap("successor: A1_eye, axis: [0, 0, 1]", "successor: A1_eye, axis: [0, 1, 0]", MINI),
+        machine=MINI,
+    ),
+    case(
+        "loop named by its link",
+        "mini_forwarder.yaml:{line of - {name: A1}: loop 'A1_eye' has the unknown "
+        "predecessor 'link_2D', did you mean 'link2_D'?",
+        swap("predecessor: link2_D", "predecessor: link_2D", MINI),
+        machine=MINI,
+    ),
+    case(
+        "loop within one body",
+        "mini_forwarder.yaml:{line of - {name: A1}: loop 'A1_eye' joins 'link2_D' "
+        "and 'link2_F', both on the body 'link2': choose frames of two bodies",
+        swap(
+            "predecessor: link2_D, successor: A1_eye",
+            "predecessor: link2_D, successor: link2_F",
+            MINI,
+        ),
+        machine=MINI,
+    ),
+    case(
+        "two strokes of one actuator",
+        "mini_forwarder.yaml:{line of active:}: 'active' lists 'X1' twice, list it once",
+        swap("active: [q1, X1, X2]", "active: [q1, X1, X1]", MINI),
+        machine=MINI,
+    ),
+    case(
+        "slew missing",
+        "mini_forwarder.yaml:{line of active:}: 2 active joints (X1, X2) for 3 "
+        "degrees of freedom: activate q1 too",
+        swap("active: [q1, X1, X2]", "active: [X1, X2]", MINI),
+        swap("  q1: {kp: 15, ki: 5}\n", "", MINI),
+        machine=MINI,
+    ),
+    case(
+        "joint that follows is active",
+        "mini_forwarder.yaml:{line of active:}: the active joints q1, X1, q9 cannot"
+        " drive q10, X2, q6, q7, q2, q11, q3: choose others",
+        swap("active: [q1, X1, X2]", "active: [q1, X1, q9]", MINI),
+        swap("  X2: {kp: 18000, ki: 20000}\n", "  q9: {kp: 18000, ki: 20000}\n", MINI),
+        machine=MINI,
+    ),
+    case(
+        "lower case joint",
+        "mini_forwarder.yaml:{line of active:}: joint 'x1' is unknown, known: X1, "
+        "X2, q1, q10, q11, q2, q3, q4, q6, q7, q9",
+        swap("active: [q1, X1, X2]", "active: [q1, x1, X2]", MINI),
+        machine=MINI,
+    ),
+    case(
+        "home in millimetres",
+        "mini_forwarder.yaml:{line of X1: 22}: home of 'X1' is 22.1, outside of its"
+        " limits 0 to 0.03, choose one within them",
+        swap("  X1: 0.0221", "  X1: 22.1", MINI),
+        machine=MINI,
+    ),
+    case(
+        "gains of one joint missing",
+        "mini_forwarder.yaml:{line of control}: no gains for X2, give kp and ki of each",
+        swap("  X2: {kp: 18000, ki: 20000}\n", "", MINI),
+        machine=MINI,
+    ),
+    case(
+        "tip is a joint",
+        "mini_forwarder.yaml:{line of tip: q3}: the tip frame 'q3' is unknown, "
+        "known: A1_barrel, A1_base, A1_eye, A1_rod, A2_barrel, A2_eye, A2_rod, "
+        "base, link1, link1_B, link1_C, link2, link2_D, link2_E, link2_F, "
+        "link2_base, link3, link3_G, link3_H, link3_elbow, link4, link4_J, "
+        "link4_base, link5, link5_J, link5_base, link6, link6_K, link7, link7_K, "
+        "link7_tip",
+        swap("tip: link7_tip", "tip: q3", MINI),
+        machine=MINI,
+    ),
+    case(
+        "rod without mass",
+        "chain_b1.urdf:{line of <link name=\"A1_rod}: joint 'X1' moves link "
+        "'A1_rod', which has no mass, give it an <inertial>",
+        swap(ROD_INERTIAL, "", CHAIN_B1),
+        machine=MINI,
+    ),
+    case(
+        "rod in grams",
+        'chain_b1.urdf:{line of <mass value="6}: value="6,46" of the mass of link '
+        "'A1_rod' is not a number, write a decimal point",
+        swap('<mass value="0.00646"/>', '<mass value="6,46"/>', CHAIN_B1),
+        machine=MINI,
+    ),
+    case(
+        "stroke reversed",
+        "chain_b1.urdf:{line of <limit}: the limits of joint 'X1' are reversed "
+        "(0.03 > 0), swap them",
+        swap('lower="0" upper="0.030"', 'lower="0.030" upper="0"', CHAIN_B1),
+        machine=MINI,
+    ),
+    case(
+        "actuator without limits",
+        "chain_b1.urdf:{line of <joint name=\"X1}: joint 'X1' is prismatic and has "
+        "no <limit>, add one",
+        swap('    <limit lower="0" upper="0.030" effort="80" velocity="0.0065"/>\n', "", CHAIN_B1),
+        machine=MINI,
+    ),
+    case(
+        "printed inertia misread",
+        'chain_c.urdf:{line of <inertia ixx="0" ixy="0" ixz="0" iyy="0}: link '
+        "'link2' has an inertia of no possible body: principal moments 0 + 8.17e-06"
+        " < 8.17e-05 kg m2, correct it",
+        swap(
+            'iyy="0.0817e-3" iyz="0" izz="0.0817e-3"',
+            'iyy="0.00817e-3" iyz="0" izz="0.0817e-3"',
+            CHAIN_C,
+        ),
+        machine=MINI,
+    ),
+    case(
+        "joint axis out of the plane",
+        "mini_forwarder.yaml:{line of active:}: 3 active joints (q1, X1, X2) for 2 "
+        "degrees of freedom: name only 2 of them",
+        swap(
+            '    <child link="link2"/>\n    <axis xyz="0 0 1"/>',
+            '    <child link="link2"/>\n    <axis xyz="0 1 0"/>',
+            CHAIN_C,
+        ),
+        machine=MINI,
+    ),
+]
+
+
+@pytest.mark.parametrize("broken", [*MECHANISM, *MINI_FORWARDER])
+def test_is_refused(broken, tmp_path):
+    assert_refused(broken, tmp_path)

@@ -1,0 +1,208 @@
+import warnings
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import crane
+from crane.errors import CraneWarning, InputError, LimitError, SimulationError
+
+
+@pytest.fixture(scope="module")
+def forwarder():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        return crane.load("mini_forwarder")
+
+
+@pytest.fixture(scope="module")
+def springy(forwarder):
+    """Frictionless, carried by a spring at each actuator about the middle of its stroke."""
+    middle = np.array([0.0, 0.015, 0.015])
+    weight = crane.Dynamics(forwarder).gravity(middle)
+    springs = tuple(
+        crane.ForceElement(joint, stiffness=k, rest=float(middle[i] + weight[i] / k))
+        for i, (joint, k) in enumerate(zip(forwarder.active, (0.3, 2000.0, 4000.0), strict=True))
+    )
+    return forwarder.replace(friction={}, forces=springs, end_stops=())
+
+
+START = (np.array([0.3, 0.018, 0.013]), np.array([0.5, 0.0, 0.02]))
+
+
+def total_energy(recording):
+    return recording.channels["kinetic"] + recording.channels["potential"]
+
+
+def imbalance(recording):
+    """Largest gap of the energy balance, relative to what went through."""
+    channels, energy = recording.channels, total_energy(recording)
+    gap = channels["work"] - (energy - energy[0]) - channels["dissipated"]
+    through = max(np.ptp(channels[name]) for name in ("work", "dissipated", "potential"))
+    return np.abs(gap).max() / through
+
+
+def test_energy_is_conserved_and_the_error_falls_with_the_fourth_power(springy):
+    drift = {}
+    for step in (4e-3, 2e-3, 1e-3):
+        recording = crane.simulate(springy, initial=START, duration=5.0, step=step)
+        low, high = recording.q[:, 1:].min(), recording.q[:, 1:].max()
+        assert low > 0 and high < 0.030  # within the strokes
+        energy = total_energy(recording)
+        drift[step] = np.abs(energy - energy[0]).max() / recording.channels["kinetic"].max()
+    assert drift[1e-3] < 1e-8
+    # energy is a smooth function of the state: its error is of the method's order or one better
+    for coarse in (4e-3, 2e-3):
+        assert 3.7 < np.log2(drift[coarse] / drift[coarse / 2]) < 5.3
+
+
+def test_agrees_with_an_adaptive_method_of_another_order(springy):
+    dynamics = crane.Dynamics(springy)
+    n = 3
+
+    def rate(_, state):
+        q_a, v_a = state[:n], state[n:]
+        return np.concatenate([v_a, dynamics.forward(q_a, v_a, np.zeros(n))])
+
+    other = solve_ivp(
+        rate, (0, 0.5), np.concatenate(START), method="DOP853", rtol=1e-11, atol=1e-13
+    )
+    recording = crane.simulate(springy, initial=START, duration=0.5)
+    np.testing.assert_allclose(recording.q[-1], other.y[:n, -1], atol=1e-9)
+    np.testing.assert_allclose(recording.v[-1], other.y[n:, -1], atol=1e-8)
+
+
+def test_power_balance_with_friction_and_control(forwarder):
+    path = crane.task_path(forwarder, "return")
+    recording = crane.simulate(forwarder, crane.PI(forwarder, path), duration=1.5)
+    assert imbalance(recording) < 1e-6
+    assert recording.channels["dissipated"][-1] > 0.1  # [J], so there was something to balance
+
+
+def test_power_balance_at_the_end_stops(forwarder):
+    recording = crane.simulate(forwarder, duration=0.6, step=5e-4)  # falls onto its stops
+    stopped = recording.q[:, 1] > forwarder.upper[1]
+    assert stopped.any()
+    assert recording.q[:, 1].max() < forwarder.upper[1] + 0.002
+    assert imbalance(recording) < 1e-4  # the stop's damping jumps, which costs the order
+
+
+def test_loops_stay_closed(forwarder):
+    path = crane.task_path(forwarder, "return")
+    recording = crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.3)
+    columns = [
+        recording.q[:, forwarder.active.index(joint)]
+        if joint in forwarder.active
+        else recording.channels[joint]
+        for joint in forwarder.joints
+    ]
+    assert forwarder.closure.residual(np.column_stack(columns)).max() < 1e-12
+
+
+def test_channels_are_those_of_the_machine(forwarder):
+    path = crane.task_path(forwarder, "lift")
+    recording = crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.05, task="lift")
+    kinematics, dynamics = crane.Kinematics(forwarder), crane.Dynamics(forwarder)
+    tip = np.column_stack([recording.channels[f"tip_{axis}"] for axis in "xyz"])
+    np.testing.assert_allclose(tip, kinematics.position(recording.q), atol=1e-12)
+    reference = np.column_stack([recording.channels[f"reference_{j}"] for j in forwarder.active])
+    np.testing.assert_array_equal(reference, path(recording.time)[0])
+    wanted = np.column_stack([recording.channels[f"reference_tip_{axis}"] for axis in "xyz"])
+    np.testing.assert_allclose(wanted, kinematics.position(reference), atol=1e-9)
+    friction = np.column_stack([recording.channels[f"friction_{j}"] for j in forwarder.active])
+    np.testing.assert_allclose(friction, dynamics.friction(recording.q, recording.v), atol=1e-9)
+    kinetic, potential = dynamics.energy(recording.q, recording.v)
+    np.testing.assert_allclose(recording.channels["kinetic"], kinetic, atol=1e-12)
+    np.testing.assert_allclose(recording.channels["potential"], potential, atol=1e-12)
+    assert recording.machine == "mini_forwarder" and recording.task == "lift"
+    assert recording.units == {"q1": "rad", "X1": "m", "X2": "m"}
+
+
+def test_survives_the_round_trip_through_a_file(forwarder, tmp_path):
+    recording = crane.simulate(forwarder, duration=0.02)
+    recording.to_csv(tmp_path / "run.csv")
+    back = crane.Recording.from_csv(tmp_path / "run.csv")
+    np.testing.assert_array_equal(back.q, recording.q)
+    np.testing.assert_array_equal(back.tau, recording.tau)
+    assert back.channels.keys() == recording.channels.keys()
+    for name, values in recording.channels.items():
+        np.testing.assert_array_equal(back.channels[name], values)
+
+
+def test_a_function_controls_as_well(forwarder):
+    gain = np.array([15.0, 5500.0, 18000.0])
+    target = np.array([0.1, 0.02, 0.012])
+    seen = []
+
+    def hold(time, q_a, v_a):
+        seen.append(time)
+        return gain * (target - q_a)
+
+    recording = crane.simulate(forwarder, hold, duration=0.01)
+    np.testing.assert_array_equal(recording.tau, gain * (target - recording.q))
+    assert min(seen) == 0 and max(seen) == pytest.approx(0.01)
+
+
+def test_progress_ends_at_one(forwarder):
+    shares = []
+    crane.simulate(forwarder, duration=0.01, progress=shares.append)
+    assert shares == sorted(shares) and shares[-1] == 1.0
+
+
+@pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+def test_a_step_that_is_too_long_is_told(forwarder):
+    path = crane.task_path(forwarder, "return")
+    with pytest.warns(CraneWarning, match="step of 0.005 s is too long"):
+        crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.5, step=5e-3)
+    path = crane.task_path(forwarder, "lift")
+    with pytest.raises(SimulationError, match="explodes .* shorten the step"):
+        crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.5, step=5e-3)
+
+
+@pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+def test_a_machine_that_leaves_its_branch_ends_in_one_line(forwarder):
+    free = forwarder.replace(friction={}, end_stops=())
+    with pytest.raises(SimulationError, match=r"^at t = 0\.\d+ s: loop 'A._eye'") as caught:
+        crane.simulate(free, lambda t, q, v: np.array([0.0, 200.0, 0.0]), duration=2.0)
+    assert "\n" not in str(caught.value)
+
+
+def test_leaving_the_limits_without_an_end_stop_is_told(forwarder):
+    free = forwarder.replace(end_stops=())
+    with pytest.warns(CraneWarning, match="'X1' leaves its limits 0 to 0.03 at t = "):
+        crane.simulate(free, lambda t, q, v: np.array([0.0, 30.0, 0.0]), duration=0.4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "text"),
+    [
+        ({}, InputError, "no duration and no path"),
+        ({"duration": -1.0}, InputError, "the duration is -1.0 s"),
+        ({"duration": np.nan}, InputError, "the duration is nan s"),
+        ({"duration": 1.0, "step": 0.0}, InputError, "the step is 0.0 s"),
+        ({"duration": 1.0, "step": 0.3}, InputError, "no whole number of steps"),
+        ({"duration": 1.0, "initial": [0, 0.04, 0]}, LimitError, "initial: X1 = 0.04 is outside"),
+        ({"duration": 1.0, "initial": [0, 0.01]}, InputError, "initial has the shape"),
+        ({"duration": 1.0, "initial": [[0, 0.01, 0]]}, InputError, "initial is a stack"),
+        (
+            {"duration": 1.0, "initial": ([0, 0.01, 0.01], [0, np.nan, 0])},
+            InputError,
+            "initial v_a is nan at X1",
+        ),
+        ({"duration": 1.0, "controller": 3}, InputError, "the controller is a int"),
+        (
+            {"duration": 1.0, "controller": lambda t, q, v: np.zeros(2)},
+            InputError,
+            "the controller gave the shape",
+        ),
+        (
+            {"duration": 1.0, "controller": lambda t, q, v: np.full(3, np.nan)},
+            InputError,
+            "the controller gave nan for q1 at t = 0 s",
+        ),
+    ],
+)
+def test_wrong_arguments_are_one_line(forwarder, arguments, error, text):
+    with pytest.raises(error) as caught:
+        crane.simulate(forwarder, **arguments)
+    assert text in str(caught.value) and "\n" not in str(caught.value)
