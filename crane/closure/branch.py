@@ -254,9 +254,10 @@ class Branch:
         phi = residual(nearest.x)
         worst = int(np.abs(phi).argmax())
         loop = self._equations.loops[self._equations.loop_of_row[worst]].name
+        unit = "m" if self._equations.is_translation[worst] else "rad"
         return OutOfReachError(
             f"loop '{loop}' cannot be closed at {self._at(target)}{sample}: it stays "
-            f"{np.abs(phi[worst]):.3g} m open; the last posture on the way that closes is at "
+            f"{np.abs(phi[worst]):.3g} {unit} open; the last posture on the way that closes is at "
             f"{self._at(last.q_a)}"
         )
 
