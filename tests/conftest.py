@@ -33,9 +33,14 @@ def stewart():
     return crane.load(DATA / "stewart.urdf")
 
 
+@pytest.fixture(scope="session")
+def five_bar():
+    return crane.load(DATA / "five_bar.urdf")
+
+
 @pytest.fixture
 def edited(tmp_path):
-    """Load a machine file of tests/data after replacing some of its text: edited(name, old, new)."""
+    """Load a machine file of tests/data with some text replaced: edited(name, old, new, ...)."""
 
     def load(name, *changes):
         text = (DATA / name).read_text().replace("urdf: ", f"urdf: {DATA}/")

@@ -38,6 +38,10 @@ def strokes(count, seed=0):
     return random.uniform([-3.1, 0.0, 0.0], [3.1, STROKE, STROKE], (count, 3))
 
 
+def columns(machine, names):
+    return [machine.column(name) for name in names]
+
+
 def poses(machine, q, *links):
     data = machine.model.createData()
     pin.framesForwardKinematics(machine.model, data, q)
@@ -227,6 +231,58 @@ def test_home_is_closed_and_cannot_be_overwritten(mini):
     before = mini.home.copy()
     mini.closure.solve(mini.home[mini.closure.active])[:] = 0.0
     assert np.array_equal(mini.home, before)
+
+
+# --- a five-bar, whose active coordinates leave holes ----------------------------------------
+
+
+def reachable(a, b):
+    distance = np.hypot(*np.subtract(*oracles.five_bar_tips(a, b)))
+    return 1e-3 < distance < 0.5 - 1e-6
+
+
+def from_closed_form(machine, q):
+    """Distance of the passive angles to the closed form, whole turns left out."""
+    a, b, c, d = q[columns(machine, "abcd")]
+    return np.abs(np.angle(np.exp(1j * (np.array([c, d]) - oracles.five_bar(a, b))))).max()
+
+
+def test_far_samples_stay_on_the_branch_around_holes(five_bar):
+    """Half of all crank angles leave the rods too short: straight ways lead through holes."""
+    q_a = np.random.default_rng(14).uniform(-3, 3, (240, 2))
+    found, missed = [], 0
+    for sample in q_a:
+        if not reachable(*sample):
+            with pytest.raises(
+                (OutOfReachError, BranchEdgeError), match="'meeting' (cannot|is at)"
+            ):
+                five_bar.closure.solve(sample)
+            continue
+        try:
+            q = five_bar.closure.solve(sample)
+        except OutOfReachError as error:  # the straight way from home is barred
+            assert "'meeting' can be closed" in str(error) and "straight" in str(error)
+            missed += 1
+            continue
+        # near stretched rods an angle is the root of the loop's rounding
+        assert from_closed_form(five_bar, q) < 1e-7
+        found.append(q)
+    assert len(found) > 100 and missed < 0.03 * len(found)
+    random = np.random.default_rng(15)
+    for q, guess in random.choice(found, (150, 2)):
+        again = five_bar.closure.solve(q[five_bar.closure.active], guess=guess)
+        assert from_closed_form(five_bar, again) < 1e-7
+    stack = five_bar.closure.solve(np.array(found)[:, five_bar.closure.active])
+    assert max(from_closed_form(five_bar, q) for q in stack) < 1e-7
+
+
+def test_five_bar_gamma_equals_the_closed_form(five_bar):
+    rows, h = columns(five_bar, "cd"), oracles.COMPLEX_STEP
+    for a, b in ((0.0, 0.0), (0.4, -0.3), (-0.2, 0.3), (0.1, 0.6)):
+        gamma = five_bar.closure.gamma(five_bar.closure.solve([a, b]))[rows]
+        slopes = [oracles.five_bar(a + 1j * h, b), oracles.five_bar(a, b + 1j * h)]
+        exact = np.imag(slopes).T / h
+        assert np.abs(gamma - exact).max() < 1e-13 * np.abs(exact).max()
 
 
 # --- slider-crank ----------------------------------------------------------------------------
@@ -513,7 +569,7 @@ def test_four_bar_cut_in_the_middle_of_its_coupler(tmp_path):
     check_gamma_and_drift(machine, theta[10:11], np.array([2.0]), np.array([1e-2]), 1e-9)
 
 
-# --- machines that cannot be ------------------------------------------------------------------
+# --- machines that cannot be -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

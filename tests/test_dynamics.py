@@ -126,7 +126,7 @@ def test_slider_crank_equals_lagrange(slider_crank):
     assert np.abs(forward - acceleration).max() < 1e-11
 
 
-# --- against an independent algorithm ---------------------------------------------------------
+# --- against an independent algorithm --------------------------------------------------------
 
 
 def tree_forces(machine, q, v, tau_a, friction):
@@ -162,18 +162,20 @@ def test_forward_equals_constraint_dynamics(loaded, friction):
         assert relative(passive, exact) < 1e-10
 
 
-def test_forward_of_spatial_loops_equals_constraint_dynamics(stewart):
-    dynamics = crane.Dynamics(stewart)
-    random = np.random.default_rng(4)
+@pytest.mark.parametrize(("name", "reach"), [("stewart", 0.08), ("five_bar", 0.3)])
+def test_forward_of_other_loops_equals_constraint_dynamics(name, reach, request):
+    machine = request.getfixturevalue(name)
+    dynamics = crane.Dynamics(machine)
+    random, n = np.random.default_rng(4), len(machine.active)
     for _ in range(40):
-        q_a, v_a = random.uniform(-0.08, 0.08, 6), random.uniform(-0.5, 0.5, 6)
-        tau = random.uniform(-50, 80, 6)
-        q = stewart.closure.solve(q_a)
-        force = np.zeros(stewart.model.nv)
-        force[stewart.closure.active] = tau
-        exact = oracles.constraint_dynamics(stewart, q, stewart.closure.gamma(q) @ v_a, force)
+        q_a, v_a = random.uniform(-reach, reach, n), random.uniform(-0.5, 0.5, n)
+        tau = random.uniform(-50, 80, n)
+        q = machine.closure.solve(q_a)
+        force = np.zeros(machine.model.nv)
+        force[machine.closure.active] = tau
+        exact = oracles.constraint_dynamics(machine, q, machine.closure.gamma(q) @ v_a, force)
         found = dynamics.forward(q_a, v_a, tau)
-        assert relative(found, exact[stewart.closure.active]) < 1e-11
+        assert relative(found, exact[machine.closure.active]) < 1e-11
 
 
 def test_legs_of_the_stewart_platform_carry_its_weight(stewart):
@@ -197,7 +199,7 @@ def test_legs_of_the_stewart_platform_carry_its_weight(stewart):
     assert relative(dynamics.inverse(q_a, 0 * q_a, 0 * q_a), exact) < 1e-12
 
 
-# --- with itself -------------------------------------------------------------------------------
+# --- with itself -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("friction", [False, True])
@@ -272,7 +274,7 @@ def test_mass_matrix_is_projected_newton_euler(dynamics, bare):
     assert np.abs(kinetic / by_mass - 1).max() < 1e-12
 
 
-@pytest.mark.parametrize("name", ["mini", "stewart", "slider_crank"])
+@pytest.mark.parametrize("name", ["mini", "stewart", "slider_crank", "five_bar"])
 def test_tree_is_assembled_depth_first(name, request):
     """Pinocchio's crba is wrong without a word if joints were added in another order."""
     model = request.getfixturevalue(name).model
@@ -283,7 +285,7 @@ def test_tree_is_assembled_depth_first(name, request):
         assert relative(upper + np.triu(upper, 1).T, tree_mass(model, q)) < 1e-13
 
 
-# --- energy --------------------------------------------------------------------------------------
+# --- energy ----------------------------------------------------------------------------------
 
 
 def bodies(machine):
@@ -396,7 +398,7 @@ def test_any_state(dynamics, q1, x1, x2, speed):
     assert relative(dynamics.forward(q_a, -v_a, tau), a_a) < 1e-12
 
 
-# --- friction ------------------------------------------------------------------------------------
+# --- friction --------------------------------------------------------------------------------
 
 
 def test_published_friction_of_the_active_joints(mini):
@@ -460,7 +462,7 @@ def test_friction_law_and_its_smoothing(slider_crank):
             assert dynamics.friction(q_a, np.array([v]))[0] == pytest.approx(expected, rel=1e-14)
 
 
-# --- springs, dampers, constant forces, end stops ----------------------------------------------
+# --- springs, dampers, constant forces, end stops --------------------------------------------
 
 
 def test_conservative_elements_do_virtual_work(bare):
@@ -524,7 +526,7 @@ def test_end_stops_push_back_and_never_pull(bare):
     assert force(0.015, 0.0, x2=0.030 + deep, v2=3.0)[1] == pytest.approx(-1e5 * deep, rel=1e-9)
 
 
-# --- payload -------------------------------------------------------------------------------------
+# --- payload ---------------------------------------------------------------------------------
 
 PAYLOAD = crane.Payload(
     "link7_tip", 0.25, com=(0.01, -0.03, 0.004),
@@ -590,7 +592,7 @@ def test_payloads_add_up_and_leave_the_machine_alone(mini):
     assert np.array_equal(crane.Dynamics(standing).parameters, before)
 
 
-# --- stacks, errors, open chains ---------------------------------------------------------------
+# --- stacks, errors, open chains -------------------------------------------------------------
 
 
 def test_stacks_equal_single_samples(loaded):
@@ -651,7 +653,7 @@ def test_open_arms_equal_pinocchio(name):
     assert machine.closure.solve(np.zeros((4, model.nv))).shape == (4, model.nv)
 
 
-# --- MuJoCo --------------------------------------------------------------------------------------
+# --- MuJoCo ----------------------------------------------------------------------------------
 
 
 def mjcf(machine, step):

@@ -253,6 +253,12 @@ class Branch:
         nearest = least_squares(residual, q[self._passive], slope, xtol=1e-12)
         phi = residual(nearest.x)
         worst = int(np.abs(phi).argmax())
+        if np.abs(phi[worst]) < 10 * _TOLERANCE * self._size:
+            return OutOfReachError(
+                f"{self._loops_of(self._weakest(last.jacobian)[1])} can be closed at "
+                f"{self._at(target)}{sample}, but the branch does not lead straight there from "
+                f"{self._at(last.q_a)}: go around in between, or give a nearer guess"
+            )
         loop = self._equations.loops[self._equations.loop_of_row[worst]].name
         unit = "m" if self._equations.is_translation[worst] else "rad"
         return OutOfReachError(
