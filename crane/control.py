@@ -1,17 +1,19 @@
 """Controllers: forces of the active joints from time, coordinates and velocities."""
 
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.description import PIGains
 from crane.dynamics import Dynamics
+from crane.dynamics.traced import Sweep
 from crane.errors import InputError, known
 from crane.machine import Machine
 from crane.paths import Path
 from crane.samples import Array, as_samples
+from crane.straight import Number
 
 
 class Controller(Protocol):
@@ -28,6 +30,68 @@ class Controller(Protocol):
 
     def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
         """Active forces (n,) [N], [N m], and the rate of the controller's states."""
+
+
+@runtime_checkable
+class TracedController(Controller, Protocol):
+    """A controller that can become part of the simulation's machine code.
+
+    Attributes:
+        settings: (s,) its numbers.
+        columns: Length c of a row of references.
+    """
+
+    settings: Array
+    columns: int
+
+    def references(self, times: Array) -> Array:
+        """What it follows, (N, c) at times (N,) [s]."""
+
+    def trace(
+        self,
+        sweep: Sweep,
+        q: list[Number],
+        v_a: list[Number],
+        state: list[Number],
+        settings: list[Number],
+        reference: list[Number],
+    ) -> tuple[list[Number], list[Number]]:
+        """`__call__` as formulas, with q of all joints."""
+
+
+class Free:
+    """No active forces."""
+
+    path: Path | None = None
+    settings = np.zeros(0)
+    columns = 0
+
+    def __init__(self, machine: Machine):
+        self._force = np.zeros(len(machine.active))
+
+    def start(self, q_a: Array) -> Array:
+        """See `Controller`."""
+        return np.zeros(0)
+
+    def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
+        """See `Controller`."""
+        return self._force, state
+
+    def references(self, times: Array) -> Array:
+        """See `TracedController`."""
+        return np.zeros((len(times), 0))
+
+    def trace(
+        self,
+        sweep: Sweep,
+        q: list[Number],
+        v_a: list[Number],
+        state: list[Number],
+        settings: list[Number],
+        reference: list[Number],
+    ) -> tuple[list[Number], list[Number]]:
+        """See `TracedController`."""
+        return [0.0] * len(v_a), state
 
 
 class PI:
@@ -69,13 +133,16 @@ class PI:
         )
         self._kp = np.array([gains[joint].kp for joint in machine.active])
         self._ki = np.array([gains[joint].ki for joint in machine.active])
+        self.settings = np.concatenate([self._kp, self._ki])
+        self.columns = len(machine.active)
 
     def start(self, q_a: Array) -> Array:
         """See `Controller`."""
         if self._integral is not None:
             return self._integral
         rest = np.zeros_like(q_a)
-        weight = Dynamics(self._machine).inverse(q_a, rest, rest, friction=True)
+        once = Dynamics(self._machine, path="pinocchio")
+        weight = once.inverse(q_a, rest, rest, friction=True)
         error = self._reference(0.0)[0] - q_a
         able = self._ki > 0
         return np.where(able, weight - self._kp * error, 0.0) / np.where(able, self._ki, 1.0)
@@ -84,6 +151,29 @@ class PI:
         """See `Controller`; the states are the integrals of the errors."""
         error = self._reference(time)[0] - q_a
         return self._kp * error + self._ki * state, error
+
+    def references(self, times: Array) -> Array:
+        """See `TracedController`."""
+        return self._reference(times)[0]
+
+    def trace(
+        self,
+        sweep: Sweep,
+        q: list[Number],
+        v_a: list[Number],
+        state: list[Number],
+        settings: list[Number],
+        reference: list[Number],
+    ) -> tuple[list[Number], list[Number]]:
+        """See `TracedController`."""
+        n = self.columns
+        columns = self._machine.closure.active
+        error = [x - q[i] for x, i in zip(reference, columns, strict=True)]
+        tau = [
+            kp * e + ki * z
+            for kp, ki, e, z in zip(settings[:n], settings[n:], error, state, strict=True)
+        ]
+        return tau, error
 
 
 class ComputedTorque:
@@ -103,6 +193,9 @@ class ComputedTorque:
         self.path: Path | None = path
         self._reference, self._bandwidth = path, bandwidth
         self._dynamics = Dynamics(machine)
+        self._active = machine.closure.active
+        self.settings = np.array([float(bandwidth)])
+        self.columns = 3 * len(machine.active)
 
     def start(self, q_a: Array) -> Array:
         """See `Controller`."""
@@ -113,6 +206,30 @@ class ComputedTorque:
         q_ref, v_ref, a_ref = self._reference(time)
         wanted = a_ref + 2 * self._bandwidth * (v_ref - v_a) + self._bandwidth**2 * (q_ref - q_a)
         return self._dynamics.inverse(q_a, v_a, wanted, friction=True), state
+
+    def references(self, times: Array) -> Array:
+        """See `TracedController`."""
+        return np.concatenate(self._reference(times), axis=1)
+
+    def trace(
+        self,
+        sweep: Sweep,
+        q: list[Number],
+        v_a: list[Number],
+        state: list[Number],
+        settings: list[Number],
+        reference: list[Number],
+    ) -> tuple[list[Number], list[Number]]:
+        """See `TracedController`."""
+        w, n = settings[0], len(v_a)
+        q_a = [q[i] for i in self._active]
+        wanted = [
+            a_ref + 2.0 * w * (v_ref - v) + w * w * (q_ref - x)
+            for q_ref, v_ref, a_ref, x, v in zip(
+                reference[:n], reference[n : 2 * n], reference[2 * n :], q_a, v_a, strict=True
+            )
+        ]
+        return sweep.inverse(wanted, friction=True), state
 
 
 class Feedback:

@@ -6,15 +6,20 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.control import Controller, Feedback
-from crane.dynamics import Dynamics, Motion
-from crane.errors import ClosureError, CraneWarning, InputError, SimulationError
+from crane.control import Controller, Feedback, Free, TracedController
+from crane.dynamics import Dynamics
+from crane.dynamics.compiled import TooLongError
+from crane.errors import CraneWarning, InputError
+from crane.integration import CompiledStepper, PythonStepper
 from crane.kinematics import Kinematics
 from crane.machine import Machine
 from crane.recording import Recording
 from crane.samples import Array, as_samples
 
 _IMBALANCE = 5e-3  # share of the energy that went through
+
+_ENERGIES = 2  # of the state: work, dissipated; of the observations: kinetic, potential
+_CHUNK = 1000  # steps between reports of progress
 
 Force = Callable[[float, Array, Array], Array]
 Progress = Callable[[float], None]
@@ -28,6 +33,7 @@ def simulate(
     step: float = 1e-3,
     *,
     task: str = "",
+    path: str = "compiled",
     progress: Progress | None = None,
 ) -> Recording:
     """Simulate a machine with its friction, passive forces and end stops.
@@ -46,6 +52,7 @@ def simulate(
         duration: [s]; that of the controller's path if not given.
         step: [s].
         task: Name to put into the recording.
+        path: "compiled" or "pinocchio", see `Dynamics`.
         progress: Called with the finished share, 0 to 1.
 
     Returns:
@@ -59,86 +66,66 @@ def simulate(
         SimulationError: The machine reached a posture it cannot go on from.
     """
     control = _as_controller(controller, machine)
-    path = control.path if control is not None else None
     if duration is None:
-        if path is None:
+        if control.path is None:
             raise InputError("no duration and no path to take it from, give a duration")
-        duration = path.duration
+        duration = control.path.duration
     steps = _count(duration, step)
-    q_a, v_a = _start(machine, initial, path)
-    run = _Run(machine, control)
-    state = run.start(q_a, v_a)
-    states = np.empty((steps + 1, len(state)))
-    forces, friction = np.empty((steps + 1, len(q_a))), np.empty((steps + 1, len(q_a)))
-    energies = np.empty((steps + 1, 2))
-    for i in range(steps + 1):
-        time = i * step
-        states[i] = state
+    q_a, v_a = _start(machine, initial, control.path)
+    dynamics = Dynamics(machine, path=path)
+    state = np.concatenate(
+        [machine.closure.solve(q_a), v_a, control.start(q_a), np.zeros(_ENERGIES)]
+    )
+    rows = _integrate(dynamics, control, state, steps, step, progress)
+    states, seen = rows[:, : len(state)], rows[:, len(state) :]
+    _warn_of_imbalance(states[:, -2], seen[:, -2:], states[:, -1], step)
+    return _recording(machine, control.path, step, states, seen, task)
+
+
+def _integrate(
+    dynamics: Dynamics,
+    control: Controller,
+    state: Array,
+    steps: int,
+    step: float,
+    progress: Progress | None,
+) -> Array:
+    """States and observations [tau, friction, kinetic, potential] at all instants."""
+    n = len(dynamics.machine.active)
+    size, times = len(state), step * np.arange(steps + 1, dtype=np.float64)
+    rows = np.empty((steps + 1, size + 2 * n + _ENERGIES))
+    slow = PythonStepper(dynamics, control)
+    fast = None
+    if dynamics.path == "compiled" and isinstance(control, TracedController):
         try:
-            rate, forces[i], motion = run.rate(time, state)
-            friction[i], energies[i] = run.observe(motion)
-            if i < steps:
-                state = run.advance(time, state, rate, step)
-        except ClosureError as error:
-            raise SimulationError(f"at t = {time:.6g} s: {error}") from None
+            own = size - dynamics.machine.model.nq - n - _ENERGIES
+            fast = CompiledStepper(dynamics, control, own)
+        except TooLongError:
+            fast = None
+    done = 0
+    while done < steps:
+        if fast is not None:
+            chunk = times[done : min(done + _CHUNK, steps)]
+            done += fast.run(chunk, state, step, rows[done:])
+        if fast is None or done < steps and (done % _CHUNK or not len(chunk)):
+            # machine code stops where a step needs a closer look: it succeeds here or says why
+            rate, seen = slow.observe(times[done], state)
+            rows[done] = [*state, *seen]
+            state = slow.advance(times[done], state, rate, step)
+            done += 1
         if progress is not None:
-            progress((i + 1) / (steps + 1))
-    _warn_of_imbalance(states[:, -2], energies, states[:, -1], step)
-    return _recording(machine, path, step, states, forces, friction, energies, task)
+            progress(done / (steps + 1))
+    _, seen = slow.observe(times[steps], state)
+    rows[steps] = [*state, *seen]
+    if progress is not None:
+        progress(1.0)
+    return rows
 
 
-class _Run:
-    """The right-hand side of the state (q, v_A, controller's states, work, dissipated)."""
-
-    def __init__(self, machine: Machine, control: Controller | None):
-        self.machine, self.control = machine, control
-        self.dynamics = Dynamics(machine)
-        self._joints, self._active = machine.model.nq, machine.closure.active
-        self._velocities = slice(self._joints, self._joints + len(machine.active))
-
-    def start(self, q_a: Array, v_a: Array) -> Array:
-        """The state at the start."""
-        q = self.machine.closure.solve(q_a)
-        own = self.control.start(q_a) if self.control is not None else np.zeros(0)
-        return np.concatenate([q, v_a, own, np.zeros(2)])
-
-    def rate(self, time: float, state: Array) -> tuple[Array, Array, Motion]:
-        """Time derivative of the state, active forces (n,), and the motion they act on."""
-        q, v_a = state[: self._joints], state[self._velocities]
-        own = state[self._velocities.stop : -2]
-        if self.control is None:
-            tau, own_rate = np.zeros_like(v_a), own
-        else:
-            tau, own_rate = self.control(time, q[self._active], v_a, own)
-        motion = self.dynamics.motion(q, v_a)
-        a_a = self.dynamics.accelerate(motion, tau, friction=True)
-        powers = [tau @ v_a, self.dynamics.dissipation(motion)]
-        return np.concatenate([motion.v, a_a, own_rate, powers]), tau, motion
-
-    def advance(self, time: float, state: Array, first: Array, step: float) -> Array:
-        """One step of the classical Runge-Kutta method, its first stage given."""
-        half = step / 2
-        second = self.rate(time + half, state + half * first)[0]
-        third = self.rate(time + half, state + half * second)[0]
-        fourth = self.rate(time + step, state + step * third)[0]
-        state = state + step / 6 * (first + 2 * second + 2 * third + fourth)
-        q = state[: self._joints]
-        if not (np.abs(first[: self._joints]).max() * step < 1 and np.isfinite(state).all()):
-            raise SimulationError(
-                f"at t = {time:.6g} s the motion explodes (over 1 m or rad in a step of "
-                f"{step:g} s): shorten the step, or smooth the friction more"
-            )
-        state[: self._joints] = self.machine.closure.solve(q[self._active], guess=q)
-        return state
-
-    def observe(self, motion: Motion) -> tuple[Array, tuple[float, float]]:
-        """Friction forces at the active joints (n,), kinetic and potential energy."""
-        friction = motion.gamma.T @ self.dynamics.forces.friction(motion.v)
-        return friction, self.dynamics.energy_at(motion.q, motion.v)
-
-
-def _as_controller(controller: Controller | Force | None, machine: Machine) -> Controller | None:
-    if controller is None or hasattr(controller, "start"):
+def _as_controller(controller: Controller | Force | None, machine: Machine) -> Controller:
+    if controller is None:
+        return Free(machine)
+    if hasattr(controller, "start"):
         return controller  # type: ignore[return-value]
     if not callable(controller):
         raise InputError(
@@ -183,11 +170,11 @@ def _recording(
     path: object,
     step: float,
     states: Array,
-    forces: Array,
-    friction: Array,
-    energies: Array,
+    seen: Array,
     task: str,
 ) -> Recording:
+    n = len(machine.active)
+    forces, friction, energies = seen[:, :n], seen[:, n : 2 * n], seen[:, 2 * n :]
     time = step * np.arange(len(states), dtype=np.float64)
     nq = machine.model.nq
     postures, v_a = states[:, :nq], states[:, nq : nq + len(machine.active)]

@@ -7,9 +7,9 @@ PACKAGE = Path(__file__).parents[1] / "crane"
 
 # A module may import those before it. Within a room, modules may not form a circle either.
 ORDER = [
-    "errors", "samples", "output", "timeseries", "description", "closure", "machine", "dynamics",
-    "kinematics", "paths", "control", "recording", "summary", "simulation", "view", "runs", "demo",
-    "cli",
+    "errors", "samples", "output", "timeseries", "straight", "description", "closure", "machine",
+    "dynamics", "kinematics", "paths", "control", "integration", "recording", "summary",
+    "simulation", "view", "runs", "demo", "cli",
 ]  # fmt: skip
 
 

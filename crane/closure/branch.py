@@ -60,7 +60,7 @@ class Branch:
         self._active, self._passive, self._span = active, passive, span
         self._blocks = structure.by_size()
         places = equations.model.jointPlacements
-        self._size = max(1.0, *(float(np.abs(place.translation).max()) for place in places))
+        self.size = max(1.0, *(float(np.abs(place.translation).max()) for place in places))
         home = self.newton(structure.home, structure.home[active], 30)
         if home is None:
             raise MechanismError("the home posture does not close, change 'home'", "home")
@@ -76,8 +76,8 @@ class Branch:
             phi, jacobian = self._equations.evaluate(q)
             phi, jacobian = phi[self._structure.rows], jacobian[self._structure.rows]
             residual = np.abs(phi).max(initial=0.0)
-            rounded = residual <= 4e-15 * self._size
-            stalled = residual <= 0.1 * _TOLERANCE * self._size and residual > 0.25 * before
+            rounded = residual <= 4e-15 * self.size
+            stalled = residual <= 0.1 * _TOLERANCE * self.size and residual > 0.25 * before
             try:
                 if rounded or stalled:
                     right = jacobian[:, self._active]
@@ -224,7 +224,7 @@ class Branch:
         if len(self._structure.redundant):
             phi, _ = self._equations.evaluate(posture.q)
             extra = np.abs(phi[self._structure.redundant])
-            if extra.max() > 1e3 * _TOLERANCE * self._size:
+            if extra.max() > 1e3 * _TOLERANCE * self.size:
                 row = self._structure.redundant[extra.argmax()]
                 loop = self._equations.loops[self._equations.loop_of_row[row]].name
                 raise OutOfReachError(
@@ -253,7 +253,7 @@ class Branch:
         nearest = least_squares(residual, q[self._passive], slope, xtol=1e-12)
         phi = residual(nearest.x)
         worst = int(np.abs(phi).argmax())
-        if np.abs(phi[worst]) < 10 * _TOLERANCE * self._size:
+        if np.abs(phi[worst]) < 10 * _TOLERANCE * self.size:
             return OutOfReachError(
                 f"{self._loops_of(self._weakest(last.jacobian)[1])} can be closed at "
                 f"{self._at(target)}{sample}, but the branch does not lead straight there from "

@@ -1,17 +1,21 @@
 """Closing the loops: q = f(q_A), v = gamma v_A, a = gamma a_A + drift."""
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from crane.closure.branch import Branch
+from crane.closure.branch import Branch, Posture
+from crane.closure.compiled import FastClosure
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import Structure, analyse
 from crane.description import LoopSpec
 from crane.errors import InputError
 from crane.samples import Array, as_samples, per_sample, solve
+
+_STEPS = 8  # from home to a target that is far from the one before it
 
 
 class Closure:
@@ -69,6 +73,19 @@ class Closure:
         self.home.flags.writeable = False
 
     @property
+    def home_posture(self) -> Posture:
+        """The home posture with its gamma."""
+        return self._branch.home
+
+    @cached_property
+    def fast(self) -> FastClosure:
+        """Machine code for these loops, made when it is first needed."""
+        branch = self._branch
+        return FastClosure(
+            self.equations, self.structure, self.active, self.passive, branch.home, branch.size
+        )
+
+    @property
     def degrees_of_freedom(self) -> int:
         """Number of active joints n."""
         return len(self.active)
@@ -95,23 +112,41 @@ class Closure:
             WrongBranchError: The guess belongs to another branch.
         """
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
-        known = self._branch.home
+        if targets.size == 0:
+            raise InputError("q_a is an empty stack, give at least one sample")
         if guess is not None:
             near = as_samples(guess, self.model.nq, "guess", self._names)
             if near.ndim != 1:
                 raise InputError(f"guess has the shape {near.shape}, give one ({self.model.nq},)")
-            if targets.ndim == 1 and (posture := self._branch.step(near, targets)):
-                return posture.q
-            known = self._branch.posture(near)
-        if targets.ndim == 1:
-            return self._branch.reach(targets, known).q
-        if len(targets) == 0:
-            raise InputError("q_a is an empty stack, give at least one sample")
-        out = np.empty((len(targets), self.model.nq))
-        for i, target in enumerate(targets):
-            known = self._branch.reach(target, known, f" (sample {i})")
-            out[i] = known.q
+            if not self.fast.start_near(near):
+                self.fast.start(self._branch.posture(near))
+        out = np.empty((*targets.shape[:-1], self.model.nq))
+        self.fill(np.atleast_2d(targets), np.atleast_2d(out), stacked=targets.ndim == 2)
         return out
+
+    def fill(self, targets: Array, out: Array, stacked: bool = True) -> None:
+        """Close the loops at targets (N, n) into out (N, nq), from where `fast` is."""
+        targets = np.ascontiguousarray(targets)
+        done = 0
+        while done < len(targets):
+            done += self.fast.follow(targets[done:], out[done:])
+            if done < len(targets):
+                sample = f" (sample {done})" if stacked else ""
+                out[done] = self.reach(targets[done], sample)
+                done += 1
+
+    def reach(self, target: Array, sample: str) -> Array:
+        """A target that is too far for one step: in several from home, or as `Branch` can."""
+        home = self._branch.home
+        way = home.q_a + np.linspace(0, 1, _STEPS + 1)[1:, None] * (target - home.q_a)
+        way[-1] = target
+        out = np.empty((_STEPS, self.model.nq))
+        self.fast.start(home)
+        if self.fast.follow(way, out) == _STEPS:
+            return out[-1]
+        posture = self._branch.reach(target, home, sample)
+        self.fast.start(posture)
+        return posture.q
 
     def gamma(self, q: ArrayLike) -> Array:
         """Derivative of f, equation (4) of the reduced-scale forwarder paper.

@@ -18,7 +18,7 @@ def frame_id(model: pin.Model, link: str) -> int:
     return index
 
 
-def _turned(axis: Sequence[float]) -> Array:
+def turned(axis: Sequence[float]) -> Array:
     """A rotation (3, 3) whose third column is the axis."""
     third = np.asarray(axis)
     first = np.cross(np.eye(3)[np.argmin(np.abs(third))], third)
@@ -58,14 +58,14 @@ class LoopEquations:
         self.model = model
         self.data = model.createData()
         self.loops = tuple(loops)
-        self._frames: list[tuple[int, pin.SE3]] = []  # (joint, placement), two per loop
+        self.frames: list[tuple[int, pin.SE3]] = []  # (joint, placement), two per loop
         sign = np.zeros((len(loops), model.nv))
         rows: list[tuple[int, bool, int, int]] = []  # loop, is translation, axis of 1, axis of 2
         for index, loop in enumerate(loops):
-            turn = pin.SE3(_turned(loop.axis), np.zeros(3))
+            turn = pin.SE3(turned(loop.axis), np.zeros(3))
             for side, name in ((-1.0, loop.predecessor), (1.0, loop.successor)):
                 frame = model.frames[frame_id(model, name)]
-                self._frames.append((frame.parentJoint, frame.placement * turn))
+                self.frames.append((frame.parentJoint, frame.placement * turn))
                 for joint in model.supports[frame.parentJoint]:
                     if joint > 0:
                         start = model.joints[joint].idx_v
@@ -79,20 +79,20 @@ class LoopEquations:
                 rows += [(index, False, i, free[0]) for i in range(3) if i != free[0]]
         self.loop_of_row = np.array([row[0] for row in rows], dtype=np.intp)
         self.is_translation = np.array([row[1] for row in rows], dtype=bool)
-        self._axis1 = np.array([row[2] for row in rows], dtype=np.intp)
-        self._axis2 = np.array([row[3] for row in rows], dtype=np.intp)
-        self._sign = sign
+        self.axis1 = np.array([row[2] for row in rows], dtype=np.intp)
+        self.axis2 = np.array([row[3] for row in rows], dtype=np.intp)
+        self.sign = sign
         self._row_sign = sign[self.loop_of_row]
 
     def _geometry(self) -> tuple[Array, Array, Array, Array]:
         """Of every row: axis of frame 1, axis of frame 2, origins of both frames, each (m, 3)."""
-        placements = [self.data.oMi[joint] * local for joint, local in self._frames]
+        placements = [self.data.oMi[joint] * local for joint, local in self.frames]
         turns = np.array([placement.rotation for placement in placements])
         origins = np.array([placement.translation for placement in placements])
         one = 2 * self.loop_of_row
         return (
-            turns[one, :, self._axis1],
-            turns[one + 1, :, self._axis2],
+            turns[one, :, self.axis1],
+            turns[one + 1, :, self.axis2],
             origins[one],
             origins[one + 1],
         )
@@ -129,7 +129,7 @@ class LoopEquations:
             locked = LOOP_TYPES[loop.type][3:]
             if not any(locked):
                 continue
-            (j1, local1), (j2, local2) = self._frames[2 * index : 2 * index + 2]
+            (j1, local1), (j2, local2) = self.frames[2 * index : 2 * index + 2]
             turn1 = (self.data.oMi[j1] * local1).rotation
             turn2 = (self.data.oMi[j2] * local2).rotation
             aligned = np.einsum("ik,ik->k", turn1, turn2)
@@ -152,7 +152,7 @@ class LoopEquations:
             return np.zeros(0)
         a, b, _, p2 = self._last
         rate = pin.computeJointJacobiansTimeVariation(self.model, self.data, q, v)
-        velocity = np.array([self.data.ov[joint].vector for joint, _ in self._frames])
+        velocity = np.array([self.data.ov[joint].vector for joint, _ in self.frames])
         one = 2 * self.loop_of_row
         v2, w1, w2 = velocity[one + 1, :3], velocity[one, 3:], velocity[one + 1, 3:]
         moved = self.is_translation[:, None]

@@ -1,6 +1,6 @@
 """Equations of motion in the active coordinates."""
 
-from crane.dynamics.dynamics import Dynamics, Motion
+from crane.dynamics.dynamics import Dynamics
 from crane.dynamics.elements import JointForces
 
-__all__ = ["Dynamics", "JointForces", "Motion"]
+__all__ = ["Dynamics", "JointForces"]

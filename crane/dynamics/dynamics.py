@@ -1,35 +1,18 @@
 """The equations of motion in the active coordinates."""
 
-from typing import NamedTuple
-
 import numpy as np
-import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from crane.dynamics.compiled import Formula, TooLongError
 from crane.dynamics.elements import JointForces
+from crane.dynamics.traced import numbers_of
+from crane.dynamics.tree import TreeDynamics
 from crane.errors import InputError, known
 from crane.machine import Machine
-from crane.samples import Array, as_samples, per_sample, solve
+from crane.samples import Array, as_samples
 
 FORMULATIONS = ("exact",)
-
-
-class Motion(NamedTuple):
-    """One closed posture in motion.
-
-    Attributes:
-        q: (nq,) posture.
-        v_a: (n,) active velocities.
-        gamma: (nv, n).
-        v: (nv,) velocities gamma v_A.
-        drift: (nv,) accelerations at a_A = 0.
-    """
-
-    q: Array
-    v_a: Array
-    gamma: Array
-    v: Array
-    drift: Array
+PATHS = ("compiled", "pinocchio")
 
 
 class Dynamics:
@@ -45,24 +28,35 @@ class Dynamics:
     asked for; passive forces belong to the machine and are always in. Every method takes single
     samples (n,) or stacks (N, n) and returns the same kind. Not safe to share between threads.
 
+    Two paths compute the same to rounding: "compiled" turns each quantity, when it is first asked
+    for, into machine code of straight-line formulas for this one machine; "pinocchio" projects the
+    results of Pinocchio's algorithms. Formulas of very large machines take too long to compile and
+    are left to the second.
+
     Args:
         machine: The machine; its payload and parameters are those at this moment.
         formulation: "exact".
+        path: "compiled" or "pinocchio".
 
     Raises:
-        InputError: Unknown formulation.
+        InputError: Unknown formulation or path.
     """
 
-    def __init__(self, machine: Machine, formulation: str = "exact"):
-        if formulation not in FORMULATIONS:
-            raise InputError(
-                f"formulation '{formulation}' is unknown, {known(FORMULATIONS, formulation)}"
-            )
+    def __init__(self, machine: Machine, formulation: str = "exact", path: str = "compiled"):
+        for what, name, names in (
+            ("formulation", formulation, FORMULATIONS),
+            ("path", path, PATHS),
+        ):
+            if name not in names:
+                raise InputError(f"{what} '{name}' is unknown, {known(names, name)}")
         self.machine = machine
         self.forces = JointForces(machine)
-        self._model = machine.model
-        self._data = machine.model.createData()
-        self._closure = machine.closure
+        self.path = path
+        self.tree = TreeDynamics(machine, self.forces)
+        self._formulas: dict[str, Formula | None] = {}
+        self.numbers = np.ascontiguousarray(
+            numbers_of(machine, machine.closure.fast.geometry, self.forces)
+        )
 
     @property
     def parameters(self) -> Array:
@@ -72,7 +66,7 @@ class Dynamics:
         I_xz, I_yz, I_zz [kg, kg m, kg m2].
         """
         return np.concatenate(
-            [inertia.toDynamicParameters() for inertia in list(self._model.inertias)[1:]]
+            [inertia.toDynamicParameters() for inertia in list(self.machine.model.inertias)[1:]]
         )
 
     def inverse(
@@ -89,14 +83,8 @@ class Dynamics:
         Returns:
             tau_A, (n,) or (N, n) [N], [N m].
         """
-
-        def one(q: Array, v_a: Array, a_a: Array) -> Array:
-            motion = self.motion(q, v_a)
-            return motion.gamma.T @ self._tree_force(
-                motion, motion.gamma @ a_a + motion.drift, friction
-            )
-
-        return per_sample(one, *self._arguments(q_a, v_a=v_a, a_a=a_a))
+        quantity = "inverse with friction" if friction else "inverse"
+        return self._evaluate(quantity, (), q_a, v_a, a_a, "a_a")
 
     def forward(
         self, q_a: ArrayLike, v_a: ArrayLike, tau_a: ArrayLike, friction: bool = False
@@ -112,49 +100,8 @@ class Dynamics:
         Returns:
             a_A, (n,) or (N, n) [m/s2], [rad/s2].
         """
-
-        def one(q: Array, v_a: Array, tau_a: Array) -> Array:
-            return self.accelerate(self.motion(q, v_a), tau_a, friction)
-
-        return per_sample(one, *self._arguments(q_a, v_a=v_a, tau_a=tau_a))
-
-    def motion(self, q: Array, v_a: Array) -> Motion:
-        """What gamma makes of active velocities.
-
-        Args:
-            q: (nq,) closed posture.
-            v_a: (n,) [m/s], [rad/s].
-        """
-        gamma, v, drift = self._closure.motion(q, v_a)
-        return Motion(q, v_a, gamma, v, drift)
-
-    def accelerate(self, motion: Motion, tau_a: Array, friction: bool = False) -> Array:
-        """`forward` of one sample whose posture is closed already.
-
-        Args:
-            motion: Posture and velocities.
-            tau_a: (n,) [N], [N m].
-            friction: Whether friction brakes.
-
-        Returns:
-            a_A (n,) [m/s2], [rad/s2].
-        """
-        bias = motion.gamma.T @ self._tree_force(motion, motion.drift, friction)
-        mass = self._mass(motion.q, motion.gamma)
-        return solve(mass, tau_a - bias)
-
-    def energy_at(self, q: Array, v: Array) -> tuple[float, float]:
-        """`energy` of one posture (nq,) with velocities (nv,) of the tree."""
-        kinetic = pin.computeKineticEnergy(self._model, self._data, q, v)
-        weight = pin.computePotentialEnergy(self._model, self._data, q)
-        return kinetic, weight + self.forces.potential(q)
-
-    def dissipation(self, motion: Motion) -> float:
-        """Power that friction, dampers and end stops take out [W]."""
-        velocity = motion.v
-        conservative = self.forces.passive(motion.q, np.zeros_like(velocity))
-        braking = conservative - self.forces.passive(motion.q, velocity)
-        return float(velocity @ (self.forces.friction(velocity) + braking))
+        quantity = "forward with friction" if friction else "forward"
+        return self._evaluate(quantity, (), q_a, v_a, tau_a, "tau_a")
 
     def mass_matrix(self, q_a: ArrayLike) -> Array:
         """M_A = gamma^T M gamma.
@@ -165,7 +112,7 @@ class Dynamics:
         Returns:
             (n, n) or (N, n, n) [kg], [kg m], [kg m2].
         """
-        return per_sample(lambda q: self._mass(q, self._closure.gamma(q)), *self._arguments(q_a))
+        return self._evaluate("mass matrix", (self._n, self._n), q_a)
 
     def bias(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
         """Active forces at zero acceleration: gamma^T (rnea(q, v, drift) - f).
@@ -177,12 +124,7 @@ class Dynamics:
         Returns:
             (n,) or (N, n) [N], [N m].
         """
-
-        def one(q: Array, v_a: Array) -> Array:
-            motion = self.motion(q, v_a)
-            return motion.gamma.T @ self._tree_force(motion, motion.drift, False)
-
-        return per_sample(one, *self._arguments(q_a, v_a=v_a))
+        return self._evaluate("bias", (), q_a, v_a)
 
     def gravity(self, q_a: ArrayLike) -> Array:
         """Active forces that hold the weight alone: gamma^T g(q), without passive forces.
@@ -193,12 +135,7 @@ class Dynamics:
         Returns:
             (n,) or (N, n) [N], [N m].
         """
-
-        def one(q: Array) -> Array:
-            weight = pin.computeGeneralizedGravity(self._model, self._data, q)
-            return self._closure.gamma(q).T @ weight
-
-        return per_sample(one, *self._arguments(q_a))
+        return self._evaluate("gravity", (), q_a)
 
     def friction(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
         """Active forces that friction of all joints consumes: gamma^T tau_F(gamma v_A).
@@ -210,12 +147,7 @@ class Dynamics:
         Returns:
             (n,) or (N, n) [N], [N m].
         """
-
-        def one(q: Array, v_a: Array) -> Array:
-            gamma = self._closure.gamma(q)
-            return gamma.T @ self.forces.friction(gamma @ v_a)
-
-        return per_sample(one, *self._arguments(q_a, v_a=v_a))
+        return self._evaluate("friction", (), q_a, v_a)
 
     def passive(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
         """What passive forces do at the active joints: gamma^T f(q, gamma v_A).
@@ -227,12 +159,7 @@ class Dynamics:
         Returns:
             (n,) or (N, n) [N], [N m].
         """
-
-        def one(q: Array, v_a: Array) -> Array:
-            gamma = self._closure.gamma(q)
-            return gamma.T @ self.forces.passive(q, gamma @ v_a)
-
-        return per_sample(one, *self._arguments(q_a, v_a=v_a))
+        return self._evaluate("passive", (), q_a, v_a)
 
     def energy(self, q_a: ArrayLike, v_a: ArrayLike) -> tuple[Array, Array]:
         """Kinetic and potential energy; the potential includes springs and constant forces.
@@ -244,11 +171,7 @@ class Dynamics:
         Returns:
             Two arrays, () or (N,) [J].
         """
-
-        def one(q: Array, v_a: Array) -> Array:
-            return np.array(self.energy_at(q, self._closure.gamma(q) @ v_a))
-
-        both = per_sample(one, *self._arguments(q_a, v_a=v_a))
+        both = self._evaluate("energy", (), q_a, v_a)
         return both[..., 0], both[..., 1]
 
     def regressor(self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike) -> Array:
@@ -262,29 +185,101 @@ class Dynamics:
         Returns:
             (n, 10 nb) or (N, n, 10 nb), columns in the order of `parameters`.
         """
+        size = 10 * (self.machine.model.njoints - 1)
+        return self._evaluate("regressor", (self._n, size), q_a, v_a, a_a, "a_a")
 
-        def one(q: Array, v_a: Array, a_a: Array) -> Array:
-            motion = self.motion(q, v_a)
-            a = motion.gamma @ a_a + motion.drift
-            tree = pin.computeJointTorqueRegressor(self._model, self._data, q, motion.v, a)
-            return motion.gamma.T @ tree
+    def at(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
+        """A quantity of one sample at a posture that is closed already.
 
-        return per_sample(one, *self._arguments(q_a, v_a=v_a, a_a=a_a))
+        Args:
+            quantity: A key of `crane.dynamics.compiled.QUANTITIES`.
+            q: (nq,) closed posture.
+            v_a: (n,) [m/s], [rad/s].
+            x: (n,) a_A or tau_A, whatever the quantity asks for.
 
-    def _arguments(self, q_a: ArrayLike, **others: ArrayLike) -> tuple[Array, ...]:
-        """Checked samples, the active coordinates replaced by closed postures."""
-        names = self.machine.active
-        checked = [as_samples(other, len(names), what, names) for what, other in others.items()]
-        return (self._closure.solve(q_a), *checked)
+        Returns:
+            The result, flattened.
+        """
+        formula = self._formula(quantity)
+        if formula is None:
+            return self.tree.at(quantity, q, v_a, x)
+        return formula.at(np.ascontiguousarray(q), np.concatenate([v_a, x]))
 
-    def _tree_force(self, motion: Motion, a: Array, friction: bool) -> Array:
-        """rnea(q, v, a) - f [+ tau_F] of the tree, (nv,)."""
-        tau = pin.rnea(self._model, self._data, motion.q, motion.v, a)
-        tau = tau - self.forces.passive(motion.q, motion.v)
-        return tau + self.forces.friction(motion.v) if friction else tau
+    @property
+    def _n(self) -> int:
+        return len(self.machine.active)
 
-    def _mass(self, q: Array, gamma: Array) -> Array:
-        upper = np.triu(pin.crba(self._model, self._data, q))
-        mass = upper + np.triu(upper, 1).T
-        out: Array = gamma.T @ mass @ gamma
+    def _formula(self, quantity: str) -> Formula | None:
+        """Machine code of a quantity, or None on Pinocchio's path."""
+        if quantity not in self._formulas:
+            try:
+                self._formulas[quantity] = (
+                    Formula(quantity, self.machine, self.numbers)
+                    if self.path == "compiled"
+                    else None
+                )
+            except TooLongError:
+                self._formulas[quantity] = None
+        return self._formulas[quantity]
+
+    def _evaluate(
+        self,
+        quantity: str,
+        shape: tuple[int, ...],
+        q_a: ArrayLike,
+        v_a: ArrayLike | None = None,
+        x: ArrayLike | None = None,
+        x_name: str = "",
+    ) -> Array:
+        """A quantity of samples or stacks, single samples among stacks held for every row.
+
+        `shape` is that of one result, () for a vector.
+        """
+        formula = self._formulas.get(quantity)
+        if formula is not None and (out := formula.one(q_a, v_a, x)) is not None:
+            return out.reshape(shape) if shape else out
+        names, n = self.machine.active, self._n
+        q_a = as_samples(q_a, n, "q_a", names)
+        checked = [
+            as_samples(value, n, what, names)
+            for what, value in (("v_a", v_a), (x_name, x))
+            if value is not None
+        ]
+        lengths = {len(array) for array in (q_a, *checked) if array.ndim == 2}
+        if len(lengths) > 1:
+            raise InputError(
+                f"stacks of {sorted(lengths)} samples do not go together, give equal N"
+            )
+        count = lengths.pop() if lengths else 1
+        if count == 0:
+            raise InputError("the stack is empty, give at least one sample")
+        stacked = any(array.ndim == 2 for array in (q_a, *checked))
+        rows = np.zeros((count, 2 * n))
+        for i, array in enumerate(checked):
+            rows[:, i * n : (i + 1) * n] = array
+        targets = np.ascontiguousarray(np.broadcast_to(q_a, (count, n)))
+        out = self._fill(quantity, targets, rows, q_a.ndim == 2)
+        if shape:
+            return out.reshape((count, *shape) if stacked else shape)
+        return out if stacked else out[0]
+
+    def _fill(self, quantity: str, targets: Array, rows: Array, stacked: bool) -> Array:
+        closure, n = self.machine.closure, self._n
+        formula = self._formula(quantity)
+        if formula is None:
+            postures = closure.solve(targets)
+            return np.array(
+                [
+                    self.tree.at(quantity, q, row[:n], row[n:])
+                    for q, row in zip(postures, rows, strict=True)
+                ]
+            )
+        out = np.empty((len(targets), formula.size))
+        done = 0
+        while done < len(targets):
+            done += formula.each(targets[done:], rows[done:], out[done:])
+            if done < len(targets):
+                q = closure.reach(targets[done], f" (sample {done})" if stacked else "")
+                out[done] = formula.at(q, rows[done])
+                done += 1
         return out

@@ -5,41 +5,54 @@ import numpy as np
 from crane.machine import Machine
 from crane.samples import Array
 
+_LAW = (
+    "coulomb", "coulomb_offset", "viscous", "viscous_offset", "sharpness",
+    "stiffness", "damping", "constant", "slack",
+    "stop", "stop_damping", "lower", "upper",
+)  # fmt: skip
+_JUMP = 1e300  # sharpness of a sign that is not smoothed
+
 
 class JointForces:
     """Friction and passive forces of all joints of a machine, in tree coordinates.
 
     Args:
         machine: The machine whose `friction`, `forces` and `end_stops` act.
+
+    Attributes:
+        table: (nv, 13) per joint: Coulomb friction, its offset, viscous friction, its offset, one
+            over the smoothing velocity; stiffness, damping, constant force, energy of the spring
+            at q = 0; stiffness and damping of the end stops, lower and upper limit.
     """
 
     def __init__(self, machine: Machine):
-        size = machine.model.nv
-        self._coulomb, self._coulomb_offset = np.zeros(size), np.zeros(size)
-        self._viscous, self._viscous_offset = np.zeros(size), np.zeros(size)
-        self._smoothing = np.ones(size)
+        table = self.table = np.zeros((machine.model.nv, len(_LAW)))
+        table[:, _LAW.index("sharpness")] = 1.0
         for joint, friction in machine.friction.items():
-            i = machine.column(joint)
-            self._coulomb[i], self._coulomb_offset[i] = friction.coulomb, friction.coulomb_offset
-            self._viscous[i], self._viscous_offset[i] = friction.viscous, friction.viscous_offset
-            self._smoothing[i] = friction.smoothing
-        self._jump = self._smoothing == 0
-        self._smoothing[self._jump] = 1.0
-        # springs of one joint add up: k (q - rest) summed is K q - sum(k rest)
-        self._stiffness, self._damping = np.zeros(size), np.zeros(size)
-        self._constant, self._slack_energy = np.zeros(size), 0.0
+            table[machine.column(joint), :5] = (
+                friction.coulomb,
+                friction.coulomb_offset,
+                friction.viscous,
+                friction.viscous_offset,
+                1.0 / friction.smoothing if friction.smoothing else _JUMP,
+            )
         for element in machine.forces:
-            i = machine.column(element.joint)
-            self._stiffness[i] += element.stiffness
-            self._damping[i] += element.damping
-            self._constant[i] += element.force + element.stiffness * element.rest
-            self._slack_energy += 0.5 * element.stiffness * element.rest**2
-        stops = [(machine.column(stop.joint), stop) for stop in machine.end_stops]
-        self._stopped = np.array([i for i, _ in stops], dtype=np.intp)
-        self._stop_stiffness = np.array([stop.stiffness for _, stop in stops])
-        self._stop_damping = np.array([stop.damping for _, stop in stops])
-        self._lower = machine.model.lowerPositionLimit[self._stopped]
-        self._upper = machine.model.upperPositionLimit[self._stopped]
+            # springs of one joint add up: sum k (q - rest) = K q - sum k rest
+            table[machine.column(element.joint), 5:9] += (
+                element.stiffness,
+                element.damping,
+                element.force + element.stiffness * element.rest,
+                0.5 * element.stiffness * element.rest**2,
+            )
+        for stop in machine.end_stops:
+            i = machine.column(stop.joint)
+            lower, upper = machine.model.lowerPositionLimit, machine.model.upperPositionLimit
+            table[i, 9:] = stop.stiffness, stop.damping, lower[i], upper[i]
+        (
+            self._coulomb, self._coulomb_offset, self._viscous, self._viscous_offset,
+            self._sharpness, self._stiffness, self._damping, self._constant, self._slack,
+            self._stop, self._stop_damping, self._lower, self._upper,
+        ) = np.ascontiguousarray(table.T)  # fmt: skip
 
     def friction(self, v: Array) -> Array:
         """Drive force that friction consumes at every joint.
@@ -53,7 +66,7 @@ class JointForces:
         Returns:
             (nv,) [N], [N m].
         """
-        sign = np.where(self._jump, np.sign(v), np.tanh(v / self._smoothing))
+        sign = np.tanh(v * self._sharpness)
         return (
             self._coulomb * sign
             + self._coulomb_offset
@@ -73,16 +86,11 @@ class JointForces:
         Returns:
             (nv,) [N], [N m].
         """
-        force = self._constant - self._stiffness * q - self._damping * v
-        if len(self._stopped):
-            at, speed = q[self._stopped], v[self._stopped]
-            over, under = np.maximum(0.0, at - self._upper), np.maximum(0.0, self._lower - at)
-            damping = self._stop_damping
-            force[self._stopped] += self._stop_stiffness * (
-                under * np.maximum(0.0, 1 - damping * speed)
-                - over * np.maximum(0.0, 1 + damping * speed)
-            )
-        return force
+        over, under = np.maximum(0.0, q - self._upper), np.maximum(0.0, self._lower - q)
+        stopping = under * np.maximum(0.0, 1 - self._stop_damping * v) - over * np.maximum(
+            0.0, 1 + self._stop_damping * v
+        )
+        return self._constant - self._stiffness * q - self._damping * v + self._stop * stopping
 
     def potential(self, q: Array) -> float:
         """Energy stored in springs, constant forces and end stops [J].
@@ -90,9 +98,10 @@ class JointForces:
         Args:
             q: (nq,) [m], [rad].
         """
-        energy = 0.5 * self._stiffness @ q**2 - self._constant @ q + self._slack_energy
-        if len(self._stopped):
-            at = q[self._stopped]
-            depth = np.maximum(0.0, np.maximum(at - self._upper, self._lower - at))
-            energy += 0.5 * self._stop_stiffness @ depth**2
-        return float(energy)
+        depth = np.maximum(0.0, np.maximum(q - self._upper, self._lower - q))
+        return float(
+            0.5 * self._stiffness @ q**2
+            - self._constant @ q
+            + self._slack.sum()
+            + 0.5 * self._stop @ depth**2
+        )

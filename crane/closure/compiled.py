@@ -1,0 +1,230 @@
+"""Closing loops in machine code made for one machine."""
+
+from ctypes import c_double, c_int64, c_void_p
+
+import numpy as np
+
+from crane.closure.branch import Posture as ClosedPosture
+from crane.closure.equations import LoopEquations
+from crane.closure.structure import Indices, Structure
+from crane.closure.traced import Constants, Loops, Posture, geometry_of
+from crane.samples import Array
+from crane.straight import Number, Program, Tape, largest, maximum
+from crane.straight.scalar import dot
+
+_STEEP = 1e3  # an entry of gamma above this is looked at closely by `Branch`
+_NEAR = 1e-6  # residual of a guess that is as good as closed
+_SURPLUS = 1e-9  # residual of redundant equations, likewise
+
+# Follows a stack of targets as `Branch` does while a single step leads from one to the next, and
+# stops where it does not: `Branch` takes that sample. `at` holds [q, gamma] of the last sample.
+# newton gives [residual, change, regular, corrected q, gamma].
+_FOLLOW = """
+define i64 @follow(i64 %count, ptr %numbers, ptr %targets, ptr %at, ptr %work, ptr %out,
+                   double %rounded, double %closed) {{
+entry:
+  %guess = getelementptr double, ptr %work, i64 0
+  %first = getelementptr double, ptr %work, i64 {nq}
+  %move_at = getelementptr double, ptr %first, i64 {nq}
+  %verdict = getelementptr double, ptr %move_at, i64 1
+  %result = getelementptr double, ptr %verdict, i64 1
+  %change_at = getelementptr double, ptr %result, i64 1
+  %good_at = getelementptr double, ptr %result, i64 2
+  %next_at = getelementptr double, ptr %result, i64 3
+  %gamma_new = getelementptr double, ptr %next_at, i64 {nq}
+  %gamma_at = getelementptr double, ptr %at, i64 {nq}
+  br label %sample
+sample:
+  %i = phi i64 [0, %entry], [%i1, %accept]
+  %more = icmp slt i64 %i, %count
+  br i1 %more, label %begin, label %done
+begin:
+  %t0 = mul i64 %i, {n}
+  %target = getelementptr double, ptr %targets, i64 %t0
+  call void @predict(ptr %at, ptr %target, ptr %first)
+  %move = load double, ptr %move_at
+  %small = fcmp olt double %move, 1.0
+  br i1 %small, label %start, label %done
+start:
+  call void @llvm.memcpy.p0.p0.i64(ptr %guess, ptr %first, i64 {bytes}, i1 false)
+  br label %newton
+newton:
+  %k = phi i64 [0, %start], [%k1, %again]
+  %before = phi double [0x7FF0000000000000, %start], [%residual, %again]
+  call void @newton(ptr %numbers, ptr %guess, ptr %result)
+  %residual = load double, ptr %result
+  %tight = fcmp ole double %residual, %rounded
+  br i1 %tight, label %judge, label %maybe
+maybe:
+  %near = fcmp ole double %residual, %closed
+  %quarter = fmul double %before, 0.25
+  %slow = fcmp ogt double %residual, %quarter
+  %stalled = and i1 %near, %slow
+  br i1 %stalled, label %judge, label %step
+step:
+  %change = load double, ptr %change_at
+  %fine = fcmp olt double %change, 1.0
+  %k1 = add i64 %k, 1
+  %time = icmp slt i64 %k1, 8
+  %on = and i1 %fine, %time
+  br i1 %on, label %again, label %done
+again:
+  call void @llvm.memcpy.p0.p0.i64(ptr %guess, ptr %next_at, i64 {bytes}, i1 false)
+  br label %newton
+judge:
+  %good = load double, ptr %good_at
+  %regular = fcmp ogt double %good, 0.0
+  br i1 %regular, label %compare, label %done
+compare:
+  call void @distance(ptr %first, ptr %guess, ptr %verdict)
+  %off = load double, ptr %verdict
+  %half = fmul double %move, 0.5
+  %bound = fadd double %half, 0.02
+  %follows = fcmp ole double %off, %bound
+  br i1 %follows, label %accept, label %done
+accept:
+  call void @llvm.memcpy.p0.p0.i64(ptr %at, ptr %guess, i64 {bytes}, i1 false)
+  call void @llvm.memcpy.p0.p0.i64(ptr %gamma_at, ptr %gamma_new, i64 {gamma_bytes}, i1 false)
+  %o0 = mul i64 %i, {nq}
+  %o = getelementptr double, ptr %out, i64 %o0
+  call void @llvm.memcpy.p0.p0.i64(ptr %o, ptr %guess, i64 {bytes}, i1 false)
+  %i1 = add i64 %i, 1
+  br label %sample
+done:
+  ret i64 %i
+}}
+"""
+
+
+class FastClosure:
+    """Machine code for the loops of one machine.
+
+    Args:
+        equations: All equations.
+        structure: Which of them count.
+        active: Columns of the active joints.
+        passive: Columns of the others.
+        home: The home posture, whose branch is followed.
+        size: Of the machine [m], to which tolerances refer.
+
+    Attributes:
+        geometry: What the formulas were traced from.
+        at: (nq + m n,) posture and passive rows of gamma that the next sample starts from.
+        work: Memory to work in.
+        bounds: Residuals that count as rounding, and as closed if they no longer fall.
+        address: Of the function `follow`, for other machine code to call.
+    """
+
+    def __init__(
+        self,
+        equations: LoopEquations,
+        structure: Structure,
+        active: Indices,
+        passive: Indices,
+        home: ClosedPosture,
+        size: float,
+    ):
+        self.geometry = geometry_of(equations)
+        self._equations, self._structure = equations, structure
+        self._active, self._passive = active, passive
+        nq, n, rows = equations.model.nq, len(active), len(passive)
+        self._nq, self._n = nq, n
+        program = Program()
+        self.add_newton(program, self._signs(home))
+        self._add_moves(program)
+        program.add_text(_FOLLOW.format(n=n, nq=nq, bytes=8 * nq, gamma_bytes=8 * rows * n))
+        program.compile()
+        self._program = program  # the functions live as long as it
+        kinds = [c_int64, *[c_void_p] * 5, c_double, c_double]
+        self._follow = program.function("follow", *kinds, result=c_int64)
+        self._newton = program.function("newton", *[c_void_p] * 3)
+        self.address = program.address("follow")
+        self.newton_address = program.address("newton")
+        self.at = np.zeros(nq + rows * n)
+        self.work = np.zeros(3 * nq + 5 + rows * n)
+        self.bounds = (1e-15 * size, 1e-13 * size)
+        self.start(home)
+
+    def start(self, posture: ClosedPosture) -> None:
+        """Let the next sample start from a posture."""
+        self.at[: self._nq] = posture.q
+        self.at[self._nq :] = posture.gamma.ravel()
+
+    def start_near(self, q: Array) -> bool:
+        """Let the next sample start from a posture (nq,) that is closed to 1e-6 or better.
+
+        Returns:
+            Whether it is, and on the home branch.
+        """
+        result = np.empty(3 + len(self.at))
+        q = np.ascontiguousarray(q)
+        self._newton(self.geometry.numbers.ctypes.data, q.ctypes.data, result.ctypes.data)
+        residual, _, regular = result[:3]
+        if not (residual <= _NEAR and regular > 0):
+            return False
+        self.at[: self._nq] = q
+        self.at[self._nq :] = result[3 + self._nq :]
+        return True
+
+    def follow(self, targets: Array, out: Array) -> int:
+        """Close the loops at targets (N, n) into out (N, nq) until one needs more than a step.
+
+        Returns:
+            How many were closed.
+        """
+        numbers = self.geometry.numbers
+        return int(
+            self._follow(
+                len(targets), numbers.ctypes.data, targets.ctypes.data, self.at.ctypes.data,
+                self.work.ctypes.data, out.ctypes.data, *self.bounds,
+            )
+        )  # fmt: skip
+
+    def trace(self, tape: Tape, geometry: int, q: int) -> tuple[list[Number], Posture, Loops]:
+        """Coordinates, bodies and loops, read from two arguments of a function to be."""
+        coordinates = tape.loads(q, 0, self._nq)
+        constants = Constants(tape, geometry, self.geometry.numbers)
+        posture = Posture(self.geometry, constants, coordinates)
+        loops = Loops(self._equations, self._structure, self._active, self._passive, posture)
+        return coordinates, posture, loops
+
+    def add_newton(self, program: Program, signs: Array) -> None:
+        """newton(numbers, q) -> residual, change, regular, corrected q, passive rows of gamma.
+
+        regular is positive on the home branch away from its edge, with surplus equations closed.
+        """
+        q, _, loops = self.trace(Tape(), 0, 1)
+        steps = loops.correction
+        corrected = [x + steps.get(i, 0.0) for i, x in enumerate(q, start=1)]
+        rows = [entry for joint in loops.passive_joints for entry in loops.gamma[joint]]
+        worst = maximum(largest(rows) - _STEEP, loops.surplus - _SURPLUS)
+        for sign, determinant in zip(signs, loops.determinants, strict=True):
+            worst = maximum(worst, -(float(sign) * determinant))
+        outputs = [loops.residual, largest(steps.values()), -1.0 * worst, *corrected, *rows]
+        program.add("newton", 2, outputs)
+
+    def _signs(self, home: ClosedPosture) -> Array:
+        """Of the blocks' determinants on the home branch."""
+        blocks = (
+            home.jacobian[np.ix_(rows, self._passive[columns])]
+            for rows, columns in self._structure.blocks
+        )
+        return np.array([np.linalg.slogdet(block)[0] for block in blocks])
+
+    def _add_moves(self, program: Program) -> None:
+        """predict(at, target) -> q, largest move of a passive joint; distance(q, q')."""
+        tape = Tape()
+        q, n = tape.loads(0, 0, self._nq), self._n
+        target = tape.loads(1, 0, n)
+        change = [target[k] - q[column] for k, column in enumerate(self._active)]
+        moves = [
+            dot(tape.loads(0, self._nq + row * n, n), change) for row in range(len(self._passive))
+        ]
+        for column, move in zip(self._passive, moves, strict=True):
+            q[column] = q[column] + move
+        for column, value in zip(self._active, target, strict=True):
+            q[column] = value
+        program.add("predict", 2, [*q, largest(moves)])
+        tape = Tape()
+        one, two = tape.loads(0, 0, self._nq), tape.loads(1, 0, self._nq)
+        program.add("distance", 2, [largest(one[i] - two[i] for i in self._passive)])

@@ -1,0 +1,346 @@
+"""Positions, loop equations and gamma as traced formulas of one machine."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from crane.closure.equations import LoopEquations, turned
+from crane.closure.structure import Indices, Structure
+from crane.samples import Array
+from crane.straight.scalar import (
+    Number,
+    Tape,
+    add,
+    apply,
+    cross,
+    dot,
+    largest,
+    product,
+    scale,
+    solve,
+    subtract,
+    times,
+)  # fmt: skip
+
+Vector = list[Number]
+_ROUNDING = 1e-15  # of a rotation by a right angle
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """What the formulas of a machine's positions depend on.
+
+    Body i (1 to nb) is moved by joint i, which turns about or slides along the body's own z;
+    body 0 is the world.
+
+    Attributes:
+        parents: (nb + 1,) parent bodies.
+        revolute: (nb + 1,) whether the joint turns.
+        turns: (nb + 1, 3, 3) from the body's directions here to those of Pinocchio's joint.
+        numbers: (12 (nb + frames),) rotation and origin of every joint frame in its parent body,
+            then of every loop frame in its body.
+        frame_bodies: Body of each loop frame, predecessor and successor of each loop in turn.
+    """
+
+    parents: tuple[int, ...]
+    revolute: tuple[bool, ...]
+    turns: Array
+    numbers: Array
+    frame_bodies: tuple[int, ...]
+
+
+def geometry_of(equations: LoopEquations) -> Geometry:
+    """Read the geometry off an assembled model."""
+    model = equations.model
+    parents, revolute, turns = [0], [False], [pin.SE3.Identity()]
+    places = []
+    for i in range(1, model.njoints):
+        joint = model.joints[i]
+        data = joint.createData()
+        joint.calc(data, np.zeros(model.nq))
+        column = np.asarray(data.S).ravel()
+        turning = bool(np.linalg.norm(column[3:]) > 0.5)
+        axis = column[3:] if turning else column[:3]
+        turn = pin.SE3(np.eye(3) if axis[2] == 1 else turned(axis.tolist()), np.zeros(3))
+        parent = model.parents[i]
+        places.append(turns[parent].inverse() * model.jointPlacements[i] * turn)
+        parents.append(parent)
+        revolute.append(turning)
+        turns.append(turn)
+    frames = equations.frames
+    places += [turns[body].inverse() * place for body, place in frames]
+    numbers = [np.concatenate([_clean(p.rotation).ravel(), p.translation]) for p in places]
+    return Geometry(
+        tuple(parents),
+        tuple(revolute),
+        np.array([turn.rotation for turn in turns]),
+        np.concatenate(numbers) if numbers else np.zeros(0),
+        tuple(body for body, _ in frames),
+    )
+
+
+def _clean(rotation: Array) -> Array:
+    """Exact zeros and ones, so that they are folded."""
+    near = np.round(rotation)
+    return np.where(np.abs(rotation - near) < _ROUNDING, near, rotation)
+
+
+class Constants:
+    """Numbers of a machine: 0, 1 and -1 become part of the formulas, the others stay arguments.
+
+    Args:
+        tape: Where they are read.
+        array: Which argument holds them.
+        values: Their values while tracing.
+    """
+
+    def __init__(self, tape: Tape, array: int, values: Array):
+        self._tape, self._array, self._values = tape, array, values
+
+    def __getitem__(self, index: int) -> Number:
+        value = float(self._values[index])
+        return value if value in (0.0, 1.0, -1.0) else self._tape.load(self._array, index)
+
+    def vector(self, start: int, count: int = 3) -> Vector:
+        """Consecutive numbers."""
+        return [self[start + i] for i in range(count)]
+
+    def place(self, index: int) -> tuple[list[Vector], Vector]:
+        """Rotation (3, 3) and origin (3,) number `index` of a geometry."""
+        start = 12 * index
+        return [self.vector(start + 3 * row) for row in range(3)], self.vector(start + 9)
+
+
+def folded(values: Array) -> bytes:
+    """What of a machine's numbers is part of its formulas."""
+    return np.where(np.isin(values, (0.0, 1.0, -1.0)), values, 2.0).tobytes()
+
+
+class Posture:
+    """Bodies and loops at traced coordinates.
+
+    Args:
+        geometry: The machine's geometry.
+        constants: Its numbers.
+        q: (nb,).
+
+    Attributes:
+        rotation: Of every body, (3, 3).
+        origin: Of every body, (3,).
+        columns: Of every joint, its spatial column at the world's origin: linear, angular.
+    """
+
+    def __init__(self, geometry: Geometry, constants: Constants, q: Sequence[Number]):
+        self.geometry, self._constants = geometry, constants
+        self.rotation: list[list[Vector]] = [[[float(r == c) for c in range(3)] for r in range(3)]]
+        self.origin: list[Vector] = [[0.0, 0.0, 0.0]]
+        self.columns: list[tuple[Vector, Vector]] = [([0.0] * 3, [0.0] * 3)]
+        for i in range(1, len(geometry.parents)):
+            parent = geometry.parents[i]
+            turn, place = constants.place(i - 1)
+            rotation = product(self.rotation[parent], turn)
+            origin = add(self.origin[parent], times(self.rotation[parent], place))
+            axis = [row[2] for row in rotation]
+            if geometry.revolute[i]:
+                c, s = apply("cos", q[i - 1]), apply("sin", q[i - 1])
+                rotation = [[c * x + s * y, c * y - s * x, z] for x, y, z in rotation]
+                self.columns.append((cross(origin, axis), axis))
+            else:
+                origin = add(origin, scale(q[i - 1], axis))
+                self.columns.append((axis, [0.0] * 3))
+            self.rotation.append(rotation)
+            self.origin.append(origin)
+
+    def frame(self, index: int) -> tuple[list[Vector], Vector]:
+        """Axes (columns of a rotation) and origin of a loop frame in the world."""
+        body = self.geometry.frame_bodies[index]
+        turn, place = self._constants.place(len(self.geometry.parents) - 1 + index)
+        axes = product(self.rotation[body], turn)
+        return axes, add(self.origin[body], times(self.rotation[body], place))
+
+
+@dataclass(frozen=True)
+class Row:
+    """One traced loop equation; see `LoopEquations`."""
+
+    bodies: tuple[int, int]
+    moves: bool
+    axis: Vector
+    arm: Vector
+    wrench: tuple[Vector, Vector]
+    phi: Number
+    slopes: dict[int, Number]  # joint -> dphi/dq
+
+
+class Loops:
+    """The independent loop equations at a traced posture.
+
+    Args:
+        equations: All equations of the machine.
+        structure: Which of them count.
+        active: Columns of the active joints.
+        passive: Columns of the others.
+        posture: The posture.
+    """
+
+    def __init__(
+        self,
+        equations: LoopEquations,
+        structure: Structure,
+        active: Indices,
+        passive: Indices,
+        posture: Posture,
+    ):
+        self._structure = structure
+        self.active_joints = [int(column) + 1 for column in active]
+        self.passive_joints = [int(column) + 1 for column in passive]
+        self._frames = [posture.frame(i) for i in range(len(posture.geometry.frame_bodies))]
+        self.rows = [self._row(equations, int(row), posture) for row in structure.rows]
+        self._others = [self._row(equations, int(row), posture) for row in structure.redundant]
+
+    def _row(self, equations: LoopEquations, row: int, posture: Posture) -> Row:
+        one = 2 * int(equations.loop_of_row[row])
+        (axes1, origin1), (axes2, origin2) = self._frames[one], self._frames[one + 1]
+        axis = [line[equations.axis1[row]] for line in axes1]
+        moves = bool(equations.is_translation[row])
+        if moves:
+            arm = origin2
+            wrench, phi = (axis, cross(arm, axis)), dot(axis, subtract(origin2, origin1))
+        else:
+            arm = [line[equations.axis2[row]] for line in axes2]
+            wrench, phi = ([0.0] * 3, cross(arm, axis)), dot(axis, arm)
+        slopes = {}
+        for column, sign in enumerate(equations.sign[one // 2]):
+            if sign:
+                linear, angular = posture.columns[column + 1]
+                slope = dot(wrench[0], linear) + dot(wrench[1], angular)
+                slopes[column + 1] = float(sign) * slope
+        bodies = posture.geometry.frame_bodies
+        return Row((bodies[one], bodies[one + 1]), moves, axis, arm, wrench, phi, slopes)
+
+    def solve(
+        self, known: dict[int, Vector], right: Sequence[Number], width: int
+    ) -> tuple[dict[int, Vector], list[Number]]:
+        """Solve J x = right for the passive joints, block after block.
+
+        Args:
+            known: Rows of x (width,) of the active joints, by joint.
+            right: Right side of the last column; the others have zero.
+            width: Number of columns.
+
+        Returns:
+            Rows of x of all joints, and the determinants of the blocks.
+        """
+        x = dict(known)
+        determinants = []
+        for rows, columns in self._structure.blocks:
+            joints = [self.passive_joints[c] for c in columns]
+            matrix, sides = [], []
+            for r in rows:
+                slopes = self.rows[r].slopes
+                matrix.append([slopes.get(joint, 0.0) for joint in joints])
+                side: Vector = [0.0] * (width - 1) + [right[r]]
+                for joint, slope in slopes.items():
+                    # the order of the blocks knows which slopes vanish everywhere
+                    if joint not in joints and joint in x:
+                        side = subtract(side, scale(slope, x[joint]))
+                sides.append(side)
+            found, determinant = solve(matrix, sides)
+            determinants.append(determinant)
+            x |= dict(zip(joints, found, strict=True))
+        return x, determinants
+
+    @cached_property
+    def _gamma(self) -> tuple[dict[int, Vector], list[Number]]:
+        n = len(self.active_joints)
+        known: dict[int, Vector] = {
+            joint: [float(i == k) for k in range(n)] for i, joint in enumerate(self.active_joints)
+        }
+        return self.solve(known, [0.0] * len(self.rows), n)
+
+    @property
+    def gamma(self) -> dict[int, Vector]:
+        """Rows of gamma (n,) by joint."""
+        return self._gamma[0]
+
+    @property
+    def determinants(self) -> list[Number]:
+        """Of the blocks, in their order."""
+        return self._gamma[1]
+
+    @cached_property
+    def correction(self) -> dict[int, Number]:
+        """Newton's step of the passive joints, by joint."""
+        held: dict[int, Vector] = {joint: [0.0] for joint in self.active_joints}
+        x, _ = self.solve(held, [-row.phi for row in self.rows], 1)
+        return {joint: x[joint][0] for joint in self.passive_joints}
+
+    @property
+    def residual(self) -> Number:
+        """The largest absolute phi of the independent equations."""
+        return largest(row.phi for row in self.rows)
+
+    @property
+    def surplus(self) -> Number:
+        """The largest absolute phi of the redundant equations."""
+        return largest(row.phi for row in self._others)
+
+
+class Motion:
+    """Bodies in motion at a traced posture.
+
+    Args:
+        posture: Bodies.
+        loops: Loops at that posture.
+        rates: (nb + 1,) joint velocities, 0 for the world.
+        gravity: (3,) the world accelerates with -gravity, so that weights need no terms of their
+            own.
+
+    Attributes:
+        velocity: Of every body, linear at the world's origin, angular.
+        acceleration: The same at zero joint acceleration.
+    """
+
+    def __init__(
+        self,
+        posture: Posture,
+        loops: Loops,
+        rates: Sequence[Number],
+        gravity: Sequence[Number] = (0.0, 0.0, 0.0),
+    ):
+        self._posture, self._loops = posture, loops
+        self.velocity: list[tuple[Vector, Vector]] = [([0.0] * 3, [0.0] * 3)]
+        self.acceleration: list[tuple[Vector, Vector]] = [([-g for g in gravity], [0.0] * 3)]
+        for i in range(1, len(posture.columns)):
+            parent = posture.geometry.parents[i]
+            linear, angular = (scale(rates[i], part) for part in posture.columns[i])
+            v, w = self.velocity[parent]
+            a, e = self.acceleration[parent]
+            bent = add(a, cross(w, linear), cross(v, angular)), add(e, cross(w, angular))
+            self.acceleration.append(bent)
+            self.velocity.append((add(v, linear), add(w, angular)))
+
+    @cached_property
+    def drift(self) -> Vector:
+        """(nb + 1,) accelerations of the joints at a_A = 0."""
+        held: dict[int, Vector] = {joint: [0.0] for joint in self._loops.active_joints}
+        x, _ = self._loops.solve(held, [-self._bend(row) for row in self._loops.rows], 1)
+        return [0.0] + [x[i][0] for i in range(1, len(self._posture.columns))]
+
+    def _bend(self, row: Row) -> Number:
+        """Second derivative of phi at zero joint acceleration; see `LoopEquations.curvature`."""
+        one, two = row.bodies
+        (v1, w1), (v2, w2) = self.velocity[one], self.velocity[two]
+        axis_rate, arm_rate = cross(w1, row.axis), cross(w2, row.arm)
+        total: Number = 0.0
+        if row.moves:
+            arm_rate = add(arm_rate, v2)
+            total = dot(axis_rate, subtract(v2, v1))
+        turning = add(cross(arm_rate, row.axis), cross(row.arm, axis_rate))
+        total = total + dot(turning, subtract(w2, w1))
+        (a1, e1), (a2, e2) = self.acceleration[one], self.acceleration[two]
+        linear, angular = row.wrench
+        return total + dot(linear, subtract(a2, a1)) + dot(angular, subtract(e2, e1))

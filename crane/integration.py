@@ -1,0 +1,238 @@
+"""Steps of the classical Runge-Kutta method, in machine code or in Python."""
+
+from ctypes import c_double, c_int64, c_void_p
+
+import numpy as np
+
+from crane.closure.traced import Constants
+from crane.control import Controller, TracedController
+from crane.dynamics import Dynamics
+from crane.dynamics.traced import Sweep
+from crane.errors import ClosureError, SimulationError
+from crane.samples import Array
+from crane.straight import Program, Tape, largest
+from crane.straight.scalar import add, dot, scale
+
+# State: q (nq), v_A (n), the controller's (k), work, dissipated energy.
+# observe gives the state's rate and then [tau, friction, kinetic, potential]; finish the next
+# state and by how much a joint moves at most; newton see `FastClosure`.
+_RUN = """
+define i64 @run(i64 %steps, ptr %newton, ptr %geometry, ptr %numbers, ptr %control, ptr %refs,
+                ptr %state, ptr %work, ptr %out, ptr %h, double %rounded, double %closed) {{
+entry:
+  %next = getelementptr double, ptr %work, i64 0
+  %peak_at = getelementptr double, ptr %work, i64 {size}
+  %k1 = getelementptr double, ptr %peak_at, i64 1
+  %seen = getelementptr double, ptr %k1, i64 {size}
+  %k2 = getelementptr double, ptr %seen, i64 {seen}
+  %k3 = getelementptr double, ptr %k2, i64 {size}
+  %k4 = getelementptr double, ptr %k3, i64 {size}
+  %result = getelementptr double, ptr %k4, i64 {size}
+  %change_at = getelementptr double, ptr %result, i64 1
+  %good_at = getelementptr double, ptr %result, i64 2
+  %corrected = getelementptr double, ptr %result, i64 3
+  %half = getelementptr double, ptr %h, i64 1
+  br label %step
+step:
+  %i = phi i64 [0, %entry], [%i1, %accept]
+  %more = icmp slt i64 %i, %steps
+  br i1 %more, label %stages, label %done
+stages:
+  %r0 = mul i64 %i, {two_refs}
+  %ref0 = getelementptr double, ptr %refs, i64 %r0
+  %ref1 = getelementptr double, ptr %ref0, i64 {refs}
+  %ref2 = getelementptr double, ptr %ref1, i64 {refs}
+  call void @observe(ptr %geometry, ptr %numbers, ptr %control, ptr %ref0, ptr %state, ptr %k1)
+  %o0 = mul i64 %i, {row}
+  %o = getelementptr double, ptr %out, i64 %o0
+  %o1 = getelementptr double, ptr %o, i64 {size}
+  call void @llvm.memcpy.p0.p0.i64(ptr %o, ptr %state, i64 {size_bytes}, i1 false)
+  call void @llvm.memcpy.p0.p0.i64(ptr %o1, ptr %seen, i64 {seen_bytes}, i1 false)
+  call void @blend(ptr %state, ptr %k1, ptr %half, ptr %next)
+  call void @rate(ptr %geometry, ptr %numbers, ptr %control, ptr %ref1, ptr %next, ptr %k2)
+  call void @blend(ptr %state, ptr %k2, ptr %half, ptr %next)
+  call void @rate(ptr %geometry, ptr %numbers, ptr %control, ptr %ref1, ptr %next, ptr %k3)
+  call void @blend(ptr %state, ptr %k3, ptr %h, ptr %next)
+  call void @rate(ptr %geometry, ptr %numbers, ptr %control, ptr %ref2, ptr %next, ptr %k4)
+  call void @finish(ptr %state, ptr %k1, ptr %k2, ptr %k3, ptr %k4, ptr %h, ptr %next)
+  %peak = load double, ptr %peak_at
+  %calm = fcmp olt double %peak, 1.0
+  br i1 %calm, label %close, label %done
+close:
+  %k = phi i64 [0, %stages], [%kn, %again]
+  %before = phi double [0x7FF0000000000000, %stages], [%residual, %again]
+  call void %newton(ptr %geometry, ptr %next, ptr %result)
+  %residual = load double, ptr %result
+  %tight = fcmp ole double %residual, %rounded
+  br i1 %tight, label %judge, label %maybe
+maybe:
+  %near = fcmp ole double %residual, %closed
+  %quarter = fmul double %before, 0.25
+  %slow = fcmp ogt double %residual, %quarter
+  %stalled = and i1 %near, %slow
+  br i1 %stalled, label %judge, label %correct
+correct:
+  %change = load double, ptr %change_at
+  %fine = fcmp olt double %change, 0.1
+  %kn = add i64 %k, 1
+  %time = icmp slt i64 %kn, 8
+  %on = and i1 %fine, %time
+  br i1 %on, label %again, label %done
+again:
+  call void @llvm.memcpy.p0.p0.i64(ptr %next, ptr %corrected, i64 {bytes}, i1 false)
+  br label %close
+judge:
+  %good = load double, ptr %good_at
+  %regular = fcmp ogt double %good, 0.0
+  br i1 %regular, label %accept, label %done
+accept:
+  call void @llvm.memcpy.p0.p0.i64(ptr %state, ptr %next, i64 {size_bytes}, i1 false)
+  %i1 = add i64 %i, 1
+  br label %step
+done:
+  ret i64 %i
+}}
+"""
+
+
+class PythonStepper:
+    """One step at a time, for any controller and on any path of `Dynamics`.
+
+    Args:
+        dynamics: The machine.
+        control: Its controller.
+    """
+
+    def __init__(self, dynamics: Dynamics, control: Controller):
+        self._dynamics, self._control = dynamics, control
+        machine = dynamics.machine
+        self._nq, self._active = machine.model.nq, machine.closure.active
+        self._speeds = slice(self._nq, self._nq + len(machine.active))
+
+    def observe(self, time: float, state: Array) -> tuple[Array, Array]:
+        """Rate of the state, and [tau, friction, kinetic, potential]."""
+        rate, tau = self._rate(time, state)
+        q, v_a = state[: self._nq], state[self._speeds]
+        seen = self._dynamics.at("observation", q, v_a, tau)
+        return rate, np.concatenate([tau, seen])
+
+    def advance(self, time: float, state: Array, first: Array, step: float) -> Array:
+        """The state one step later, its rate at the start given.
+
+        Raises:
+            SimulationError: The motion explodes, or the loops cannot be closed any more.
+        """
+        half = step / 2
+        second, _ = self._rate(time + half, state + half * first)
+        third, _ = self._rate(time + half, state + half * second)
+        fourth, _ = self._rate(time + step, state + step * third)
+        after = state + step / 6 * (first + 2 * second + 2 * third + fourth)
+        q = after[: self._nq]
+        if not (np.abs(first[: self._nq]).max() * step < 1 and np.isfinite(after).all()):
+            raise SimulationError(
+                f"at t = {time:.6g} s the motion explodes (over 1 m or rad in a step of "
+                f"{step:g} s): shorten the step, or smooth the friction more"
+            )
+        try:
+            closed = self._dynamics.machine.closure.solve(q[self._active], guess=q)
+        except ClosureError as error:
+            raise SimulationError(f"at t = {time + step:.6g} s: {error}") from None
+        after[: self._nq] = closed
+        return after
+
+    def _rate(self, time: float, state: Array) -> tuple[Array, Array]:
+        q, v_a = state[: self._nq], state[self._speeds]
+        own = state[self._speeds.stop : -2]
+        tau, own_rate = self._control(time, q[self._active], v_a, own)
+        try:
+            rates = self._dynamics.at("rates", q, v_a, tau)
+        except ClosureError as error:
+            raise SimulationError(f"at t = {time:.6g} s: {error}") from None
+        return np.concatenate([rates[:-1], own_rate, [tau @ v_a, rates[-1]]]), tau
+
+
+class CompiledStepper:
+    """Many steps at once in machine code, with a controller that is traced along.
+
+    Args:
+        dynamics: The machine.
+        control: Its controller.
+        states: Number of the controller's states.
+    """
+
+    def __init__(self, dynamics: Dynamics, control: TracedController, states: int):
+        machine = dynamics.machine
+        self._fast, self._numbers = machine.closure.fast, dynamics.numbers
+        self._control = control
+        nq, n = machine.model.nq, len(machine.active)
+        self._size, self._seen = nq + n + states + 2, 2 * n + 2
+        program = Program()
+        for name in ("observe", "rate"):
+            tape = Tape()
+            q, posture, loops = self._fast.trace(tape, 0, 4)
+            v_a, own = tape.loads(4, nq, n), tape.loads(4, nq + n, states)
+            sweep = Sweep(posture, loops, Constants(tape, 1, self._numbers), q, v_a)
+            settings = tape.loads(2, 0, len(control.settings))
+            tau, own_rate = control.trace(
+                sweep, q, v_a, own, settings, tape.loads(3, 0, control.columns)
+            )
+            a_a = sweep.forward(tau, friction=True)
+            powers = [dot(tau, v_a), sweep.dissipation]
+            outputs = [*sweep.rates[1:], *a_a, *own_rate, *powers]
+            if name == "observe":
+                outputs += [*tau, *sweep.friction, sweep.kinetic, sweep.potential]
+            program.add(name, 5, outputs)
+        self._add_sums(program, nq)
+        sizes = {"size": self._size, "seen": self._seen, "row": self._size + self._seen}
+        program.add_text(
+            _RUN.format(
+                **sizes, size_bytes=8 * self._size, seen_bytes=8 * self._seen, bytes=8 * nq,
+                refs=control.columns, two_refs=2 * control.columns,
+            )
+        )  # fmt: skip
+        program.compile()
+        self._program = program
+        self._run = program.function(
+            "run", c_int64, *[c_void_p] * 9, c_double, c_double, result=c_int64
+        )
+        self._work = np.zeros(5 * self._size + self._seen + 4 + 2 * nq * (n + 1))
+
+    def run(self, times: Array, state: Array, step: float, out: Array) -> int:
+        """Steps from the first of `times` on, one row of `out` before each.
+
+        Args:
+            times: (steps,) [s].
+            state: The state at the first time; replaced by that after the last step done.
+            step: [s].
+            out: (steps, size + seen), state and observations at each of the times.
+
+        Returns:
+            How many steps were done; the one after them needs a closer look.
+        """
+        halves = times[0] + 0.5 * step * np.arange(2 * len(times) + 1)
+        references = np.ascontiguousarray(self._control.references(halves))
+        settings = np.ascontiguousarray(self._control.settings)
+        steps = np.array([step, 0.5 * step])
+        arrays = (self._fast.geometry.numbers, self._numbers, settings, references)
+        return int(
+            self._run(
+                len(times), self._fast.newton_address, *(array.ctypes.data for array in arrays),
+                state.ctypes.data, self._work.ctypes.data, out.ctypes.data, steps.ctypes.data,
+                *self._fast.bounds,
+            )
+        )  # fmt: skip
+
+    def _add_sums(self, program: Program, nq: int) -> None:
+        """blend(s, k, h) = s + h k; finish(s, k1, k2, k3, k4, h) = s + h/6 (...), largest move."""
+        tape = Tape()
+        state, rate = tape.loads(0, 0, self._size), tape.loads(1, 0, self._size)
+        program.add("blend", 3, add(state, scale(tape.load(2, 0), rate)))
+        tape = Tape()
+        state = tape.loads(0, 0, self._size)
+        k1, k2, k3, k4 = (tape.loads(array, 0, self._size) for array in range(1, 5))
+        h = tape.load(5, 0)
+        mean = add(k1, scale(2.0, add(k2, k3)), k4)
+        after = add(state, scale(h * (1.0 / 6.0), mean))
+        # the largest of all changes, so that NaN and infinity anywhere show
+        move = h * largest([*k1[:nq], *scale(1e-9, mean)])
+        program.add("finish", 6, [*after, move])

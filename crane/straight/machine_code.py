@@ -1,0 +1,127 @@
+"""From tapes to machine code, through LLVM."""
+
+import ctypes
+import struct
+from collections.abc import Sequence
+from typing import Any
+
+from crane.straight.scalar import Expression, Number
+
+# Sums may be reordered and products fused; NaN and infinity stay honest.
+_FAST = "reassoc nsz arcp contract"
+_CALLS = {
+    "sin": "@sin", "cos": "@cos", "tanh": "@tanh", "sqrt": "@llvm.sqrt.f64",
+    "abs": "@llvm.fabs.f64", "maximum": "@larger", "copysign": "@llvm.copysign.f64",
+}  # fmt: skip
+_DECLARATIONS = """
+declare double @sin(double)
+declare double @cos(double)
+declare double @tanh(double)
+declare double @llvm.sqrt.f64(double)
+declare double @llvm.fabs.f64(double)
+declare double @llvm.copysign.f64(double, double)
+declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
+define internal double @larger(double %a, double %b) alwaysinline {
+  %more = fcmp oge double %a, %b
+  %out = select i1 %more, double %a, double %b
+  %odd = fcmp uno double %a, %a
+  %seen = select i1 %odd, double %a, double %out
+  ret double %seen
+}
+"""
+
+
+class Program:
+    """Straight-line functions f(in_0, in_1, ..., out) of arrays, and loops that call them."""
+
+    def __init__(self) -> None:
+        self._texts = [_DECLARATIONS]
+        self._engine: Any = None
+
+    def add(self, name: str, arrays: int, outputs: Sequence[Number]) -> None:
+        """Add a function: `arrays` arguments that are read, and one that takes the outputs."""
+        self._texts.append(_function(name, arrays, outputs))
+
+    def add_text(self, text: str) -> None:
+        """Add a function written in LLVM's language."""
+        self._texts.append(text)
+
+    def compile(self) -> None:
+        """Translate everything that was added."""
+        llvm, target = _target()
+        module = llvm.parse_assembly("\n".join(self._texts))
+        module.verify()
+        options = llvm.create_pipeline_tuning_options(speed_level=2)
+        options.slp_vectorization = False  # takes long and gains nothing here
+        passes = llvm.create_pass_builder(target, options)
+        passes.getModulePassManager().run(module, passes)
+        self._engine = llvm.create_mcjit_compiler(module, target)
+        self._engine.finalize_object()
+
+    def function(self, name: str, *arguments: Any, result: Any = None) -> Any:
+        """A compiled function as one of ctypes, which lets other threads run meanwhile."""
+        return ctypes.CFUNCTYPE(result, *arguments)(self.address(name))
+
+    def address(self, name: str) -> int:
+        """Where a compiled function is, for as long as the program lives."""
+        return int(self._engine.get_function_address(name))
+
+
+def _target() -> tuple[Any, Any]:
+    import llvmlite.binding as llvm
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    # one per program: its engine owns it
+    target = llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2
+    )
+    return llvm, target
+
+
+def _function(name: str, arrays: int, outputs: Sequence[Number]) -> str:
+    arguments = [f"ptr noalias readonly %in{i}" for i in range(arrays)]
+    lines = [f"define void @{name}({', '.join([*arguments, 'ptr noalias %out'])}) {{"]
+    tapes = {value.tape for value in outputs if isinstance(value, Expression)}
+    operations = tapes.pop().operations if tapes else []
+    for index in _needed(operations, outputs):
+        kind, *operands = operations[index]
+        if kind == "load":
+            array, at = operands
+            lines.append(f"  %p{index} = getelementptr double, ptr %in{array}, i64 {at}")
+            lines.append(f"  %v{index} = load double, ptr %p{index}")
+            continue
+        words = [_operand(operand) for operand in operands]
+        if kind == "fneg":
+            lines.append(f"  %v{index} = fneg double {words[0]}")
+        elif kind in _CALLS:
+            typed = ", ".join(f"double {word}" for word in words)
+            lines.append(f"  %v{index} = call double {_CALLS[kind]}({typed})")
+        else:
+            lines.append(f"  %v{index} = {kind} {_FAST} double {words[0]}, {words[1]}")
+    for i, value in enumerate(outputs):
+        word = _operand(value.index if isinstance(value, Expression) else float(value))
+        lines.append(f"  %q{i} = getelementptr double, ptr %out, i64 {i}")
+        lines.append(f"  store double {word}, ptr %q{i}")
+    return "\n".join([*lines, "  ret void", "}"])
+
+
+def _needed(operations: Sequence[tuple], outputs: Sequence[Number]) -> list[int]:
+    """Indices of the operations that the outputs depend on, in order."""
+    needed: set[int] = set()
+    waiting = [value.index for value in outputs if isinstance(value, Expression)]
+    while waiting:
+        index = waiting.pop()
+        if index not in needed:
+            needed.add(index)
+            kind, *operands = operations[index]
+            if kind != "load":
+                waiting += [operand for operand in operands if isinstance(operand, int)]
+    return sorted(needed)
+
+
+def _operand(operand: float | int) -> str:
+    if isinstance(operand, int):
+        return f"%v{operand}"
+    (bits,) = struct.unpack(">Q", struct.pack(">d", operand))
+    return f"0x{bits:016X}"
