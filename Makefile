@@ -16,7 +16,7 @@ help:
 	@echo "make test    fast tests"
 	@echo "make slow    slow tests: browser, MuJoCo, long simulations"
 	@echo "make lint    ruff and mypy"
-	@echo "make bench   measure speed"
+	@echo "make bench   measure speed; results in docs/performance.md"
 	@echo "make clean   remove .venv, caches and results"
 
 setup: $(READY)
@@ -52,7 +52,7 @@ lint: $(READY)
 	$(BIN)/python -m mypy
 
 bench: $(READY_BENCH)
-	$(BIN)/python scripts/benchmark.py
+	$(BIN)/python scripts/benchmark.py --write docs/performance.md
 
 clean:
 	rm -rf .venv .hypothesis .mypy_cache .pytest_cache .ruff_cache build dist demo-output

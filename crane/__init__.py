@@ -1,9 +1,10 @@
-"""crane: machines with closed kinematic chains, simulated and identified in their actuators."""
+"""crane: machines with closed kinematic chains, computed in their actuators."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from crane.batch import Batch, simulate_batch
     from crane.closure import Closure
     from crane.control import PI, ComputedTorque
     from crane.description import EndStop, ForceElement, Friction, PIGains
@@ -27,13 +28,15 @@ _HOMES = {
     "crane.machine": ("Machine", "Payload", "load"),
     "crane.paths": ("Path", "point_to_point", "polynomial", "task_path", "tip_path"),
     "crane.recording": ("Recording",),
+    "crane.batch": ("Batch", "simulate_batch"),
     "crane.simulation": ("simulate",),
 }
 
 __all__ = [
-    "PI", "Closure", "ComputedTorque", "CraneError", "CraneWarning", "Dynamics", "EndStop",
-    "ForceElement", "Friction", "Kinematics", "Machine", "PIGains", "Path", "Payload",
-    "Recording", "load", "point_to_point", "polynomial", "simulate", "task_path", "tip_path",
+    "PI", "Batch", "Closure", "ComputedTorque", "CraneError", "CraneWarning", "Dynamics",
+    "EndStop", "ForceElement", "Friction", "Kinematics", "Machine", "PIGains", "Path",
+    "Payload", "Recording", "load", "point_to_point", "polynomial", "simulate",
+    "simulate_batch", "task_path", "tip_path",
 ]  # fmt: skip
 
 

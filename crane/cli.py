@@ -1,5 +1,6 @@
 """The command line: crane list, info, check, simulate, view, plot, demo."""
 
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -9,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crane.errors import CraneError, CraneWarning, InputError
+import crane
+from crane.errors import CraneError, CraneWarning, DescriptionError, InputError, OutputError
 
 if TYPE_CHECKING:
     from crane.machine import Machine
@@ -17,21 +19,35 @@ if TYPE_CHECKING:
 
 # Commands import what they need when they run, so that `crane --help` answers at once.
 
+_INTERRUPTED = 130
+
 app = typer.Typer(
-    help="Machines with closed kinematic chains: simulate, identify, show. "
-    "Add --debug to any command to see where an error comes from.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _place(text: str | Path) -> Path:
+    if not str(text):
+        raise OutputError("the name after --out is empty, give one")
+    return Path(text)
+
 
 MachineName = Annotated[
     str,
     typer.Argument(metavar="MACHINE", help="A bundled name, a machine file, or a URDF."),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite what is there.")]
-Out = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
-OutFile = Annotated[Path | None, typer.Option("--out", help="The file to write.")]
+Out = Annotated[
+    Path,
+    typer.Option("--out", metavar="FOLDER", parser=_place, help="Folder for the results."),
+]
+OutFile = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="FILE", parser=_place, help="The file to write."),
+]
 NoOpen = Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")]
 
 
@@ -43,6 +59,10 @@ def main() -> None:
     warnings.simplefilter("once", CraneWarning)
     try:
         status = app(args=arguments, standalone_mode=False, prog_name="crane")
+        if status == _INTERRUPTED:  # what the parser makes of KeyboardInterrupt
+            raise KeyboardInterrupt
+        if sys.stdout is not None:  # it is where the shell has closed it
+            sys.stdout.flush()
     except CraneError as error:
         if debug:
             raise
@@ -50,7 +70,16 @@ def main() -> None:
         sys.exit(2)
     except KeyboardInterrupt:
         _say("error: interrupted, nothing was written")
-        sys.exit(130)
+        sys.exit(_INTERRUPTED)
+    except OSError as error:
+        if debug:
+            raise
+        _abandon_output()
+        if isinstance(error, BrokenPipeError):  # whoever read it has seen enough
+            sys.exit(1)
+        place = error.filename or "output"
+        _say(f"error: {place}: {error.strerror or error}, check the place and try again")
+        sys.exit(2)
     except Exception as error:
         # the command line parser's own errors, whose class is not public
         message = getattr(error, "format_message", None)
@@ -62,6 +91,27 @@ def main() -> None:
     sys.exit(status if isinstance(status, int) else 0)
 
 
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"crane {crane.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_show_version, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Machines with closed kinematic chains: simulate and show.
+
+    Add --debug to any command to see where an error comes from.
+    """
+
+
 @app.command("list")
 def list_machines() -> None:
     """List the machines that can be named."""
@@ -71,7 +121,9 @@ def list_machines() -> None:
     for name in bundled():
         print(f"  {name}")
     if examples():
-        print("Robots of example-robot-data (open chains):")
+        print(
+            "Robots of example-robot-data (open chains; some are refused by the strict reading):"
+        )
         print(f"  {', '.join(examples())}")
 
 
@@ -108,8 +160,10 @@ def simulate(
     controller: Annotated[
         str | None, typer.Option(help="pi or computed-torque; pi if the machine has gains.")
     ] = None,
-    duration: Annotated[float | None, typer.Option(help="[s], the task's if not given.")] = None,
-    step: Annotated[float, typer.Option(help="Step of the integration [s].")] = 1e-3,
+    duration: Annotated[
+        float | None, typer.Option(help="In seconds; that of the task if not given.")
+    ] = None,
+    step: Annotated[float, typer.Option(help="Step of the integration in seconds.")] = 1e-3,
     force: Force = False,
 ) -> None:
     """Simulate a task, or without one the free motion from the home posture."""
@@ -143,17 +197,27 @@ def view(
     what: Annotated[
         str, typer.Argument(metavar="WHAT", help="A machine, a run's folder, or a recording.")
     ],
+    machine: Annotated[
+        str | None,
+        typer.Option(metavar="MACHINE", help="The machine of a run, if not as recorded."),
+    ] = None,
     out: OutFile = None,
     no_open: NoOpen = False,
     force: Force = False,
 ) -> None:
     """Write a page that shows a machine or plays a run, and open it."""
+    from crane.output import file_name
     from crane.runs import PAGE, check_free
     from crane.view.page import open_in_browser, write_page
 
     folder, recording = _run_of(what)
-    loaded = _load(what) if recording is None else _machine_of(recording, what)
-    page = out or (folder / PAGE if folder else Path(f"{loaded.name}.html"))
+    if recording is not None:
+        loaded = _machine_of(recording, what, machine)
+    elif machine is None:
+        loaded = _load(what)
+    else:
+        raise InputError(f"--machine is for runs, and '{what}' is none, leave it out")
+    page = out or (folder / PAGE if folder else Path(file_name(loaded.name) + ".html"))
     check_free(page, force)
     write_page(loaded, page, recording)
     print(f"written to {page}")
@@ -209,15 +273,28 @@ def _run_of(what: str) -> tuple[Path | None, "Recording | None"]:
     return None, None
 
 
-def _machine_of(recording: "Recording", what: str) -> "Machine":
+def _machine_of(recording: "Recording", what: str, given: str | None) -> "Machine":
+    from crane.description.sources import find
+
+    if given is not None:
+        return _load(given)
     if not recording.machine:
         raise InputError(
-            f"{what}: does not name its machine, write '# machine: NAME' above its header row"
+            f"{what}: does not name its machine, add --machine, or write '# machine: NAME' above "
+            "its header row"
         )
+    try:
+        find(recording.machine)
+    except DescriptionError as error:
+        raise DescriptionError(
+            f"{what}: its machine is not found ({error}); add --machine to say where it is"
+        ) from None
     return _load(recording.machine)
 
 
 def _describe(machine: "Machine") -> Iterator[str]:
+    from crane.dynamics import Dynamics
+
     closure = machine.closure
     structure = closure.structure
     mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
@@ -236,9 +313,9 @@ def _describe(machine: "Machine") -> Iterator[str]:
             f"    {joint:<10}{machine.lower[i]:.5g} to {machine.upper[i]:.5g} "
             f"{machine.unit(joint)}, home {home:.5g}"
         )
-    if len(closure.passive):
-        names = [machine.joints[i] for i in closure.passive]
-        yield f"    passive   {', '.join(names)}"
+    for i in closure.passive:
+        joint = machine.joints[i]
+        yield f"    {joint:<10}passive, home {machine.home[i]:.5g} {machine.unit(joint)}"
     loops = closure.equations.loops
     yield (
         f"  loops       {len(loops)}: {len(structure.rows)} independent equations, "
@@ -252,6 +329,9 @@ def _describe(machine: "Machine") -> Iterator[str]:
             for _, columns in structure.blocks
         ]
         yield f"  solved as   {', then '.join(order)}"
+    path = Dynamics(machine).path_of("forward")
+    reason = "" if path == "compiled" else ", too large for machine code"
+    yield f"  computed    {path}{reason}"
     yield f"  tip         {machine.tip or 'none'}"
     for task in machine.tasks.values():
         yield f"  task        {task.name}, {task.duration:g} s: {task.description}"
@@ -274,6 +354,12 @@ def _progress(what: str) -> Iterator[Callable[[float], None]]:
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
     _say(f"warning: {message}")
+
+
+def _abandon_output() -> None:
+    """Let the interpreter end without a word on what could not be written."""
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _say(text: str) -> None:

@@ -12,7 +12,7 @@ from crane.dynamics.traced import Sweep
 from crane.errors import InputError, known
 from crane.machine import Machine
 from crane.paths import Path
-from crane.samples import Array, as_samples
+from crane.samples import Array, as_number, as_sample
 from crane.straight import Number
 
 
@@ -129,7 +129,7 @@ class PI:
         self._machine, self._reference = machine, path
         names = machine.active
         self._integral = (
-            None if integral is None else as_samples(integral, len(names), "integral", names)
+            None if integral is None else as_sample(integral, len(names), "integral", names)
         )
         self._kp = np.array([gains[joint].kp for joint in machine.active])
         self._ki = np.array([gains[joint].ki for joint in machine.active])
@@ -149,12 +149,12 @@ class PI:
 
     def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
         """See `Controller`; the states are the integrals of the errors."""
-        error = self._reference(time)[0] - q_a
+        error = self._reference.position(time) - q_a
         return self._kp * error + self._ki * state, error
 
     def references(self, times: Array) -> Array:
         """See `TracedController`."""
-        return self._reference(times)[0]
+        return self._reference.position(times)
 
     def trace(
         self,
@@ -188,8 +188,7 @@ class ComputedTorque:
     """
 
     def __init__(self, machine: Machine, path: Path, bandwidth: float = 20.0):
-        if not (np.isfinite(bandwidth) and bandwidth > 0):
-            raise InputError(f"the bandwidth is {bandwidth} rad/s, give a positive number")
+        bandwidth = as_number(bandwidth, "the bandwidth", "rad/s", above=0)
         self.path: Path | None = path
         self._reference, self._bandwidth = path, bandwidth
         self._dynamics = Dynamics(machine)
@@ -250,19 +249,9 @@ class Feedback:
 
     def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
         """See `Controller`."""
-        tau = np.asarray(self._function(time, q_a.copy(), v_a.copy()), dtype=np.float64)
-        if tau.shape != (len(self._active),):
-            raise InputError(
-                f"the controller gave the shape {tau.shape} at t = {time:g} s, return one force "
-                f"per active joint ({', '.join(self._active)})"
-            )
-        if not np.isfinite(tau).all():
-            joint = self._active[int(np.argmin(np.isfinite(tau)))]
-            raise InputError(
-                f"the controller gave {tau[self._active.index(joint)]} for {joint} at "
-                f"t = {time:g} s, return finite forces"
-            )
-        return tau, state
+        forces = self._function(time, q_a.copy(), v_a.copy())
+        what = f"the controller's force at t = {time:g} s"
+        return as_sample(forces, len(self._active), what, self._active), state
 
 
 CONTROLLERS: Mapping[str, Callable[[Machine, Path], Controller]] = {

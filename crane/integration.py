@@ -1,10 +1,12 @@
-"""Steps of the classical Runge-Kutta method, in machine code or in Python."""
+"""Motion in time: the classical Runge-Kutta method, in machine code or Python, and scipy's."""
 
+from collections.abc import Callable
 from ctypes import c_double, c_int64, c_void_p
+from typing import Any
 
 import numpy as np
 
-from crane.closure.traced import Constants
+from crane.closure.traced import Constants, folded
 from crane.control import Controller, TracedController
 from crane.dynamics import Dynamics
 from crane.dynamics.traced import Sweep
@@ -95,6 +97,10 @@ done:
 """
 
 
+ADAPTIVE = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
+_OR = ", or shorten the step"
+
+
 class PythonStepper:
     """One step at a time, for any controller and on any path of `Dynamics`.
 
@@ -122,21 +128,21 @@ class PythonStepper:
         Raises:
             SimulationError: The motion explodes, or the loops cannot be closed any more.
         """
-        half = step / 2
-        second, _ = self._rate(time + half, state + half * first)
-        third, _ = self._rate(time + half, state + half * second)
-        fourth, _ = self._rate(time + step, state + step * third)
-        after = state + step / 6 * (first + 2 * second + 2 * third + fourth)
+        total = rate = first
+        for share, weight in ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
+            if not np.abs(rate[: self._nq]).max() * step < 1:  # also NaN
+                raise SimulationError(
+                    f"at t = {time:.6g} s the motion explodes (over 1 m or rad in a step of "
+                    f"{step:g} s): shorten the step, or smooth the friction more"
+                )
+            rate, _ = self._rate(time + share * step, state + share * step * rate)
+            total = total + weight * rate
+        after = state + step / 6 * total
         q = after[: self._nq]
-        if not (np.abs(first[: self._nq]).max() * step < 1 and np.isfinite(after).all()):
-            raise SimulationError(
-                f"at t = {time:.6g} s the motion explodes (over 1 m or rad in a step of "
-                f"{step:g} s): shorten the step, or smooth the friction more"
-            )
         try:
             closed = self._dynamics.machine.closure.solve(q[self._active], guess=q)
         except ClosureError as error:
-            raise SimulationError(f"at t = {time + step:.6g} s: {error}") from None
+            raise SimulationError(f"at t = {time + step:.6g} s: {error}{_OR}") from None
         after[: self._nq] = closed
         return after
 
@@ -147,7 +153,7 @@ class PythonStepper:
         try:
             rates = self._dynamics.at("rates", q, v_a, tau)
         except ClosureError as error:
-            raise SimulationError(f"at t = {time:.6g} s: {error}") from None
+            raise SimulationError(f"at t = {time:.6g} s: {error}{_OR}") from None
         return np.concatenate([rates[:-1], own_rate, [tau @ v_a, rates[-1]]]), tau
 
 
@@ -158,6 +164,9 @@ class CompiledStepper:
         dynamics: The machine.
         control: Its controller.
         states: Number of the controller's states.
+
+    Raises:
+        TooLongError: It would take too long to compile.
     """
 
     def __init__(self, dynamics: Dynamics, control: TracedController, states: int):
@@ -166,7 +175,23 @@ class CompiledStepper:
         self._control = control
         nq, n = machine.model.nq, len(machine.active)
         self._size, self._seen = nq + n + states + 2, 2 * n + 2
-        program = Program()
+        key = (
+            type(control),
+            control.columns,
+            len(control.settings),
+            states,
+            folded(self._numbers),
+        )
+        if key not in self._fast.programs:
+            self._fast.programs[key] = self._compile(nq, n, states)
+        self._program = self._fast.programs[key]
+        self._run = self._program.function(
+            "run", c_int64, *[c_void_p] * 9, c_double, c_double, result=c_int64
+        )
+        self._work = np.zeros(5 * self._size + self._seen + 4 + 2 * nq * (n + 1))
+
+    def _compile(self, nq: int, n: int, states: int) -> Program:
+        program, control = Program(), self._control
         for name in ("observe", "rate"):
             tape = Tape()
             q, posture, loops = self._fast.trace(tape, 0, 4)
@@ -183,19 +208,20 @@ class CompiledStepper:
                 outputs += [*tau, *sweep.friction, sweep.kinetic, sweep.potential]
             program.add(name, 5, outputs)
         self._add_sums(program, nq)
-        sizes = {"size": self._size, "seen": self._seen, "row": self._size + self._seen}
         program.add_text(
             _RUN.format(
-                **sizes, size_bytes=8 * self._size, seen_bytes=8 * self._seen, bytes=8 * nq,
-                refs=control.columns, two_refs=2 * control.columns,
+                size=self._size,
+                seen=self._seen,
+                row=self._size + self._seen,
+                size_bytes=8 * self._size,
+                seen_bytes=8 * self._seen,
+                bytes=8 * nq,
+                refs=control.columns,
+                two_refs=2 * control.columns,
             )
-        )  # fmt: skip
-        program.compile()
-        self._program = program
-        self._run = program.function(
-            "run", c_int64, *[c_void_p] * 9, c_double, c_double, result=c_int64
         )
-        self._work = np.zeros(5 * self._size + self._seen + 4 + 2 * nq * (n + 1))
+        program.compile()
+        return program
 
     def run(self, times: Array, state: Array, step: float, out: Array) -> int:
         """Steps from the first of `times` on, one row of `out` before each.
@@ -236,3 +262,58 @@ class CompiledStepper:
         # the largest of all changes, so that NaN and infinity anywhere show
         move = h * largest([*k1[:nq], *scale(1e-9, mean)])
         program.add("finish", 6, [*after, move])
+
+
+def integrate_adaptively(
+    dynamics: Dynamics,
+    control: Controller,
+    state: Array,
+    steps: int,
+    step: float,
+    method: str,
+    progress: Callable[[float], None] | None = None,
+) -> Array:
+    """States and observations every `step` by an adaptive method with dense output.
+
+    The loops are closed to rounding at the recorded instants.
+
+    Args:
+        dynamics: The machine.
+        control: Its controller.
+        state: At the start.
+        steps: Number of recorded intervals.
+        step: [s].
+        method: One of `ADAPTIVE`.
+        progress: Called with the finished share, 0 to 1.
+
+    Returns:
+        (steps + 1, .) rows as `CompiledStepper.run` writes them.
+
+    Raises:
+        SimulationError: The method gives up, or the loops cannot be closed any more.
+    """
+    from scipy.integrate import solve_ivp
+
+    stepper = PythonStepper(dynamics, control)
+    times = step * np.arange(steps + 1, dtype=np.float64)
+
+    def rate(time: float, state: Array) -> Array:
+        if progress is not None:
+            progress(min(time / times[-1], 1.0))
+        return stepper.observe(time, state)[0]
+
+    chosen: Any = method
+    result = solve_ivp(
+        rate, (0.0, times[-1]), state, method=chosen, t_eval=times, rtol=1e-9, atol=1e-11
+    )
+    if not result.success:
+        raise SimulationError(
+            f"at t = {result.t[-1] if len(result.t) else 0.0:.6g} s {method} gives up: "
+            f"{result.message.rstrip('.').lower()}, try another method"
+        )
+    closure, nq = dynamics.machine.closure, dynamics.machine.model.nq
+    rows = []
+    for time, sample in zip(times, result.y.T, strict=True):
+        sample[:nq] = closure.solve(sample[:nq][closure.active], guess=sample[:nq])
+        rows.append(np.concatenate([sample, stepper.observe(time, sample)[1]]))
+    return np.array(rows)

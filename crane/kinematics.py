@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from crane.errors import ClosureError, InputError, UnreachableTipError
 from crane.machine import Machine
-from crane.samples import Array, as_samples, per_sample
+from crane.samples import Array, as_sample, as_samples, per_sample
 
 _ACCURACY = 1e-11  # [m] per metre of machine
 
@@ -94,8 +94,8 @@ class Kinematics:
         """Active coordinates within their limits that put the frame at a position.
 
         Levenberg-Marquardt on the reduced Jacobian with the limits as bounds, from the guess or
-        the nearest of a grid of postures. A stack is tracked like a path. Where more active
-        joints than directions are there, the solution nearest to the start is found.
+        the nearest of a grid of postures. A stack is tracked like a path. Where there are
+        more active joints than directions, each step of the descent is the shortest.
 
         Args:
             position: (3,) or (N, 3) in the world [m].
@@ -109,7 +109,12 @@ class Kinematics:
             UnreachableTipError: The position is out of reach.
         """
         targets = as_samples(position, 3, "position", ("x", "y", "z"))
-        start = None if guess is None else self.machine.check_limits(guess, "guess")
+        start = None
+        if guess is not None:
+            names = self.machine.active
+            start = self.machine.check_limits(
+                as_sample(guess, len(names), "guess", names), "guess"
+            )
         if targets.ndim == 1:
             return self._inverse(targets, start, "")
         if len(targets) == 0:

@@ -5,6 +5,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pinocchio as pin
@@ -26,7 +27,7 @@ from crane.description import (
     read,
 )
 from crane.errors import DescriptionError, InputError, LimitError, MechanismError, known
-from crane.samples import Array, as_samples
+from crane.samples import Array, as_number, as_sample, as_samples
 
 _NO_LIMIT = 1e9  # stands for infinity in the text handed to Pinocchio
 _LIMIT_SLACK = 1e-9  # [m], [rad] beyond a limit that counts as on it
@@ -175,7 +176,7 @@ class Machine:
                 raise InputError(f"joint '{stop.joint}' has no limits to stop at, give it some")
         return dataclasses.replace(
             self,
-            friction=self.friction if friction is None else dict(friction),
+            friction=self.friction if friction is None else MappingProxyType(dict(friction)),
             forces=self.forces if forces is None else tuple(forces),
             end_stops=self.end_stops if end_stops is None else tuple(end_stops),
         )
@@ -187,19 +188,18 @@ class Machine:
             InputError: Unknown frame, or no possible mass and inertia.
         """
         frame = self.model.frames[self.frame(payload.frame)]
-        com = as_samples(payload.com, 3, "the payload's com")
+        com = as_sample(payload.com, 3, "the payload's com")
         tensor = as_samples(payload.inertia, 3, "the payload's inertia")
-        if not (np.isfinite(payload.mass) and payload.mass >= 0):
-            raise InputError(f"the payload's mass is {payload.mass} kg, give a positive number")
+        mass = as_number(payload.mass, "the payload's mass", "kg")
+        if mass < 0:
+            raise InputError(f"the payload's mass is {mass:g} kg, it must not be negative")
         if tensor.shape != (3, 3) or not np.allclose(tensor, tensor.T, rtol=1e-9, atol=1e-15):
             raise InputError("the payload's inertia is not a symmetric (3, 3) matrix")
-        problem = inertia_problem(payload.mass, tensor)
+        problem = inertia_problem(mass, tensor)
         if problem and tensor.any():
             raise InputError(f"the payload has {problem}")
         model = pin.Model(self.model)
-        model.appendBodyToJoint(
-            frame.parentJoint, pin.Inertia(payload.mass, com, tensor), frame.placement
-        )
+        model.appendBodyToJoint(frame.parentJoint, pin.Inertia(mass, com, tensor), frame.placement)
         return dataclasses.replace(self, model=model)
 
 
@@ -234,14 +234,14 @@ def load(name: str | Path) -> Machine:
         model=model,
         closure=closure,
         active=active,
-        lower=lower[closure.active].copy(),
-        upper=upper[closure.active].copy(),
-        friction=spec.friction,
+        lower=_fixed(lower[closure.active]),
+        upper=_fixed(upper[closure.active]),
+        friction=MappingProxyType(dict(spec.friction)),
         forces=spec.forces,
         end_stops=spec.end_stops,
         tip=spec.tip,
-        tasks=spec.tasks,
-        control=spec.control,
+        tasks=MappingProxyType(dict(spec.tasks)),
+        control=MappingProxyType(dict(spec.control)),
     )
 
 
@@ -258,6 +258,13 @@ def _home_guess(spec: MachineSpec, model: pin.Model, active: tuple[str, ...]) ->
             )
         guess[column] = value
     return guess
+
+
+def _fixed(array: Array) -> Array:
+    """A copy that cannot be changed."""
+    out = array.copy()
+    out.flags.writeable = False
+    return out
 
 
 def _assemble(spec: MachineSpec) -> pin.Model:

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import BPoly, PPoly
+from scipy.interpolate import BPoly, PPoly, make_interp_spline
 
 from crane.errors import InputError, known
 from crane.kinematics import Kinematics
 from crane.machine import Machine
-from crane.samples import Array, as_samples
+from crane.samples import Array, as_number, as_samples
 
 _KNOTS_PER_SECOND = 100
 
@@ -30,6 +30,10 @@ class Path:
         self.duration = float(curve.x[-1])
         self.tip = tip
         self._curves = (curve, curve.derivative(), curve.derivative(2))
+
+    def position(self, time: ArrayLike) -> Array:
+        """Coordinates alone, (n,) or (N, n) at times () or (N,) [s]."""
+        return np.asarray(self._curves[0](np.clip(time, 0.0, self.duration)))
 
     def __call__(self, time: ArrayLike) -> tuple[Array, Array, Array]:
         """Coordinates, velocities and accelerations.
@@ -59,7 +63,7 @@ def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Path
     Raises:
         InputError: No coordinates, not finite, or no duration.
     """
-    _check_duration(duration)
+    as_number(duration, "the path's duration", "s", above=0)
     try:
         rows = [np.asarray(row, dtype=np.float64) for row in coefficients]
     except (TypeError, ValueError):
@@ -86,7 +90,7 @@ def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Path:
     Raises:
         InputError: Different sizes, not finite, or no duration.
     """
-    _check_duration(duration)
+    as_number(duration, "the path's duration", "s", above=0)
     first = as_samples(np.ravel(start), np.size(start), "start")
     last = as_samples(np.ravel(end), len(first), "end")
     shape = np.array([0, 0, 0, 10.0, -15.0, 6.0]) / duration ** np.arange(6)
@@ -98,8 +102,10 @@ def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Path:
 def tip_path(machine: Machine, tip: Path, guess: ArrayLike | None = None) -> Path:
     """The motion of the active joints that moves the tip along a path.
 
-    Positions, velocities and accelerations are exact at knots every 10 ms (inverse kinematics,
-    v_A = J^-1 x', a_A = J^-1 (x'' - bias)); quintics join them.
+    Positions at knots every 10 ms come from inverse kinematics, and so do velocities and
+    accelerations, v_A = J^-1 x', a_A = J^-1 (x'' - bias); quintics join them. A machine with more
+    than three active joints moves them as little as it can from knot to knot, and its velocities
+    and accelerations are those of the quintic spline through the knots.
 
     Args:
         machine: The machine.
@@ -113,10 +119,14 @@ def tip_path(machine: Machine, tip: Path, guess: ArrayLike | None = None) -> Pat
         UnreachableTipError: The path leaves the reach.
     """
     kinematics = Kinematics(machine)
-    count = max(2, int(np.ceil(tip.duration * _KNOTS_PER_SECOND)) + 1)
+    count = max(6, int(np.ceil(tip.duration * _KNOTS_PER_SECOND)) + 1)
     time = np.linspace(0.0, tip.duration, count)
     x, x_rate, x_second = tip(time)
     q_a = kinematics.inverse(x, guess)
+    if q_a.shape[1] > x.shape[1]:
+        spline = make_interp_spline(time, q_a, k=5)
+        knots = np.stack([q_a, spline(time, 1), spline(time, 2)], axis=1)
+        return Path(BPoly.from_derivatives(time, knots), tip)
     jacobian = np.linalg.pinv(kinematics.jacobian(q_a))
     v_a = np.einsum("ijk,ik->ij", jacobian, x_rate)
     a_a = np.einsum("ijk,ik->ij", jacobian, x_second - kinematics.bias(q_a, v_a))
@@ -143,8 +153,3 @@ def task_path(machine: Machine, task: str) -> Path:
     path = polynomial([chosen.coefficients[name] for name in machine.active], chosen.duration)
     machine.check_limits(path(np.linspace(0, path.duration, 501))[0], f"task '{task}'")
     return path
-
-
-def _check_duration(duration: float) -> None:
-    if not (np.isfinite(duration) and duration > 0):
-        raise InputError(f"the path's duration is {duration} s, give a positive number")

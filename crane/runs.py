@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
+from crane import output
 from crane.errors import OutputError, RecordingError
 from crane.machine import Machine
-from crane.output import replacing
+from crane.output import staging
 from crane.recording import Recording
 from crane.summary import summarize
 
@@ -15,40 +16,27 @@ def check_folder(folder: Path, force: bool) -> None:
     """See that results may go to a folder, before they are computed.
 
     Raises:
-        OutputError: It holds something already and `force` is off, or it is a file.
+        OutputError: It holds something already and `force` is off, it cannot be written, or a
+            file is in the way.
     """
-    try:
-        if folder.is_dir() and any(folder.iterdir()) and not force:
+    output.check_folder(folder)
+    if folder.is_dir() and not force:
+        try:
+            empty = not any(folder.iterdir())
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise OutputError(f"{folder}: cannot be read ({reason}), choose another") from None
+        if not empty:
             raise OutputError(f"{folder}: is not empty, choose another folder or add --force")
-    except OSError as error:
-        raise _no_folder(folder, error) from None
-    if folder.exists() and not folder.is_dir():
-        raise OutputError(f"{folder}: is a file, give the name of a folder")
-
-
-def make_folder(folder: Path) -> None:
-    """Create a folder where there is none.
-
-    Raises:
-        OutputError: It cannot be created.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _no_folder(folder, error) from None
-
-
-def _no_folder(folder: Path, error: OSError) -> OutputError:
-    reason = (error.strerror or str(error)).lower()
-    return OutputError(f"{folder}: cannot be a folder ({reason}), choose another")
 
 
 def check_free(file: Path, force: bool) -> None:
-    """See that a file may be written.
+    """See that a file may be written, before it is computed.
 
     Raises:
-        OutputError: It exists and `force` is off.
+        OutputError: It exists and `force` is off, or it cannot be written.
     """
+    output.check_file(file)
     if file.exists() and not force:
         raise OutputError(f"{file}: exists already, choose another name or add --force")
 
@@ -56,17 +44,20 @@ def check_free(file: Path, force: bool) -> None:
 def write_run(folder: Path, recording: Recording, title: str) -> str:
     """Write a recording and its summary into a folder, created where there is none.
 
+    Figure and page of an earlier run in the same folder are removed: they show something else.
+
     Returns:
         The summary, Markdown.
 
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    make_folder(folder)
     text = f"# {title}\n\n{summarize(recording).to_markdown()}"
-    recording.to_csv(folder / RECORDING)
-    with replacing(folder / SUMMARY) as part:
-        part.write_text(text, encoding="utf-8")
+    with staging(folder) as part:
+        recording.to_csv(part / RECORDING)
+        (part / SUMMARY).write_text(text, encoding="utf-8")
+        for name in (FIGURE, PAGE):
+            (folder / name).unlink(missing_ok=True)
     return text
 
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from crane.errors import InputError
+from crane.errors import ClosureError, InputError
 
 Array = NDArray[np.float64]
 
@@ -22,10 +22,7 @@ def as_samples(value: ArrayLike, size: int, what: str, names: Sequence[str] = ()
     Raises:
         InputError: Wrong shape, not numbers, or not finite.
     """
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputError(f"{what} is not an array of numbers, give {size} per sample") from None
+    array = _numbers(value, what, f"give {size} per sample")
     if array.ndim not in (1, 2) or array.shape[-1] != size:
         columns = f" ({', '.join(names)})" if names else ""
         raise InputError(
@@ -40,9 +37,53 @@ def as_samples(value: ArrayLike, size: int, what: str, names: Sequence[str] = ()
     return array
 
 
+def as_sample(value: ArrayLike, size: int, what: str, names: Sequence[str] = ()) -> Array:
+    """`as_samples` of exactly one sample (size,).
+
+    Raises:
+        InputError: Also for a stack.
+    """
+    shape = _numbers(value, what, f"give {size}").shape
+    if shape != (size,):
+        columns = f" ({', '.join(names)})" if names else ""
+        raise InputError(f"{what} has the shape {shape}, give ({size},){columns}")
+    return as_samples(value, size, what, names)
+
+
+def as_number(value: object, what: str, unit: str, above: float = -np.inf) -> float:
+    """A finite number above a bound.
+
+    Raises:
+        InputError: It is not.
+    """
+    array = _numbers(value, what, "give a number")
+    if array.ndim or not np.isfinite(array) or not array > above:
+        bound = f" above {above:g}" if above > -np.inf else ""
+        raise InputError(f"{what} is {value} {unit}, give a number{bound}")
+    return float(array)
+
+
+def _numbers(value: object, what: str, wanted: str) -> Array:
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "biuf":
+            raise TypeError
+        return array.astype(np.float64, copy=False)
+    except (TypeError, ValueError):
+        raise InputError(f"{what} is not made of real numbers, {wanted}") from None
+
+
 def solve(matrix: Array, right: Array) -> Array:
     """Solution x of matrix x = right, float64 for the type checker too."""
     return np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
+
+
+def _named(sample: int, function: Callable[..., Array], *arrays: Array) -> Array:
+    """Call a function and name the sample in errors of the closure."""
+    try:
+        return function(*arrays)
+    except ClosureError as error:
+        raise type(error)(f"{error} (sample {sample})") from None
 
 
 def per_sample(function: Callable[..., Array], *arrays: Array) -> Array:
@@ -60,7 +101,7 @@ def per_sample(function: Callable[..., Array], *arrays: Array) -> Array:
         raise InputError(f"stacks of {sorted(lengths)} samples do not go together, give equal N")
     (count,) = lengths
     rows: Iterable[Array] = (
-        function(*(array[i] if array.ndim == 2 else array for array in arrays))
+        _named(i, function, *(array[i] if array.ndim == 2 else array for array in arrays))
         for i in range(count)
     )
     first = next(iter(rows), None)

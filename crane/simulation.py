@@ -8,17 +8,19 @@ from numpy.typing import ArrayLike
 
 from crane.control import Controller, Feedback, Free, TracedController
 from crane.dynamics import Dynamics
-from crane.dynamics.compiled import TooLongError
-from crane.errors import CraneWarning, InputError
-from crane.integration import CompiledStepper, PythonStepper
+from crane.errors import CraneWarning, InputError, known
+from crane.integration import ADAPTIVE, CompiledStepper, PythonStepper, integrate_adaptively
 from crane.kinematics import Kinematics
 from crane.machine import Machine
+from crane.paths import Path
 from crane.recording import Recording
-from crane.samples import Array, as_samples
+from crane.samples import Array, as_number, as_sample
+from crane.straight import TooLongError
 
 _IMBALANCE = 5e-3  # share of the energy that went through
 
 _ENERGIES = 2  # of the state: work, dissipated; of the observations: kinetic, potential
+_MOST = 4_000_000  # steps of one recording
 _CHUNK = 1000  # steps between reports of progress
 
 Force = Callable[[float, Array, Array], Array]
@@ -34,6 +36,7 @@ def simulate(
     *,
     task: str = "",
     path: str = "compiled",
+    method: str = "rk4",
     progress: Progress | None = None,
 ) -> Recording:
     """Simulate a machine with its friction, passive forces and end stops.
@@ -53,6 +56,8 @@ def simulate(
         step: [s].
         task: Name to put into the recording.
         path: "compiled" or "pinocchio", see `Dynamics`.
+        method: "rk4", or one of scipy's adaptive methods ("DOP853", "Radau", "LSODA", ...) with
+            relative tolerance 1e-9, whose dense output is recorded every `step`.
         progress: Called with the finished share, 0 to 1.
 
     Returns:
@@ -65,6 +70,30 @@ def simulate(
         LimitError: The start lies outside of the limits.
         SimulationError: The machine reached a posture it cannot go on from.
     """
+    if not (isinstance(task, str) and task.isprintable()):
+        raise InputError(f"task {task!r} is not one line of text")
+    control = _as_controller(controller, machine)
+    _, states, seen = trajectory(machine, control, initial, duration, step, path, method, progress)
+    _warn_of_imbalance(states[:, -2], seen[:, -2:], states[:, -1], step)
+    return _recording(machine, control.path, step, states, seen, task)
+
+
+def trajectory(
+    machine: Machine,
+    controller: Controller | Force | None,
+    initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None,
+    duration: float | None,
+    step: float,
+    path: str = "compiled",
+    method: str = "rk4",
+    progress: Progress | None = None,
+) -> tuple[Array, Array, Array]:
+    """What `simulate` computes, without channels; see there for arguments and errors.
+
+    Returns:
+        Times (N,); states (N, .) of q (nq), v_A (n), the controller's, work, dissipated;
+        observations (N, 2 n + 2) of tau, friction, kinetic, potential.
+    """
     control = _as_controller(controller, machine)
     if duration is None:
         if control.path is None:
@@ -76,10 +105,14 @@ def simulate(
     state = np.concatenate(
         [machine.closure.solve(q_a), v_a, control.start(q_a), np.zeros(_ENERGIES)]
     )
-    rows = _integrate(dynamics, control, state, steps, step, progress)
-    states, seen = rows[:, : len(state)], rows[:, len(state) :]
-    _warn_of_imbalance(states[:, -2], seen[:, -2:], states[:, -1], step)
-    return _recording(machine, control.path, step, states, seen, task)
+    if method == "rk4":
+        rows = _integrate(dynamics, control, state, steps, step, progress)
+    elif method in ADAPTIVE:
+        rows = integrate_adaptively(dynamics, control, state, steps, step, method, progress)
+    else:
+        raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")
+    times = step * np.arange(steps + 1, dtype=np.float64)
+    return times, rows[:, : len(state)], rows[:, len(state) :]
 
 
 def _integrate(
@@ -104,10 +137,12 @@ def _integrate(
             fast = None
     done = 0
     while done < steps:
+        stopped = True
         if fast is not None:
             chunk = times[done : min(done + _CHUNK, steps)]
-            done += fast.run(chunk, state, step, rows[done:])
-        if fast is None or done < steps and (done % _CHUNK or not len(chunk)):
+            count = fast.run(chunk, state, step, rows[done:])
+            done, stopped = done + count, count < len(chunk)
+        if stopped:
             # machine code stops where a step needs a closer look: it succeeds here or says why
             rate, seen = slow.observe(times[done], state)
             rows[done] = [*state, *seen]
@@ -123,11 +158,13 @@ def _integrate(
 
 
 def _as_controller(controller: Controller | Force | None, machine: Machine) -> Controller:
+    if not isinstance(machine, Machine):
+        raise InputError(f"{machine!r} is not a machine, load it with crane.load")
     if controller is None:
         return Free(machine)
     if hasattr(controller, "start"):
         return controller  # type: ignore[return-value]
-    if not callable(controller):
+    if not callable(controller) or isinstance(controller, type):
         raise InputError(
             f"the controller is a {type(controller).__name__}, give a function (t, q_a, v_a) -> "
             "tau_a or a controller object"
@@ -136,9 +173,13 @@ def _as_controller(controller: Controller | Force | None, machine: Machine) -> C
 
 
 def _count(duration: float, step: float) -> int:
-    for name, value in (("duration", duration), ("step", step)):
-        if not (np.isfinite(value) and value > 0):
-            raise InputError(f"the {name} is {value} s, give a positive number")
+    duration = as_number(duration, "the duration", "s", above=0)
+    step = as_number(step, "the step", "s", above=0)
+    if duration / step > _MOST:
+        raise InputError(
+            f"{duration:g} s are {duration / step:.3g} steps of {step:g} s, at most {_MOST}: "
+            "simulate less, or go on from the last sample of a first part"
+        )
     steps = round(duration / step)
     if steps < 1 or abs(steps * step - duration) > 1e-9 * duration:
         raise InputError(
@@ -148,26 +189,28 @@ def _count(duration: float, step: float) -> int:
 
 
 def _start(
-    machine: Machine, initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None, path: object
+    machine: Machine, initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None, path: Path | None
 ) -> tuple[Array, Array]:
     size, rest = len(machine.active), np.zeros(len(machine.active))
     if initial is None:
-        if callable(path):
+        if path is not None:
             return machine.check_limits(path(0.0)[0], "the start of the path"), rest
         return np.array(machine.home[machine.closure.active]), rest
     if isinstance(initial, tuple) and len(initial) == 2 and np.ndim(initial[0]) == 1:
         q_a = machine.check_limits(initial[0], "initial q_a")
-        v_a = as_samples(initial[1], size, "initial v_a", machine.active)
+        v_a = as_sample(initial[1], size, "initial v_a", machine.active)
     else:
         q_a, v_a = machine.check_limits(initial, "initial"), rest  # type: ignore[arg-type]
-    if q_a.ndim != 1 or v_a.ndim != 1:
-        raise InputError(f"initial is a stack, give one sample ({size},)")
+    if q_a.ndim != 1:
+        raise InputError(
+            f"initial is a stack, give one sample ({size},) or a pair as a tuple (q_a, v_a)"
+        )
     return q_a, v_a
 
 
 def _recording(
     machine: Machine,
-    path: object,
+    path: Path | None,
     step: float,
     states: Array,
     seen: Array,
@@ -194,14 +237,14 @@ def _recording(
         tip = np.array([kinematics.position_at(q) for q in postures])
         for axis, values in zip("xyz", tip.T, strict=True):
             add(f"tip_{axis}", values, "m")
-    if path is not None and callable(path):
+    if path is not None:
         reference, reference_rate, _ = path(time)
         for i, joint in enumerate(machine.active):
             add(f"reference_{joint}", reference[:, i], machine.unit(joint))
             rate_unit = machine.unit(joint) + "/s"
             add(f"reference_velocity_{joint}", reference_rate[:, i], rate_unit)
-        if (tip_reference := getattr(path, "tip", None)) is not None:
-            for axis, values in zip("xyz", tip_reference(time)[0].T, strict=True):
+        if path.tip is not None:
+            for axis, values in zip("xyz", path.tip(time)[0].T, strict=True):
                 add(f"reference_tip_{axis}", values, "m")
     for i, joint in enumerate(machine.active):
         add(f"friction_{joint}", friction[:, i], "N" if machine.unit(joint) == "m" else "N m")

@@ -468,3 +468,95 @@ def derivative(function, step):
         sum(weight * (function(k * step) - function(-k * step)) for k, weight in weights.items())
         / step
     )
+
+
+# --- random spatial mechanisms ---------------------------------------------------------------
+
+REACH = 0.1  # [rad], half of it [m]: limits of every joint of a random mechanism
+
+
+def random_mechanism(folder, seed, kind):
+    """Write a mechanism of random joints with one loop of a kind, closed at zero; its path.
+
+    Two branches of joints grow from random bodies and meet in the loop. Which joints are active
+    is drawn too, so a draw may be one that cannot be driven.
+    """
+    random = np.random.default_rng(seed)
+    rows = LOCKED[kind]
+    count = rows + int(random.integers(1, 3 if rows == 6 else 4))
+    split = int(random.integers(1, count))  # joints of the first branch
+    foot = int(random.integers(0, split))  # body that carries the second branch
+    active = random.permutation(count)[: count - rows] + 1
+    places = [pin.SE3.Identity()]  # of the bodies in the world, at zero
+    lines = [f'<robot name="random{seed}">', '  <link name="body0"/>']
+
+    def numbers(values):
+        return " ".join(repr(float(value)) for value in values)
+
+    def origin(place):
+        return (
+            f'<origin xyz="{numbers(place.translation)}" '
+            f'rpy="{numbers(pin.rpy.matrixToRpy(place.rotation))}"/>'
+        )
+
+    def anywhere(size):
+        turn = pin.rpy.rpyToMatrix(*random.uniform(-1.5, 1.5, 3))
+        return pin.SE3(turn, random.uniform(-size, size, 3))
+
+    for i in range(1, count + 1):
+        parent = foot if i == split + 1 else i - 1
+        step = pin.SE3.Identity() if random.random() < 0.15 else anywhere(0.4)
+        places.append(places[parent] * step)
+        axis = random.normal(size=3)
+        if random.random() < 0.4:  # along a direction of the frame, either way
+            axis = random.choice([-1.0, 1.0]) * np.eye(3)[random.integers(3)]
+        slides = random.random() < 0.3
+        reach = REACH / 2 if slides else REACH
+        mass, extent = random.uniform(0.2, 3.0), random.uniform(0.02, 0.2, 3) ** 2
+        turn = pin.rpy.rpyToMatrix(*random.uniform(-3, 3, 3))
+        inertia = turn @ np.diag(mass * (extent.sum() - extent)) @ turn.T
+        moments = dict(zip(("ixx", "ixy", "ixz"), inertia[0], strict=True))
+        moments |= {"iyy": inertia[1, 1], "iyz": inertia[1, 2], "izz": inertia[2, 2]}
+        tensor = " ".join(f'{key}="{float(value)!r}"' for key, value in moments.items())
+        lines.append(
+            f'  <joint name="j{i}" type="{"prismatic" if slides else "revolute"}" '
+            f'independent="{str(i in active).lower()}">{origin(step)}'
+            f'<parent link="body{parent}"/><child link="body{i}"/>'
+            f'<axis xyz="{numbers(axis / np.linalg.norm(axis))}"/>'
+            f'<limit lower="{-reach}" upper="{reach}" effort="9" velocity="9"/></joint>\n'
+            f'  <link name="body{i}"><inertial><origin xyz="'
+            f'{numbers(random.uniform(-0.2, 0.2, 3))}"/><mass value="{float(mass)!r}"/>'
+            f"<inertia {tensor}/></inertial></link>"
+        )
+    clasp = places[count] * anywhere(0.3)
+    axis = random.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    # from the end of one branch to the end of the other
+    ends = [(body, places[body].inverse() * clasp) for body in (split, count)]
+    path = folder / f"random{seed}.urdf"
+    if kind == "cylindrical":  # which URDF+ does not have
+        for end, (body, place) in zip(("one", "two"), ends, strict=True):
+            lines.append(
+                f'  <link name="{end}"/><joint name="at_{end}" type="fixed">{origin(place)}'
+                f'<parent link="body{body}"/><child link="{end}"/></joint>'
+            )
+        whole = folder / f"random{seed}.yaml"
+        whole.write_text(
+            f"name: random{seed}\nchains: [{{name: all, urdf: {path.name}}}]\n"
+            f"active: [{', '.join(f'j{i}' for i in sorted(active))}]\nloops:\n"
+            "  - {name: clasp, type: cylindrical, predecessor: one, successor: two, "
+            f"axis: [{', '.join(repr(float(x)) for x in axis)}]}}\n"
+        )
+        lines = [line.replace('independent="true"', "") for line in lines]
+        lines = [line.replace('independent="false"', "") for line in lines]
+    else:
+        one, two = (
+            f'<{end} link="body{body}">{origin(place)}</{end}>'
+            for end, (body, place) in zip(("predecessor", "successor"), ends, strict=True)
+        )
+        lines.append(
+            f'  <loop name="clasp" type="{kind}">{one}{two}<axis xyz="{numbers(axis)}"/></loop>'
+        )
+        whole = path
+    path.write_text("\n".join([*lines, "</robot>", ""]))
+    return whole

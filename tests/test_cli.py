@@ -1,4 +1,7 @@
+import os
 import re
+import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +14,7 @@ import crane
 def run(*arguments, cwd=None):
     """The command line in a process of its own, as a user has it."""
     return subprocess.run(
-        [sys.executable, "-c", "from crane.cli import main; main()", *map(str, arguments)],
+        [sys.executable, "-c", MAIN, *map(str, arguments)],
         capture_output=True,
         text=True,
         cwd=cwd,
@@ -28,6 +31,9 @@ def one_error(result) -> str:
     return lines[0]
 
 
+MAIN = "from crane.cli import main; main()"
+
+
 @pytest.fixture(scope="module")
 def free_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "fall"
@@ -41,6 +47,8 @@ def test_help_names_every_command_and_imports_nothing_heavy():
     assert result.returncode == 0
     for command in ("list", "info", "check", "simulate", "view", "plot", "demo"):
         assert re.search(rf"\b{command}\b", result.stdout)
+    assert "identif" not in result.stdout
+    assert run("-h").stdout == result.stdout
     code = "import sys, crane.cli; print([m for m in ('numpy', 'pinocchio') if m in sys.modules])"
     imported = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert imported.stdout.strip() == "[]"
@@ -50,6 +58,7 @@ def test_list():
     result = run("list")
     assert result.returncode == 0
     assert "  mini_forwarder\n" in result.stdout and "ur5_robot" in result.stdout
+    assert "some are refused" in result.stdout
 
 
 def test_info_says_what_the_machine_is():
@@ -59,6 +68,63 @@ def test_info_says_what_the_machine_is():
     assert "4: 8 independent equations, 12 redundant" in result.stdout
     assert "q4+q9, then q10+q2, then q6+q11, then q7+q3" in result.stdout
     assert "task        lift, 10 s: lifts along a straight line" in result.stdout
+
+
+def test_info_has_the_whole_home_posture_and_the_path(mini):
+    lines = run("info", "mini_forwarder").stdout.splitlines()
+    told = dict(
+        re.match(r"    (\w+) .* home (\S+)", line).groups() for line in lines if " home " in line
+    )
+    assert set(told) == set(mini.joints)
+    for joint, value in told.items():
+        assert float(value) == pytest.approx(mini.home[mini.column(joint)], rel=1e-4)
+    assert "  computed    compiled" in lines
+
+
+def test_version_and_units_in_help():
+    assert run("--version").stdout == f"crane {crane.__version__}\n"
+    text = " ".join(run("simulate", "-h").stdout.split())
+    assert "In seconds; that of the task" in text and "integration in seconds" in text
+
+
+@pytest.mark.parametrize("arguments", [["list"], ["info", "ur5_robot"], ["--version"]])
+def test_output_that_cannot_be_written_is_one_line(arguments):
+    command = [sys.executable, "-c", MAIN, *arguments]
+    with open("/dev/full", "w") as full:
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert result.returncode == 2
+    assert result.stderr.startswith("error: output: No space left on device")
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [["list"], ["simulate", "--help"]])
+def test_a_reader_that_has_gone_is_no_error(arguments):
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-c", MAIN, *arguments]
+    result = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (result.returncode, result.stderr) == (1, "")
+
+
+@pytest.mark.parametrize("delay", [0.0, 1.5])
+def test_interrupt_is_one_line_and_leaves_nothing(tmp_path, delay):
+    # a shell that starts tests in the background has them ignore the signal
+    code = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {MAIN}"
+    command = [sys.executable, "-c", code, "simulate", "mini_forwarder", "--task", "lift"]
+    command += ["--duration", "1000", "--out", str(tmp_path / "new" / "run")]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr.readline().startswith("warning: ")  # the machine has been read
+        try:
+            process.wait(delay)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGINT)
+        out, rest = process.communicate(timeout=60)
+    assert (process.returncode, out) == (130, "")
+    assert rest == "error: interrupted, nothing was written\n"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_check_tells_warnings_by_its_status():
@@ -115,10 +181,47 @@ def test_view_of_a_machine_goes_to_the_working_folder(tmp_path):
     assert (tmp_path / "mini_forwarder.html").is_file()
 
 
+def test_view_of_a_run_whose_machine_has_moved(tmp_path):
+    data = Path(__file__).parent / "data"
+    machine = Path(shutil.copy(data / "slider_crank.yaml", tmp_path))
+    shutil.copytree(data / "slider_crank", tmp_path / "slider_crank")
+    simulate = ("simulate", machine, "--duration", "0.01", "--out", tmp_path / "run")
+    assert run(*simulate).returncode == 0
+    machine.unlink()
+    page = tmp_path / "run" / "view.html"
+    view = ("view", tmp_path / "run", "--no-open")
+    error = one_error(run(*view))
+    assert "slider_crank.yaml: no such file" in error and "add --machine" in error
+    assert not page.exists()
+    result = run(*view, "--machine", data / "slider_crank.yaml")
+    assert result.returncode == 0, result.stderr
+    assert page.is_file()
+
+
+def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
+    data = Path(__file__).parent / "data"
+    text = (data / "slider_crank.yaml").read_text().replace("urdf: ", f"urdf: {data}/")
+    assert "name: slider_crank" in text
+    text = text.replace("name: slider_crank", "name: 'a/b: <c>'")
+    (tmp_path / "named.yaml").write_text(text)
+    result = run("view", "named.yaml", "--no-open", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "a_b_c.html").is_file()
+
+
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
         (["fly"], "No such command 'fly'"),
+        (["info", "zzzzzz"], "known: mini_forwarder; crane list shows all names"),
+        (["demo", "--out", ""], "the name after --out is empty"),
+        (["demo", "--out", "/dev/null"], "/dev/null: is a file"),
+        (["view", "ur5_robot", "--no-open", "--out", "page.png"], "end the name in .html"),
+        (["view", "ur5_robot", "--machine", "ur5_robot"], "--machine is for runs"),
+        (
+            ["simulate", "nothing", "--duration", "1", "--out", "/dev/null/run"],
+            "/dev/null/run: /dev/null is a file, give the name of a folder",
+        ),
         (["info"], "Missing argument 'MACHINE'"),
         (["info", "mini_forwardr"], "did you mean 'mini_forwarder'?"),
         (["check", "nothing.yaml"], "nothing.yaml: no such file"),
@@ -159,8 +262,14 @@ def test_debug_shows_where_an_error_comes_from():
 
 @pytest.mark.slow
 def test_demo(tmp_path):
-    result = run("demo", "--out", tmp_path / "demo")
+    (tmp_path / "demo" / "lift").mkdir(parents=True)
+    for name in ("notes.txt", "lift/view.html"):
+        (tmp_path / "demo" / name).write_text("old")
+    result = run("demo", "--out", tmp_path / "demo", "--force")
     assert result.returncode == 0, result.stderr
+    names = {path.name for path in (tmp_path / "demo").iterdir()}
+    assert names == {"loading", "return", "lift", "summary.md", "notes.txt"}
+    assert (tmp_path / "demo" / "lift" / "view.html").stat().st_size > 1000
     for task in ("loading", "return", "lift"):
         names = {path.name for path in (tmp_path / "demo" / task).iterdir()}
         assert names == {"recording.csv", "summary.md", "figure.png", "view.html"}

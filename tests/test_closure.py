@@ -405,7 +405,7 @@ def test_bad_arguments(mini):
         (lambda: closure.solve(0.0), r"the shape \(\)"),
         (lambda: closure.solve(np.zeros((2, 2, 3))), r"the shape \(2, 2, 3\)"),
         (lambda: closure.solve(np.zeros((0, 3))), "empty"),
-        (lambda: closure.solve("far"), "not an array of numbers"),
+        (lambda: closure.solve("far"), "not made of real numbers"),
         (lambda: closure.solve(np.zeros(3), guess=np.zeros(3)), "guess has the shape"),
         (lambda: closure.solve(np.zeros(3), guess=np.zeros((2, 11))), "guess has the shape"),
         (lambda: closure.solve(np.zeros(3), guess=np.full(11, np.nan)), "guess is nan at q1"),

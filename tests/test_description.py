@@ -279,10 +279,12 @@ class TestSources:
             ("mini_forwader", "no machine and no file is named 'mini_forwader', "
              "did you mean 'mini_forwarder'?"),
             ("ur5_robt", "no machine and no file is named 'ur5_robt', did you mean 'ur5_robot'?"),
-            ("elephant", "no machine and no file is named 'elephant', known: {bundled}"),
+            ("elephant", "no machine and no file is named 'elephant', known: {bundled}; "
+             "crane list shows all names"),
             ("crane.yaml", "crane.yaml: no such file, check the path"),
             ("folder/crane.urdf", "folder/crane.urdf: no such file, check the path"),
-            ("a\0b", "no machine and no file is named 'a b', known: {bundled}"),
+            ("a\0b", "no machine and no file is named 'a b', known: {bundled}; "
+             "crane list shows all names"),
             ("folder", "folder: not a machine, give a machine file (.yaml) or a URDF (.urdf)"),
             ("", ".: not a machine, give a machine file (.yaml) or a URDF (.urdf)"),
             ("a.txt", "a.txt: not a machine, give a machine file (.yaml) or a URDF (.urdf)"),

@@ -130,7 +130,7 @@ def test_unknown_names(mini):
     ("payload", "text"),
     [
         ({"frame": "link8"}, "frame 'link8' is unknown"),
-        ({"mass": -1.0}, r"mass is -1.0 kg, give a positive"),
+        ({"mass": -1.0}, r"mass is -1 kg, it must not be negative"),
         ({"mass": np.nan}, "mass is nan kg"),
         ({"com": (0.0, 0.1)}, "payload's com has the shape"),
         ({"com": (0.0, np.inf, 0.0)}, "payload's com is inf"),

@@ -1,5 +1,6 @@
 """Reference motions, and what the paper says about its three trajectories."""
 
+import dataclasses
 import warnings
 
 import numpy as np
@@ -185,7 +186,7 @@ def test_bad_arguments(mini):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for call, text in (
-            (lambda: crane.polynomial([[1.0]], 0.0), "duration is 0.0 s, give a positive"),
+            (lambda: crane.polynomial([[1.0]], 0.0), "duration is 0.0 s, give a number above 0"),
             (lambda: crane.polynomial([[1.0]], np.nan), "duration is nan s"),
             (lambda: crane.polynomial([], 1.0), "coefficients"),
             (lambda: crane.polynomial([[np.inf]], 1.0), "coefficients are not finite"),
@@ -194,9 +195,26 @@ def test_bad_arguments(mini):
             (lambda: crane.point_to_point([0, 0], [1, 1], -1.0), "duration is -1.0 s"),
             (lambda: crane.point_to_point([0, 0], [1, 1, 1], 1.0), r"end has the shape \(3,\)"),
             (lambda: crane.point_to_point([0, np.nan], [1, 1], 1.0), "start is nan"),
-            (lambda: crane.point_to_point("ab", [1, 1], 1.0), "start is not an array of numbers"),
+            (lambda: crane.point_to_point("ab", [1, 1], 1.0), "start is not made of real numbers"),
             (lambda: crane.task_path(mini, "dance"), "no task 'dance', known: lift, loading"),
             (lambda: crane.tip_path(mini, crane.polynomial([[0.3], [0.0]], 1.0)), "shape"),
         ):
             with pytest.raises(InputError, match=text):
                 call()
+
+
+def test_redundant_arms_move_smoothly():
+    arm = crane.load("ur5_robot")
+    arm = dataclasses.replace(arm, tip="tool0")
+    kinematics = crane.Kinematics(arm)
+    q_a = np.array([0.3, -1.2, 1.4, -0.5, 0.4, 0.2])
+    start = kinematics.position(q_a)
+    line = crane.point_to_point(start, start + [0.05, 0.1, -0.08], 1.0)
+    path = crane.tip_path(arm, line, guess=q_a)
+    time = np.linspace(0, 1, 997)
+    position, velocity, acceleration = path(time)
+    np.testing.assert_allclose(kinematics.position(position), line(time)[0], atol=1e-7)
+    step = time[1] - time[0]
+    slope = (position[2:] - position[:-2]) / (2 * step)
+    np.testing.assert_allclose(velocity[1:-1], slope, atol=1e-4)
+    assert np.abs(acceleration).max() < 5  # [rad/s2]; the line itself takes 2.4

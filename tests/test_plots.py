@@ -1,8 +1,10 @@
 import subprocess
 import sys
+from string import ascii_lowercase
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from crane.errors import OutputError
 from crane.recording import Recording
@@ -182,3 +184,66 @@ def test_no_global_state_of_pyplot():
     code = "import sys, crane.view.plots; print('matplotlib.pyplot' in sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "False"
+
+
+def boxes(figure):
+    """Where the words at the axes of the path in space are drawn, by what they say [pixels]."""
+    FigureCanvasAgg(figure).draw()
+    (space,) = (axes for axes in figure.axes if axes.name == "3d")
+    found = {}
+    for name, axis in zip("xyz", (space.xaxis, space.yaxis, space.zaxis), strict=True):
+        found[name] = [axis.label.get_window_extent()]
+        low, high = sorted(axis.get_view_interval())
+        for tick in axis.get_major_ticks():
+            assert low < tick.get_loc() < high
+            found[name].append(tick.label1.get_window_extent())
+    return found
+
+
+@pytest.mark.parametrize(
+    "end",
+    [
+        (0.42, 0.0, 0.13),
+        (0.38, 0.0, 0.13),
+        (0.12, -0.25, 0.1),
+        (0.36, 0.0, 0.0),
+        (0.4, 0.7, -0.07),
+        (2.4, 3.7, 9.1),
+        (0.36, 0.0, -0.07),
+    ],
+)
+def test_words_at_the_axes_of_the_path_keep_apart(end):
+    start = (0.36, 0.0, -0.07)
+    zeros = np.zeros((50, 1))
+    channels = {f"tip_{x}": np.linspace(*ends, 50) for x, *ends in zip("xyz", start, end)}  # noqa: B905
+    channels |= {f"reference_{name}": values for name, values in channels.items()}
+    time = np.linspace(0, 1, 50)
+    recording = Recording(time, ("q1",), zeros, zeros, zeros, {"q1": "rad"}, channels)
+    figure = recording_figure(recording)
+    found = boxes(figure)
+    assert all(2 <= len(words) <= 5 for words in found.values())
+    words = [box for boxes_ in found.values() for box in boxes_]
+    for i, one in enumerate(words):
+        assert figure.bbox.x0 <= one.x0 and one.x1 <= figure.bbox.x1
+        for other in words[:i]:
+            assert not one.overlaps(other)
+
+
+@pytest.mark.parametrize(
+    ("joints", "tip"), [(5, True), (6, True), (7, True), (7, False), (30, True)]
+)
+def test_many_joints_are_wrapped(joints, tip):
+    names = tuple(f"q{i + 1}" for i in range(joints))
+    zeros = np.zeros((3, joints))
+    channels = {f"tip_{axis}": np.arange(3.0) for axis in "xyz"} if tip else {}
+    units = dict.fromkeys(names, "rad")
+    figure = recording_figure(Recording([0, 1, 2], names, zeros, zeros, zeros, units, channels))
+    assert 200 * figure.get_size_inches()[0] < 4000
+    grid = panels(figure)
+    assert len(grid) == 3 * joints
+    titles = [grid[place].get_title() for place in sorted(grid) if place[0] % 3 == 0]
+    assert titles == [f"$q_{{{i + 1}}}$" for i in range(joints)]
+    for (row, _), axes in grid.items():
+        assert axes.get_xlabel() == ("time [s]" if row % 3 == 2 else "")
+    letters = [text.get_text() for place in sorted(grid) for text in grid[place].texts]
+    assert letters == [f"({letter})" for letter in ascii_lowercase[: 3 * joints]]

@@ -193,12 +193,12 @@ def test_leaving_the_limits_without_an_end_stop_is_told(forwarder):
         (
             {"duration": 1.0, "controller": lambda t, q, v: np.zeros(2)},
             InputError,
-            "the controller gave the shape",
+            "the controller's force at t = 0 s has the shape (2,), give (3,) (q1, X1, X2)",
         ),
         (
             {"duration": 1.0, "controller": lambda t, q, v: np.full(3, np.nan)},
             InputError,
-            "the controller gave nan for q1 at t = 0 s",
+            "the controller's force at t = 0 s is nan at q1",
         ),
     ],
 )
@@ -206,3 +206,22 @@ def test_wrong_arguments_are_one_line(forwarder, arguments, error, text):
     with pytest.raises(error) as caught:
         crane.simulate(forwarder, **arguments)
     assert text in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Radau"])
+def test_adaptive_methods_agree_with_fixed_steps(springy, method):
+    fixed = crane.simulate(springy, initial=START, duration=0.3, step=5e-4)
+    adaptive = crane.simulate(springy, initial=START, duration=0.3, step=5e-4, method=method)
+    np.testing.assert_allclose(adaptive.q, fixed.q, atol=1e-8)
+    np.testing.assert_allclose(adaptive.v, fixed.v, atol=1e-6)
+    assert adaptive.time.tolist() == fixed.time.tolist()
+
+
+def test_unknown_method(springy):
+    with pytest.raises(InputError, match="method 'rk5' is unknown"):
+        crane.simulate(springy, duration=0.1, method="rk5")
+
+
+def test_too_many_steps(forwarder):
+    with pytest.raises(InputError, match="1e[+]15 steps of 0.001 s, at most 4000000"):
+        crane.simulate(forwarder, duration=1e12)

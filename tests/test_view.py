@@ -1,5 +1,7 @@
 """Pages: what they show is where forward kinematics puts it, and nothing leaves them."""
 
+import dataclasses
+import json
 import shutil
 import warnings
 from html.parser import HTMLParser
@@ -333,6 +335,41 @@ def test_what_cannot_be_drawn_leaves_the_old_page(machine, recording, tmp_path):
     with pytest.raises(OutputError, match="there is no folder"):
         write_page(machine, tmp_path / "none" / "page.html")
     assert list(tmp_path.iterdir()) == [page]
+
+
+def about(path):
+    """What a page says about itself."""
+    (line,) = (x for x in path.read_text().splitlines() if x.startswith("const page = "))
+    return json.loads(line.removeprefix("const page = ").removesuffix(";"))
+
+
+@pytest.mark.parametrize("slew", [0.0, 0.7, -2.5])
+def test_side_looks_at_the_plane_of_the_crane(machine, tmp_path, slew):
+    q_a = np.array([[slew, 0.0221, 0.0108], [slew + 0.4, 0.03, 0.0]])
+    zeros, units = np.zeros((2, 3)), {joint: machine.unit(joint) for joint in machine.active}
+    recording = Recording([0, 1], machine.active, q_a, zeros, zeros, units)
+    views = about(write_page(machine, tmp_path / "page.html", recording))["views"]
+    plane = world(machine, machine.closure.solve(q_a[0]), "link1")[:3, :3]
+    np.testing.assert_allclose(views["front"], plane @ [1, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(views["side"], plane @ [0, -1, 0], atol=1e-9)
+    np.testing.assert_allclose(views["iso"], plane @ [1, -1.6, 0.75], atol=1e-9)
+
+
+def test_views_are_the_world_s_where_no_tip_points_anywhere(tmp_path):
+    (tmp_path / "arm.urdf").write_text(ARM.format(foot=""))
+    arm = crane.load(tmp_path / "arm.urdf")
+    for tip in (None, "foot", "arm"):  # none, one that stands still, one on the first joint
+        assert build_scene(dataclasses.replace(arm, tip=tip)).heading == 0
+    pointing = build_scene(dataclasses.replace(arm, tip="hand")).heading
+    assert pointing == pytest.approx(np.arctan2(0.1, 0.4 * np.cos(0.3)))
+
+
+@pytest.mark.parametrize("name", ["page.png", "page", "page.html.txt"])
+def test_a_page_is_named_as_one(machine, tmp_path, name):
+    with pytest.raises(OutputError, match=r"end the name in \.html"):
+        write_page(machine, tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+    write_page(machine, tmp_path / "page.HTM")
 
 
 MATRICES = """(links) => {

@@ -228,9 +228,9 @@ class Branch:
                 row = self._structure.redundant[extra.argmax()]
                 loop = self._equations.loops[self._equations.loop_of_row[row]].name
                 raise OutOfReachError(
-                    f"loop '{loop}' stays {extra.max():.3g} open at {self._at(posture.q_a)}"
-                    f"{sample}, its surplus equations hold only near home: the mechanism is "
-                    "overconstrained, use a looser loop type"
+                    f"loop '{loop}' stays {extra.max():.3g} {self._unit(row)} open at "
+                    f"{self._at(posture.q_a)}{sample}, its surplus equations hold only near home: "
+                    "the mechanism is overconstrained, use a looser loop type"
                 )
 
     def _out_of_reach(self, target: Array, last: Posture, sample: str) -> OutOfReachError:
@@ -260,7 +260,7 @@ class Branch:
                 f"{self._at(last.q_a)}: go around in between, or give a nearer guess"
             )
         loop = self._equations.loops[self._equations.loop_of_row[worst]].name
-        unit = "m" if self._equations.is_translation[worst] else "rad"
+        unit = self._unit(worst)
         return OutOfReachError(
             f"loop '{loop}' cannot be closed at {self._at(target)}{sample}: it stays "
             f"{np.abs(phi[worst]):.3g} {unit} open; the last posture on the way that closes is at "
@@ -272,6 +272,9 @@ class Branch:
             f"{what} is assembled the other way at {self._at(posture.q_a)}: start from the home "
             "posture's branch"
         )
+
+    def _unit(self, row: int) -> str:
+        return "m" if self._equations.is_translation[row] else "rad"
 
     def _loops_of(self, rows: Indices) -> str:
         loops = sorted(set(self._equations.loop_of_row[self._structure.rows[rows]].tolist()))

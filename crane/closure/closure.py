@@ -1,20 +1,23 @@
 """Closing the loops: q = f(q_A), v = gamma v_A, a = gamma a_A + drift."""
 
+import threading
 from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from crane.closure.branch import Branch, Posture
-from crane.closure.compiled import FastClosure
+from crane.closure.branch import Branch
+from crane.closure.compiled import Cursor, FastClosure
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import Structure, analyse
 from crane.description import LoopSpec
-from crane.errors import InputError
+from crane.errors import BranchEdgeError, InputError
 from crane.samples import Array, as_samples, per_sample, solve
+from crane.straight import TooLongError
 
+_FEW, _FAR = 100, 0.1  # samples worth sorting: how many, how far apart as a share of the range
 _STEPS = 8  # from home to a target that is far from the one before it
 
 
@@ -27,8 +30,6 @@ class Closure:
         q = f(q_A)                 phi(q) = 0, on the assembly branch of the home posture
         gamma = df/dq_A            rows of active joints: identity; passive: -J_P^-1 J_A
         drift = gammadot v_A       rows of active joints: zero; passive: -J_P^-1 (Jdot v)
-
-    Not safe to share between threads: give each its own.
 
     Args:
         model: The spanning tree.
@@ -54,6 +55,7 @@ class Closure:
     ):
         self.model = model
         self.equations = LoopEquations(model, loops)
+        self._local = threading.local()
         self.active_names = tuple(active)
         ids = [model.getJointId(name) for name in active]
         self.active = np.array([model.joints[i].idx_v for i in ids], dtype=np.intp)
@@ -61,29 +63,47 @@ class Closure:
         self._names = tuple(model.names)[1:]
         self.structure: Structure = analyse(self.equations, self.active, self.passive, guess)
         span = model.upperPositionLimit[self.active] - model.lowerPositionLimit[self.active]
+        self._span = np.where(np.isfinite(span) & (span > 0), span, 1.0)
         self._branch = Branch(
-            self.equations,
-            self.structure,
-            self._names,
-            self.active,
-            self.passive,
-            np.where(np.isfinite(span) & (span > 0), span, 1.0),
+            self.equations, self.structure, self._names, self.active, self.passive, self._span
         )
         self.home = self._branch.home.q.copy()
         self.home.flags.writeable = False
 
-    @property
-    def home_posture(self) -> Posture:
-        """The home posture with its gamma."""
-        return self._branch.home
-
     @cached_property
-    def fast(self) -> FastClosure:
-        """Machine code for these loops, made when it is first needed."""
+    def _made(self) -> FastClosure | None:
         branch = self._branch
-        return FastClosure(
-            self.equations, self.structure, self.active, self.passive, branch.home, branch.size
-        )
+        try:
+            return FastClosure(
+                self.equations, self.structure, self.active, self.passive, branch.home, branch.size
+            )
+        except TooLongError:
+            return None
+
+    @property
+    def compiled(self) -> bool:
+        """Whether there is machine code for these loops."""
+        return self._made is not None
+
+    @property
+    def fast(self) -> FastClosure:
+        """Machine code for these loops, made when it is first needed.
+
+        Raises:
+            TooLongError: The machine is too large for it.
+        """
+        if self._made is None:
+            raise TooLongError
+        return self._made
+
+    @property
+    def _cursor(self) -> Cursor:
+        """This thread's cursor."""
+        try:
+            return self._local.cursor
+        except AttributeError:
+            self._local.cursor = self.fast.cursor()
+            return self._local.cursor
 
     @property
     def degrees_of_freedom(self) -> int:
@@ -114,38 +134,76 @@ class Closure:
         targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
         if targets.size == 0:
             raise InputError("q_a is an empty stack, give at least one sample")
+        near = None
         if guess is not None:
             near = as_samples(guess, self.model.nq, "guess", self._names)
             if near.ndim != 1:
                 raise InputError(f"guess has the shape {near.shape}, give one ({self.model.nq},)")
-            if not self.fast.start_near(near):
-                self.fast.start(self._branch.posture(near))
+            if self.compiled and not self.fast.start_near(self._cursor, near):
+                self._cursor.start(self._branch.posture(near))
         out = np.empty((*targets.shape[:-1], self.model.nq))
-        self.fill(np.atleast_2d(targets), np.atleast_2d(out), stacked=targets.ndim == 2)
+        if not self.compiled:
+            known = self._branch.home if near is None else self._branch.posture(near)
+            for i, target in enumerate(np.atleast_2d(targets)):
+                sample = f" (sample {i})" if targets.ndim == 2 else ""
+                known = self._branch.reach(target, known, sample)
+                out[(i,) if targets.ndim == 2 else ()] = known.q
+            return out
+        self._close(np.atleast_2d(targets), np.atleast_2d(out), stacked=targets.ndim == 2)
         return out
 
-    def fill(self, targets: Array, out: Array, stacked: bool = True) -> None:
-        """Close the loops at targets (N, n) into out (N, nq), from where `fast` is."""
-        targets = np.ascontiguousarray(targets)
-        done = 0
+    def _close(self, targets: Array, out: Array, stacked: bool) -> None:
+        """Close the loops at targets (N, n) into out (N, nq)."""
+        order = self._order(targets) if len(targets) > _FEW else None
+        sorted_targets = np.ascontiguousarray(targets if order is None else targets[order])
+        done, closed = 0, out if order is None else np.empty_like(out)
         while done < len(targets):
-            done += self.fast.follow(targets[done:], out[done:])
+            done += self.fast.follow(self._cursor, sorted_targets[done:], closed[done:])
             if done < len(targets):
-                sample = f" (sample {done})" if stacked else ""
-                out[done] = self.reach(targets[done], sample)
+                index = done if order is None else order[done]
+                sample = f" (sample {index})" if stacked else ""
+                closed[done] = self.reach(self._cursor, sorted_targets[done], sample)
                 done += 1
+        if order is not None:
+            out[order] = closed
 
-    def reach(self, target: Array, sample: str) -> Array:
-        """A target that is too far for one step: in several from home, or as `Branch` can."""
+    def _order(self, targets: Array) -> NDArray[np.intp] | None:
+        """An order of far samples in which neighbours are near; None for what is a path already.
+
+        Cells of all coordinates but one, along the last one within a cell. Coordinates that move
+        no passive joint do not count.
+        """
+        counts = np.abs(self._branch.home.gamma).max(axis=0, initial=0.0) > 0
+        scaled = (targets / self._span)[:, counts]
+        if not scaled.size or np.abs(np.diff(scaled, axis=0)).max(axis=1).mean() < _FAR:
+            return None
+        cells = np.floor(scaled * len(targets) ** (1 / scaled.shape[1]))
+        order: NDArray[np.intp] = np.lexsort((scaled[:, -1], *cells[:, :-1].T))
+        return order
+
+    def reach(self, cursor: Cursor, target: Array, sample: str = "") -> Array:
+        """The posture at a target that is too far for one step, where the cursor is left.
+
+        In several steps from home, or as `Branch` can.
+
+        Args:
+            cursor: Where to go on from afterwards.
+            target: (n,).
+            sample: What to call the target in errors.
+
+        Returns:
+            q (nq,).
+        """
         home = self._branch.home
         way = home.q_a + np.linspace(0, 1, _STEPS + 1)[1:, None] * (target - home.q_a)
         way[-1] = target
         out = np.empty((_STEPS, self.model.nq))
-        self.fast.start(home)
-        if self.fast.follow(way, out) == _STEPS:
-            return out[-1]
+        for some in (way[-1:], way[1::2], way):
+            cursor.start(home)
+            if self.fast.follow(cursor, some, out) == len(some):
+                return out[len(some) - 1]
         posture = self._branch.reach(target, home, sample)
-        self.fast.start(posture)
+        cursor.start(posture)
         return posture.q
 
     def gamma(self, q: ArrayLike) -> Array:
@@ -161,7 +219,24 @@ class Closure:
             InputError: Wrong shape or not finite.
             BranchEdgeError: The passive joints are not determined there.
         """
-        return per_sample(self._gamma, as_samples(q, self.model.nq, "q", self._names))
+        q = as_samples(q, self.model.nq, "q", self._names)
+        if not self.compiled:
+            return per_sample(self._gamma, q)
+        if q.size == 0:
+            raise InputError("q is an empty stack, give at least one sample")
+        rows, done = np.atleast_2d(np.ascontiguousarray(q)), 0
+        out = np.empty((len(rows), self.model.nv, len(self.active)))
+        while done < len(rows):
+            done += self.fast.gamma(rows[done:], out[done:])
+            if done < len(rows):
+                # what looks singular is computed with pivoting, or refused
+                try:
+                    out[done] = self._gamma(rows[done])
+                except BranchEdgeError as error:
+                    sample = f" (sample {done})" if q.ndim == 2 else ""
+                    raise BranchEdgeError(f"{error}{sample}") from None
+                done += 1
+        return out if q.ndim == 2 else out[0]
 
     def drift(self, q: ArrayLike, v: ArrayLike) -> Array:
         """Acceleration of the tree at a_A = 0: drift = gammadot v_A, a = gamma a_A + drift.

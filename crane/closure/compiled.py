@@ -1,6 +1,7 @@
 """Closing loops in machine code made for one machine."""
 
 from ctypes import c_double, c_int64, c_void_p
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -96,6 +97,52 @@ done:
 """
 
 
+_GAMMAS = """
+define i64 @gammas(i64 %count, ptr %numbers, ptr %q, ptr %out, ptr %work) {{
+entry:
+  %good_at = getelementptr double, ptr %work, i64 2
+  br label %sample
+sample:
+  %i = phi i64 [0, %entry], [%i1, %accept]
+  %more = icmp slt i64 %i, %count
+  br i1 %more, label %look, label %done
+look:
+  %q0 = mul i64 %i, {nq}
+  %here = getelementptr double, ptr %q, i64 %q0
+  call void @newton(ptr %numbers, ptr %here, ptr %work)
+  %good = load double, ptr %good_at
+  %regular = fcmp ogt double %good, 0.0
+  br i1 %regular, label %accept, label %done
+accept:
+  %o0 = mul i64 %i, {size}
+  %o = getelementptr double, ptr %out, i64 %o0
+  call void @whole(ptr %work, ptr %o)
+  %i1 = add i64 %i, 1
+  br label %sample
+done:
+  ret i64 %i
+}}
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Cursor:
+    """Where following a stack has got to; every thread and every formula has its own.
+
+    Attributes:
+        at: (nq + m n,) posture and passive rows of gamma that the next sample starts from.
+        work: Memory to work in.
+    """
+
+    at: Array
+    work: Array
+
+    def start(self, posture: ClosedPosture) -> None:
+        """Let the next sample start from a posture."""
+        self.at[: len(posture.q)] = posture.q
+        self.at[len(posture.q) :] = posture.gamma.ravel()
+
+
 class FastClosure:
     """Machine code for the loops of one machine.
 
@@ -109,8 +156,7 @@ class FastClosure:
 
     Attributes:
         geometry: What the formulas were traced from.
-        at: (nq + m n,) posture and passive rows of gamma that the next sample starts from.
-        work: Memory to work in.
+        programs: Further machine code for this machine, by what it depends on.
         bounds: Residuals that count as rounding, and as closed if they no longer fall.
         address: Of the function `follow`, for other machine code to call.
     """
@@ -133,52 +179,69 @@ class FastClosure:
         self.add_newton(program, self._signs(home))
         self._add_moves(program)
         program.add_text(_FOLLOW.format(n=n, nq=nq, bytes=8 * nq, gamma_bytes=8 * rows * n))
+        self._add_gamma(program)
         program.compile()
         self._program = program  # the functions live as long as it
         kinds = [c_int64, *[c_void_p] * 5, c_double, c_double]
         self._follow = program.function("follow", *kinds, result=c_int64)
+        self._gamma = program.function("gammas", c_int64, *[c_void_p] * 4, result=c_int64)
         self._newton = program.function("newton", *[c_void_p] * 3)
         self.address = program.address("follow")
         self.newton_address = program.address("newton")
-        self.at = np.zeros(nq + rows * n)
-        self.work = np.zeros(3 * nq + 5 + rows * n)
+        self.programs: dict[tuple, Program] = {}
+        self._rows = rows
+        self._home = home
         self.bounds = (1e-15 * size, 1e-13 * size)
-        self.start(home)
 
-    def start(self, posture: ClosedPosture) -> None:
-        """Let the next sample start from a posture."""
-        self.at[: self._nq] = posture.q
-        self.at[self._nq :] = posture.gamma.ravel()
+    def cursor(self) -> "Cursor":
+        """A place to follow stacks from, at home."""
+        cursor = Cursor(
+            np.empty(self._nq + self._rows * self._n),
+            np.empty(3 * self._nq + 5 + self._rows * self._n),
+        )
+        cursor.start(self._home)
+        return cursor
 
-    def start_near(self, q: Array) -> bool:
-        """Let the next sample start from a posture (nq,) that is closed to 1e-6 or better.
+    def start_near(self, cursor: "Cursor", q: Array) -> bool:
+        """Put a cursor on a posture (nq,) that is closed to 1e-6 or better.
 
         Returns:
             Whether it is, and on the home branch.
         """
-        result = np.empty(3 + len(self.at))
+        result = np.empty(3 + len(cursor.at))
         q = np.ascontiguousarray(q)
         self._newton(self.geometry.numbers.ctypes.data, q.ctypes.data, result.ctypes.data)
         residual, _, regular = result[:3]
         if not (residual <= _NEAR and regular > 0):
             return False
-        self.at[: self._nq] = q
-        self.at[self._nq :] = result[3 + self._nq :]
+        cursor.at[: self._nq] = q
+        cursor.at[self._nq :] = result[3 + self._nq :]
         return True
 
-    def follow(self, targets: Array, out: Array) -> int:
+    def follow(self, cursor: "Cursor", targets: Array, out: Array) -> int:
         """Close the loops at targets (N, n) into out (N, nq) until one needs more than a step.
 
         Returns:
             How many were closed.
         """
-        numbers = self.geometry.numbers
+        numbers, targets = self.geometry.numbers, np.ascontiguousarray(targets)
         return int(
             self._follow(
-                len(targets), numbers.ctypes.data, targets.ctypes.data, self.at.ctypes.data,
-                self.work.ctypes.data, out.ctypes.data, *self.bounds,
+                len(targets), numbers.ctypes.data, targets.ctypes.data, cursor.at.ctypes.data,
+                cursor.work.ctypes.data, out.ctypes.data, *self.bounds,
             )
         )  # fmt: skip
+
+    def gamma(self, q: Array, out: Array) -> int:
+        """Evaluate gamma at closed postures (N, nq) into out (N, nv, n), while they are regular.
+
+        Returns:
+            How many were done.
+        """
+        work = self.cursor().work  # held until the call is over
+        numbers, q = self.geometry.numbers, np.ascontiguousarray(q)
+        arrays = (numbers, q, out, work)
+        return int(self._gamma(len(q), *(array.ctypes.data for array in arrays)))
 
     def trace(self, tape: Tape, geometry: int, q: int) -> tuple[list[Number], Posture, Loops]:
         """Coordinates, bodies and loops, read from two arguments of a function to be."""
@@ -200,8 +263,21 @@ class FastClosure:
         worst = maximum(largest(rows) - _STEEP, loops.surplus - _SURPLUS)
         for sign, determinant in zip(signs, loops.determinants, strict=True):
             worst = maximum(worst, -(float(sign) * determinant))
+        for alignment in loops.alignments:
+            worst = maximum(worst, -1.0 * alignment)
         outputs = [loops.residual, largest(steps.values()), -1.0 * worst, *corrected, *rows]
         program.add("newton", 2, outputs)
+
+    def _add_gamma(self, program: Program) -> None:
+        """whole(result of newton) -> gamma of all joints, and the loop `gammas` over postures."""
+        tape, n = Tape(), self._n
+        rows: list[list[Number]] = [[0.0] * n for _ in range(self._nq)]
+        for k, column in enumerate(self._active):
+            rows[column][k] = 1.0
+        for i, column in enumerate(self._passive):
+            rows[column] = tape.loads(0, 3 + self._nq + i * n, n)
+        program.add("whole", 1, [entry for row in rows for entry in row])
+        program.add_text(_GAMMAS.format(nq=self._nq, size=self._nq * n))
 
     def _signs(self, home: ClosedPosture) -> Array:
         """Of the blocks' determinants on the home branch."""

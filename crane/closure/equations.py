@@ -1,5 +1,6 @@
 """The loop equations phi(q) = 0, their Jacobian and its time derivative."""
 
+import threading
 from collections.abc import Sequence
 
 import numpy as np
@@ -35,6 +36,14 @@ def _cross(a: Array, b: Array) -> Array:
     return out
 
 
+def aligned_axes(loop_type: str) -> list[int]:
+    """Axes of the two frames of a loop that point the same way when it is closed."""
+    locked = LOOP_TYPES[loop_type][3:]
+    if all(locked):
+        return [0, 1, 2]
+    return [k for k in range(3) if any(locked) and not locked[k]]
+
+
 class LoopEquations:
     """All equations of all loops of a machine.
 
@@ -56,7 +65,7 @@ class LoopEquations:
 
     def __init__(self, model: pin.Model, loops: Sequence[LoopSpec]):
         self.model = model
-        self.data = model.createData()
+        self._local = threading.local()  # a machine may be used by several threads
         self.loops = tuple(loops)
         self.frames: list[tuple[int, pin.SE3]] = []  # (joint, placement), two per loop
         sign = np.zeros((len(loops), model.nv))
@@ -84,9 +93,19 @@ class LoopEquations:
         self.sign = sign
         self._row_sign = sign[self.loop_of_row]
 
+    @property
+    def data(self) -> pin.Data:
+        """Pinocchio's memory of this thread."""
+        try:
+            return self._local.data
+        except AttributeError:
+            self._local.data = self.model.createData()
+            return self._local.data
+
     def _geometry(self) -> tuple[Array, Array, Array, Array]:
         """Of every row: axis of frame 1, axis of frame 2, origins of both frames, each (m, 3)."""
-        placements = [self.data.oMi[joint] * local for joint, local in self.frames]
+        bodies = self.data.oMi
+        placements = [bodies[joint] * local for joint, local in self.frames]
         turns = np.array([placement.rotation for placement in placements])
         origins = np.array([placement.translation for placement in placements])
         one = 2 * self.loop_of_row
@@ -116,7 +135,7 @@ class LoopEquations:
         if not self.loops:
             return np.zeros(0), np.zeros((0, self.model.nv))
         jacobian = pin.computeJointJacobians(self.model, self.data, q)
-        self._last = a, b, p1, p2 = self._geometry()
+        self._local.last = a, b, p1, p2 = self._geometry()
         phi = np.einsum("ij,ij->i", a, np.where(self.is_translation[:, None], p2 - p1, b))
         return phi, self._row_sign * (self._wrenches(a, b, p2) @ jacobian)
 
@@ -126,14 +145,13 @@ class LoopEquations:
             return None
         pin.forwardKinematics(self.model, self.data, q)
         for index, loop in enumerate(self.loops):
-            locked = LOOP_TYPES[loop.type][3:]
-            if not any(locked):
+            checked = aligned_axes(loop.type)
+            if not checked:
                 continue
             (j1, local1), (j2, local2) = self.frames[2 * index : 2 * index + 2]
             turn1 = (self.data.oMi[j1] * local1).rotation
             turn2 = (self.data.oMi[j2] * local2).rotation
             aligned = np.einsum("ik,ik->k", turn1, turn2)
-            checked = range(3) if all(locked) else [k for k in range(3) if not locked[k]]
             if any(aligned[k] < 0 for k in checked):
                 return loop.name
         return None
@@ -142,7 +160,7 @@ class LoopEquations:
         """Second derivative of phi at zero joint acceleration, (d/dt dphi/dq) v.
 
         Args:
-            q: (nq,) [m], [rad], the posture `evaluate` was last called with.
+            q: (nq,) [m], [rad], the posture this thread last called `evaluate` with.
             v: (nv,) [m/s], [rad/s].
 
         Returns:
@@ -150,7 +168,7 @@ class LoopEquations:
         """
         if not self.loops:
             return np.zeros(0)
-        a, b, _, p2 = self._last
+        a, b, _, p2 = self._local.last
         rate = pin.computeJointJacobiansTimeVariation(self.model, self.data, q, v)
         velocity = np.array([self.data.ov[joint].vector for joint, _ in self.frames])
         one = 2 * self.loop_of_row

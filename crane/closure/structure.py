@@ -129,6 +129,8 @@ def analyse(
             "active",
         )
     home = _close(equations, guess, passive)
+    endless = passive[np.isinf(model.upperPositionLimit[passive])]  # pins may have wound up
+    home[endless] = np.remainder(home[endless] + np.pi, 2 * np.pi) - np.pi
     _check_closed(
         equations, home, f"at home ({given})", "choose other values or guess more passive joints"
     )

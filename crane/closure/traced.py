@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.equations import LoopEquations, turned
+from crane.closure.equations import LoopEquations, aligned_axes, turned
 from crane.closure.structure import Indices, Structure
 from crane.samples import Array
 from crane.straight.scalar import (
@@ -178,6 +178,8 @@ class Row:
 class Loops:
     """The independent loop equations at a traced posture.
 
+    `alignments` are cosines that are 1 where the loops' axes are not opposed.
+
     Args:
         equations: All equations of the machine.
         structure: Which of them count.
@@ -199,6 +201,13 @@ class Loops:
         self.passive_joints = [int(column) + 1 for column in passive]
         self._frames = [posture.frame(i) for i in range(len(posture.geometry.frame_bodies))]
         self.rows = [self._row(equations, int(row), posture) for row in structure.rows]
+        self.alignments = [
+            dot([line[k] for line in one[0]], [line[k] for line in two[0]])
+            for loop, one, two in zip(
+                equations.loops, self._frames[::2], self._frames[1::2], strict=True
+            )
+            for k in aligned_axes(loop.type)
+        ]
         self._others = [self._row(equations, int(row), posture) for row in structure.redundant]
 
     def _row(self, equations: LoopEquations, row: int, posture: Posture) -> Row:

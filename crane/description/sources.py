@@ -76,5 +76,5 @@ def find(name: str | Path) -> Path:
         )
     hint = known([*machines, *robots], text)
     if hint.startswith("known"):
-        hint = known(machines)
+        hint = f"{known(machines)}; crane list shows all names"
     raise DescriptionError(f"no machine and no file is named '{text}', {hint}")

@@ -7,6 +7,18 @@ from pathlib import Path
 
 from lxml import etree
 
+from crane.errors import InputError
+from crane.samples import as_number
+
+
+def _check(item: object, what: str, *positive: str) -> None:
+    """Raise for numbers that are not finite, or negative where that has no meaning."""
+    for name, value in vars(item).items():
+        if name != "joint":
+            number = as_number(value, f"{name} of {what}", "")
+            if name in positive and number < 0:
+                raise InputError(f"{name} of {what} is {number:g}, it must not be negative")
+
 
 @dataclass(frozen=True)
 class Chain:
@@ -90,6 +102,9 @@ class Friction:
     viscous_offset: float = 0.0
     smoothing: float = 1e-3
 
+    def __post_init__(self) -> None:
+        _check(self, "friction", "coulomb", "viscous", "smoothing")
+
 
 @dataclass(frozen=True)
 class ForceElement:
@@ -109,6 +124,9 @@ class ForceElement:
     damping: float = 0.0
     force: float = 0.0
 
+    def __post_init__(self) -> None:
+        _check(self, f"force element of '{self.joint}'", "stiffness", "damping")
+
 
 @dataclass(frozen=True)
 class EndStop:
@@ -126,6 +144,9 @@ class EndStop:
     stiffness: float
     damping: float = 0.0
 
+    def __post_init__(self) -> None:
+        _check(self, f"end stop of '{self.joint}'", "stiffness", "damping")
+
 
 @dataclass(frozen=True)
 class PIGains:
@@ -138,6 +159,9 @@ class PIGains:
 
     kp: float
     ki: float
+
+    def __post_init__(self) -> None:
+        _check(self, "PI gains", "kp", "ki")
 
 
 @dataclass(frozen=True)

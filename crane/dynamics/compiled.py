@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from crane.closure.compiled import FastClosure
-from crane.closure.traced import Constants
+from crane.closure.traced import Constants, folded
 from crane.dynamics.traced import Sweep
 from crane.machine import Machine
 from crane.samples import Array
@@ -34,7 +34,7 @@ QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
     "observation": lambda sweep, x: [*sweep.friction, sweep.kinetic, sweep.potential],
     "regressor": lambda sweep, x: [entry for row in sweep.regressor(x) for entry in row],
 }
-_MOST = 60_000  # operations of a formula; longer ones take too long to compile
+_FLOAT = np.dtype(np.float64)
 
 # Closes the loops sample by sample and evaluates there; like `follow`, stops at the first sample
 # that is too far from the one before it.
@@ -67,7 +67,7 @@ done:
 }}
 define i64 @once(ptr %a) {{
   {loads}
-  call void @scan(ptr %v5, ptr %v9)
+  call void @scan(ptr %v4, ptr %v5, ptr %v9)
   %most = load double, ptr %v9
   %finite = fcmp olt double %most, 0x7FF0000000000000
   br i1 %finite, label %go, label %stop
@@ -96,45 +96,34 @@ class Formula:
 
     Attributes:
         size: Length of the result of one sample.
+        cursor: Where it has got to.
+
+    Raises:
+        TooLongError: It would take too long to compile.
     """
 
     def __init__(self, quantity: str, machine: Machine, numbers: Array):
-        closure = machine.closure
-        self._fast: FastClosure = closure.fast
+        fast = self._fast = machine.closure.fast
         self._numbers = numbers
         nq, n = machine.model.nq, len(machine.active)
-        tape = Tape()
-        q, posture, loops = self._fast.trace(tape, 0, 2)
-        sweep = Sweep(posture, loops, Constants(tape, 1, numbers), q, tape.loads(3, 0, n))
-        outputs = QUANTITIES[quantity](sweep, tape.loads(3, n, n))
-        self.size = len(outputs)
-        if len(tape.operations) > _MOST:
-            raise TooLongError
-        self._program = program = Program()
-        program.add("formula", 4, outputs)
-        tape = Tape()
-        program.add("scan", 1, [largest(tape.loads(0, 0, 2 * n))])
-        program.add_text(
-            _EACH.format(n=n, inputs=2 * n, outputs=self.size, loads=_LOADS, passed=_PASSED)
-        )
-        program.compile()
+        key = (quantity, folded(numbers))
+        if key not in fast.programs:
+            fast.programs[key] = _compile(quantity, fast, numbers, n)
+        self._program = program = fast.programs[key]
+        self.size = program.sizes["formula"]
         kinds = [c_int64, *[c_void_p] * 9, c_double, c_double]
         self._each = program.function("each", *kinds, result=c_int64)
         self._formula = program.function("formula", *[c_void_p] * 5)
-        self._q = np.zeros(nq)
+        self.cursor = fast.cursor()
+        self._q, self._out = np.zeros(nq), np.zeros(self.size)
         self._target, self._input = np.zeros(n), np.zeros(2 * n)
-        self._out = np.zeros(self.size)
         self._first, self._second = self._input[:n], self._input[n:]
         self._shape = (n,)
         # a single pointer costs a call from Python far less than twelve arguments
-        arguments = self._arguments(self._target[None], self._input[None], self._out[None])
         self._once = program.function("once", c_void_p, result=c_int64)
+        arguments = self._arguments(self._target[None], self._input[None], self._out[None])
         self._packed = np.array(
-            [
-                value if isinstance(value, int) else np.float64(value).view(np.int64)
-                for value in arguments
-            ],
-            dtype=np.int64,
+            [x if isinstance(x, int) else np.float64(x).view(np.int64) for x in arguments]
         )
         self._packed_at = self._packed.ctypes.data
 
@@ -149,7 +138,11 @@ class Formula:
         shape = self._shape
         for buffer, array in ((self._second, x), (self._first, v_a), (self._target, q_a)):
             if array is not None:
-                if array.__class__ is not np.ndarray or array.shape != shape:
+                if (
+                    array.__class__ is not np.ndarray
+                    or array.shape != shape
+                    or array.dtype is not _FLOAT
+                ):
                     return None
                 buffer[:] = array
         return self._out.copy() if self._once(self._packed_at) == 1 else None
@@ -173,10 +166,23 @@ class Formula:
 
     def _arguments(self, targets: Array, inputs: Array, out: Array) -> tuple[int | float, ...]:
         fast = self._fast
-        arrays = (fast.geometry.numbers, self._numbers, targets, inputs, fast.at, fast.work)
-        addresses = [array.ctypes.data for array in (*arrays, self._q, out)]
+        arrays = (fast.geometry.numbers, self._numbers, targets, inputs)
+        memory = (self.cursor.at, self.cursor.work, self._q, out)
+        addresses = [array.ctypes.data for array in (*arrays, *memory)]
         return (len(targets), fast.address, *addresses, *fast.bounds)
 
 
-class TooLongError(Exception):
-    """A formula has so many operations that compiling it would take minutes."""
+def _compile(quantity: str, fast: FastClosure, numbers: Array, n: int) -> Program:
+    tape = Tape()
+    q, posture, loops = fast.trace(tape, 0, 2)
+    sweep = Sweep(posture, loops, Constants(tape, 1, numbers), q, tape.loads(3, 0, n))
+    outputs = QUANTITIES[quantity](sweep, tape.loads(3, n, n))
+    program = Program()
+    program.add("formula", 4, outputs)
+    tape = Tape()  # what is not finite is left to the checks that name it
+    program.add("scan", 2, [largest([*tape.loads(0, 0, n), *tape.loads(1, 0, 2 * n)])])
+    program.add_text(
+        _EACH.format(n=n, inputs=2 * n, outputs=len(outputs), loads=_LOADS, passed=_PASSED)
+    )
+    program.compile()
+    return program

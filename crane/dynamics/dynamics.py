@@ -3,13 +3,14 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.dynamics.compiled import Formula, TooLongError
+from crane.dynamics.compiled import Formula
 from crane.dynamics.elements import JointForces
 from crane.dynamics.traced import numbers_of
 from crane.dynamics.tree import TreeDynamics
 from crane.errors import InputError, known
 from crane.machine import Machine
 from crane.samples import Array, as_samples
+from crane.straight import TooLongError
 
 FORMULATIONS = ("exact",)
 PATHS = ("compiled", "pinocchio")
@@ -49,14 +50,17 @@ class Dynamics:
         ):
             if name not in names:
                 raise InputError(f"{what} '{name}' is unknown, {known(names, name)}")
+        if not isinstance(machine, Machine):
+            raise InputError(f"{machine!r} is not a machine, load it with crane.load")
         self.machine = machine
         self.forces = JointForces(machine)
-        self.path = path
+        self.path = path if machine.closure.compiled else "pinocchio"
         self.tree = TreeDynamics(machine, self.forces)
         self._formulas: dict[str, Formula | None] = {}
-        self.numbers = np.ascontiguousarray(
-            numbers_of(machine, machine.closure.fast.geometry, self.forces)
-        )
+        self.numbers = np.zeros(0)
+        if self.path == "compiled":
+            geometry = machine.closure.fast.geometry
+            self.numbers = np.ascontiguousarray(numbers_of(machine, geometry, self.forces))
 
     @property
     def parameters(self) -> Array:
@@ -65,9 +69,7 @@ class Dynamics:
         Ten per body about its joint frame's origin: m, m c_x, m c_y, m c_z, I_xx, I_xy, I_yy,
         I_xz, I_yz, I_zz [kg, kg m, kg m2].
         """
-        return np.concatenate(
-            [inertia.toDynamicParameters() for inertia in list(self.machine.model.inertias)[1:]]
-        )
+        return self.tree.parameters
 
     def inverse(
         self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike, friction: bool = False
@@ -188,6 +190,10 @@ class Dynamics:
         size = 10 * (self.machine.model.njoints - 1)
         return self._evaluate("regressor", (self._n, size), q_a, v_a, a_a, "a_a")
 
+    def path_of(self, quantity: str = "forward") -> str:
+        """Which path computes a quantity of `crane.dynamics.compiled.QUANTITIES`."""
+        return "pinocchio" if self._formula(quantity) is None else "compiled"
+
     def at(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
         """A quantity of one sample at a posture that is closed already.
 
@@ -279,7 +285,8 @@ class Dynamics:
         while done < len(targets):
             done += formula.each(targets[done:], rows[done:], out[done:])
             if done < len(targets):
-                q = closure.reach(targets[done], f" (sample {done})" if stacked else "")
+                sample = f" (sample {done})" if stacked else ""
+                q = closure.reach(formula.cursor, targets[done], sample)
                 out[done] = formula.at(q, rows[done])
                 done += 1
         return out

@@ -81,7 +81,7 @@ class Sweep:
 
     @cached_property
     def _columns(self) -> list[list[tuple[Vector, Vector]]]:
-        """Per body the columns dV/dv_A (linear at the world's origin, angular), the drift's last."""
+        """Per body dV/dv_A (linear at the world's origin, angular) by column, then the drift."""
         columns: list[list[tuple[Vector, Vector]]] = [[([0.0] * 3, [0.0] * 3)] * (self._n + 1)]
         for i in range(1, self._size):
             linear, angular = self._posture.columns[i]

@@ -35,8 +35,16 @@ class TreeDynamics:
     """
 
     def __init__(self, machine: Machine, forces: JointForces):
-        self._model, self._data = machine.model, machine.model.createData()
+        # a copy, so that parameters stay those of this moment
+        self._model = pin.Model(machine.model)
+        self._data = self._model.createData()
         self._closure, self._forces = machine.closure, forces
+
+    @property
+    def parameters(self) -> Array:
+        """See `Dynamics.parameters`."""
+        inertias = list(self._model.inertias)[1:]
+        return np.concatenate([inertia.toDynamicParameters() for inertia in inertias])
 
     def at(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
         """A quantity of one sample; see `QUANTITIES` for x.

@@ -7,8 +7,8 @@ from typing import Any
 
 from crane.straight.scalar import Expression, Number
 
-# Sums may be reordered and products fused; NaN and infinity stay honest.
-_FAST = "reassoc nsz arcp contract"
+# Products may be fused with sums. Reordering sums would gain nothing and let NaN cancel.
+_FAST = "nsz arcp contract"
 _CALLS = {
     "sin": "@sin", "cos": "@cos", "tanh": "@tanh", "sqrt": "@llvm.sqrt.f64",
     "abs": "@llvm.fabs.f64", "maximum": "@larger", "copysign": "@llvm.copysign.f64",
@@ -31,16 +31,33 @@ define internal double @larger(double %a, double %b) alwaysinline {
 """
 
 
+MOST = 60_000  # operations of a function; longer ones take minutes to compile
+
+
+class TooLongError(Exception):
+    """A function has more than `MOST` operations."""
+
+
 class Program:
-    """Straight-line functions f(in_0, in_1, ..., out) of arrays, and loops that call them."""
+    """Straight-line functions f(in_0, in_1, ..., out) of arrays, and loops that call them.
+
+    Attributes:
+        sizes: Number of outputs of each function.
+    """
 
     def __init__(self) -> None:
         self._texts = [_DECLARATIONS]
+        self.sizes: dict[str, int] = {}
         self._engine: Any = None
 
     def add(self, name: str, arrays: int, outputs: Sequence[Number]) -> None:
-        """Add a function: `arrays` arguments that are read, and one that takes the outputs."""
+        """Add a function: `arrays` arguments that are read, and one that takes the outputs.
+
+        Raises:
+            TooLongError: It has too many operations.
+        """
         self._texts.append(_function(name, arrays, outputs))
+        self.sizes[name] = len(outputs)
 
     def add_text(self, text: str) -> None:
         """Add a function written in LLVM's language."""
@@ -84,7 +101,10 @@ def _function(name: str, arrays: int, outputs: Sequence[Number]) -> str:
     lines = [f"define void @{name}({', '.join([*arguments, 'ptr noalias %out'])}) {{"]
     tapes = {value.tape for value in outputs if isinstance(value, Expression)}
     operations = tapes.pop().operations if tapes else []
-    for index in _needed(operations, outputs):
+    needed = _needed(operations, outputs)
+    if len(needed) > MOST:
+        raise TooLongError
+    for index in needed:
         kind, *operands = operations[index]
         if kind == "load":
             array, at = operands

@@ -23,13 +23,15 @@ class Tape:
 
     def __init__(self) -> None:
         self.operations: list[tuple] = []
-        self._index: dict[tuple, int] = {}
+        self._index: dict[tuple[object, ...], int] = {}
 
     def add(self, *operation: object) -> "Expression":
         """The expression of an operation, the old one if it is there already."""
-        index = self._index.get(operation)
+        # the constant 2.0 and operation number 2 are equal to Python
+        key = (*operation, *(type(operand) is float for operand in operation))
+        index = self._index.get(key)
         if index is None:
-            index = self._index[operation] = len(self.operations)
+            index = self._index[key] = len(self.operations)
             self.operations.append(operation)
         return Expression(self, index)
 
@@ -110,7 +112,7 @@ def maximum(a: Number, b: Number) -> Number:
         return a.tape.add("maximum", a.index, b.index if isinstance(b, Expression) else float(b))
     if isinstance(b, Expression):
         return maximum(b, a)
-    return max(a, b)
+    return math.nan if a != a or b != b else max(a, b)
 
 
 def largest(values: Iterable[Number]) -> Number:
@@ -211,6 +213,8 @@ def solve(
         length = apply("sqrt", column[0] * column[0] + below)
         if isinstance(column[0], Expression):
             length = with_sign_of(length, column[0])
+        elif column[0] < 0:
+            length = -length
         first = column[0] + length
         normal = [first, *column[1:]]
         factor = 1.0 / (length * first)

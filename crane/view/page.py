@@ -5,10 +5,12 @@ import json
 import webbrowser
 from html import escape
 from importlib.resources import files
+from math import cos, sin
 from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
 
+from crane.errors import OutputError
 from crane.machine import Machine
 from crane.output import replacing
 from crane.view.scene import TRACES, Scene, build_scene
@@ -16,7 +18,9 @@ from crane.view.scene import TRACES, Scene, build_scene
 if TYPE_CHECKING:
     from crane.recording import Recording
 
-# Directions from the machine to the camera; x forward, z up.
+SUFFIXES = (".html", ".htm")
+
+# Directions from the machine to the camera; x forward (see `Scene.heading`), z up.
 VIEWS = {"iso": (1.0, -1.6, 0.75), "side": (0.0, -1.0, 0.0), "front": (1.0, 0.0, 0.0)}
 
 
@@ -24,7 +28,8 @@ def write_page(machine: Machine, path: str | Path, recording: "Recording | None"
     """Write a machine, moving as recorded or in its home posture, as one HTML file.
 
     The page holds the viewer and the scene; nothing is loaded from anywhere. It plays the motion
-    in the recording's time, with a slider.
+    in the recording's time, with a slider. "front" looks at the machine from where its tip points
+    at the start, "side" at right angles to that, so at the plane of a crane.
 
     Args:
         machine: The machine.
@@ -38,8 +43,10 @@ def write_page(machine: Machine, path: str | Path, recording: "Recording | None"
         RecordingError: The recording lacks an active joint of the machine.
         ClosureError: The loops cannot be closed at a recorded sample.
         InputError: A posture is not finite.
-        OutputError: The file cannot be written.
+        OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
+    if Path(path).suffix.lower() not in SUFFIXES:
+        raise OutputError(f"{path}: a page is for a browser, end the name in .html")
     scene = build_scene(machine, recording)
     text = _html(scene, machine.name, "home posture" if recording is None else recording.task)
     with replacing(path) as part:
@@ -63,7 +70,7 @@ def _html(scene: Scene, name: str, task: str) -> str:
         "duration": scene.duration,
         "lower": scene.lower.tolist(),
         "upper": scene.upper.tolist(),
-        "views": VIEWS,
+        "views": {name: _turned(view, scene.heading) for name, view in VIEWS.items()},
         "traces": {name: f"#{TRACES[name]:06x}" for name in scene.traces},
     }
     blobs = [base64.b64encode(umsgpack.packb(c)).decode() for c in scene.commands]
@@ -75,6 +82,15 @@ def _html(scene: Scene, name: str, task: str) -> str:
         page=_script(about),
         commands=_script(blobs),
     )
+
+
+def _turned(view: tuple[float, float, float], heading: float) -> list[float]:
+    x, y, z = view
+    return [
+        x * cos(heading) - y * sin(heading),
+        x * sin(heading) + y * cos(heading),
+        z,
+    ]
 
 
 def _script(value: Any) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FixedLocator, MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
 
 from crane.errors import OutputError
@@ -53,6 +53,9 @@ STYLE: Any = {
     "pdf.fonttype": 42,
     "svg.hashsalt": "crane",
 }
+# Distances of words from the axes of a box [points], of which matplotlib adds the last by itself.
+TICK_OFFSET, LABEL_OFFSET, PAD_OFFSET = 8.0, 14.0, 8.0
+MOST_COLUMNS = 5  # joints beside each other
 # Least height of an axis, so that rounding noise of a joint at rest looks like rest.
 LEAST_SPAN = {"deg": 0.2, "mm": 0.2, "deg/s": 0.2, "mm/s": 0.2, "N m": 0.02, "N": 0.2}
 
@@ -90,23 +93,28 @@ def recording_figure(recording: Recording) -> Figure:
     """The figure of a recording.
 
     One column per active joint with its displacement, velocity and force over time, in degrees
-    and millimetres; where the channels tip_x, tip_y, tip_z exist, the path of the tip beside
-    them. References (channels reference_<joint>, reference_velocity_<joint>, reference_tip_x,
-    ...) are dashed; with one for the tip comes its distance from it.
+    and millimetres, many joints in several bands below each other; where the channels tip_x,
+    tip_y, tip_z exist, the path of the tip beside them. References (channels reference_<joint>,
+    reference_velocity_<joint>, reference_tip_x, ...) are dashed; with one for the tip comes its
+    distance from it.
     """
     tip, joints = points(recording, "tip"), recording.joints
     with mpl.rc_context(STYLE):
-        widths = [1.0] * len(joints) + [1.6] * (tip is not None)
+        bands = -(-len(joints) // MOST_COLUMNS)
+        columns = -(-len(joints) // bands)
+        widths = [1.0] * columns + [1.6] * (tip is not None)
         width = 2.4 * sum(widths) + 0.3
-        margin = 0.2 if tip is not None else 0.0  # the layout overlooks the label of the z axis
+        margin = 0.3 if tip is not None else 0.0  # the layout overlooks the label of the z axis
         layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0 - margin / width, 1.0))
-        figure = Figure(figsize=(width, 6.0), layout=layout)
-        grid = figure.add_gridspec(3, len(widths), width_ratios=widths)
-        for column, name in enumerate(joints):
-            for row, panel in enumerate(_panels(recording, column)):
-                axes = figure.add_subplot(grid[row, column])
+        figure = Figure(figsize=(width, 6.0 * bands), layout=layout)
+        grid = figure.add_gridspec(3 * bands, len(widths), width_ratios=widths)
+        for index, name in enumerate(joints):
+            band, column = divmod(index, columns)
+            beside = min(columns, len(joints) - band * columns)
+            for row, panel in enumerate(_panels(recording, index)):
+                axes = figure.add_subplot(grid[3 * band + row, column])
                 _draw_panel(axes, recording.time, panel)
-                _letter(axes, row * len(joints) + column)
+                _letter(axes, 3 * band * columns + row * beside + column)
                 if row == 0:
                     axes.set_title(_symbol(name))
                 if row == 2:
@@ -115,7 +123,7 @@ def recording_figure(recording: Recording) -> Figure:
                     axes.tick_params(labelbottom=False)
         if tip is not None:
             reference = points(recording, "reference_tip")
-            rows = slice(None) if reference is None else slice(2)
+            rows = slice(3) if reference is None else slice(2)
             space = figure.add_subplot(grid[rows, -1], projection="3d")
             _draw_path(space, tip, reference)
             _letter(space, 3 * len(joints))
@@ -183,7 +191,7 @@ def _draw_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
     """The path of the tip [m] in space, to scale, with its shadow on the ground of the box."""
     shown = tip if reference is None else np.vstack([tip, reference])
     low, high = shown.min(axis=0), shown.max(axis=0)
-    span = np.maximum(high - low, 0.3 * max(float((high - low).max()), 1e-3)) * 1.1
+    span = np.maximum(high - low, 0.4 * max(float((high - low).max()), 1e-2)) * 1.1
     low, high = (low + high - span) / 2, (low + high + span) / 2
     x, y, z = tip.T
     axes.plot(x, y, np.full_like(z, low[2]), color="#a8a8a8", linewidth=1.0, label="shadow")
@@ -197,11 +205,27 @@ def _draw_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="path of the tip")
     axes.set_box_aspect(span, zoom=0.88)
     axes.view_init(elev=24, azim=-60)
-    for axis, length in zip((axes.xaxis, axes.yaxis, axes.zaxis), span, strict=True):
-        axis.set_major_locator(MaxNLocator(4 if length > 0.5 * span.max() else 2))
+    for i, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):
+        axis.set_major_locator(FixedLocator(_ticks(low[i], high[i], span[i] / span.max())))
         axis.set_pane_color("#fafafa")
-    axes.tick_params(pad=0)
-    axes.zaxis.labelpad = 0
+        # matplotlib moves words away from an axis in proportion to the widths across it
+        across = float(np.delete(span, i).max() / span.max())
+        axis.set_tick_params(pad=TICK_OFFSET / across - PAD_OFFSET)
+        axis.labelpad = LABEL_OFFSET / across - PAD_OFFSET
+
+
+def _ticks(low: float, high: float, share: float) -> list[float]:
+    """Round values away from the ends, where other axes begin; few on a short axis."""
+    margin = 0.12 * (high - low)
+    low, high = low + margin, high - margin
+    least, most = (2, 3) if share > 0.5 else (1, 2)
+    inside: list[float] = []
+    for count in range(1, 9):  # how many fit between round values depends on where they lie
+        values = MaxNLocator(count, steps=[1, 2, 5, 10]).tick_values(low, high)
+        inside = [float(value) for value in values if low <= value <= high] or inside
+        if len(inside) >= least:
+            break
+    return inside[:: -(-len(inside) // most)]
 
 
 def _letter(axes: Axes, index: int) -> None:

@@ -32,6 +32,8 @@ class Scene:
         lower: (3,) lowest corner of everything that is drawn in any frame [m].
         upper: (3,) highest corner [m].
         traces: Names of the lines that are drawn, among `TRACES`.
+        heading: Angle about z from the x axis to where the tip points in the first frame, seen
+            from the first joint that moves it [rad]; 0 without a tip, or with one on that axis.
     """
 
     commands: Sequence[dict[str, Any]]
@@ -40,6 +42,7 @@ class Scene:
     lower: Array
     upper: Array
     traces: tuple[str, ...]
+    heading: float
 
 
 def build_scene(machine: Machine, recording: "Recording | None" = None) -> Scene:
@@ -82,6 +85,7 @@ def build_scene(machine: Machine, recording: "Recording | None" = None) -> Scene
         lower=lower,
         upper=upper,
         traces=tuple(lines),
+        heading=_heading(machine, q[0], float(np.linalg.norm(upper - lower))),
     )
 
 
@@ -151,6 +155,19 @@ def _lines(
     if machine.tip is not None:
         lines["tip"] = link_poses(machine, q, [machine.tip])[machine.tip][:, :3, 3]
     return lines
+
+
+def _heading(machine: Machine, q: Array, size: float) -> float:
+    if machine.tip is None:
+        return 0.0
+    data = machine.model.createData()
+    pin.framesForwardKinematics(machine.model, data, q)
+    frame = machine.frame(machine.tip)
+    joints = machine.model.supports[machine.model.frames[frame].parentJoint]
+    if len(joints) < 2:  # the tip stands still
+        return 0.0
+    x, y, _ = data.oMf[frame].translation - data.oMi[joints[1]].translation
+    return float(np.arctan2(y, x)) if np.hypot(x, y) > 1e-3 * size else 0.0
 
 
 def _bounds(

@@ -1,0 +1,512 @@
+"""Traced arithmetic and its machine code against numpy."""
+
+import gc
+import math
+import subprocess
+import sys
+import threading
+from ctypes import c_void_p
+
+import numpy as np
+import pytest
+
+from crane.straight import Expression, Program, Tape, largest, maximum
+from crane.straight.scalar import (
+    add,
+    apply,
+    cross,
+    dot,
+    product,
+    scale,
+    solve,
+    solve_positive,
+    subtract,
+    times,
+    with_sign_of,
+)
+
+NAN, INF = math.nan, math.inf
+X = (0.7, -1.9, 3.1, 0.25, -0.6, 12.0, 1.0, -1.0)
+
+
+class Function:
+    """f(in) -> out of one array, which keeps its program."""
+
+    def __init__(self, *functions):
+        self.program = Program()
+        self.sizes = []
+        for i, outputs in enumerate(functions):
+            self.program.add(f"f{i}", 1, outputs)
+            self.sizes.append(len(outputs))
+        self.program.compile()
+        self.calls = [
+            self.program.function(f"f{i}", c_void_p, c_void_p) for i in range(len(functions))
+        ]
+
+    def __call__(self, x, which=0):
+        x, out = np.array(x, dtype=np.float64), np.empty(self.sizes[which])
+        self.calls[which](x.ctypes.data, out.ctypes.data)
+        return out
+
+
+def run(formulas, x):
+    """formulas(list of loads) -> outputs, evaluated at x."""
+    return Function(formulas(Tape().loads(0, 0, len(x))))(x)
+
+
+# --- single operations -----------------------------------------------------------------------
+
+OPERATIONS = {
+    "x + y": lambda x, y: x + y,
+    "x + 2.5": lambda x, y: x + 2.5,
+    "2.5 + x": lambda x, y: 2.5 + x,
+    "x - y": lambda x, y: x - y,
+    "x - 2.5": lambda x, y: x - 2.5,
+    "2.5 - x": lambda x, y: 2.5 - x,
+    "0 - x": lambda x, y: 0.0 - x,
+    "x * y": lambda x, y: x * y,
+    "x * 2.5": lambda x, y: x * 2.5,
+    "2.5 * x": lambda x, y: 2.5 * x,
+    "-1 * x": lambda x, y: -1.0 * x,
+    "x / y": lambda x, y: x / y,
+    "x / 2.5": lambda x, y: x / 2.5,
+    "x / -1": lambda x, y: x / -1,
+    "2.5 / x": lambda x, y: 2.5 / x,
+    "-x": lambda x, y: -x,
+    "x x": lambda x, y: x * x,
+    "x / x": lambda x, y: x / x,
+    "integers": lambda x, y: 3 * x + 2 - y / 4 + (7 - x) + 5 / y,
+    "numpy": lambda x, y: np.float64(3) * x + np.float64(2) - y / np.float64(4),
+    "mixed": lambda x, y: (x + y) * (x - y) / (1.0 + x * x) - 0.5 * y * -x,
+}
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_operations_equal_those_of_numpy(name):
+    pairs = [(a, b) for a in X for b in X]
+    found = run(
+        lambda x: [OPERATIONS[name](x[i], x[j]) for i in range(len(X)) for j in range(len(X))], X
+    )
+    wanted = [OPERATIONS[name](a, b) for a, b in pairs]
+    np.testing.assert_allclose(found, wanted, rtol=1e-15, atol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["sin", "cos", "tanh", "sqrt", "abs"])
+def test_functions_equal_those_of_numpy(name):
+    x = [0.0, 1e-300, 1e-8, 0.3, 1.0, 2.0, 25.0, 1e5]
+    if name != "sqrt":
+        x += [-value for value in x]
+    wanted = getattr(np, name)(np.array(x))
+    found = run(lambda x: [apply(name, value) for value in x], x)
+    np.testing.assert_allclose(found, wanted, rtol=4e-16, atol=1e-16)
+    folded = run(lambda y: [y[0], *(apply(name, value) for value in x)], [0.0])
+    np.testing.assert_allclose(folded[1:], wanted, rtol=4e-16, atol=1e-16)
+
+
+def test_signs_are_copied():
+    x = [3.0, -2.0, 0.0, -0.0]
+    found = run(lambda x: [with_sign_of(m, s) for m in (*x, 5.0, -5.0, 2) for s in x], x)
+    wanted = [math.copysign(m, s) for m in (*x, 5.0, -5.0, 2) for s in x]
+    np.testing.assert_array_equal(found, wanted)
+    np.testing.assert_array_equal(np.signbit(found), np.signbit(wanted))
+
+
+def test_vectors_equal_those_of_numpy():
+    random = np.random.default_rng(0)
+    x = random.normal(size=24)
+    a, b, matrix = x[:3], x[3:6], x[6:15].reshape(3, 3)
+    other = x[15:].reshape(3, 3)
+
+    def formulas(x):
+        rows, more = ([x[s + 3 * r : s + 3 * r + 3] for r in range(3)] for s in (6, 15))
+        return [
+            dot(x[:3], x[3:6]),
+            *cross(x[:3], x[3:6]),
+            *add(x[:3], x[3:6], x[6:9]),
+            *scale(x[0], x[3:6]),
+            *subtract(x[:3], x[3:6]),
+            *times(rows, x[:3]),
+            *(value for row in product(rows, more) for value in row),
+        ]
+
+    wanted = np.concatenate(
+        [[a @ b], np.cross(a, b), a + b + x[6:9], x[0] * b, a - b, matrix @ a]
+        + [(matrix @ other).ravel()]
+    )
+    np.testing.assert_allclose(run(formulas, x), wanted, rtol=1e-14, atol=1e-15)
+    with pytest.raises(ValueError):
+        dot([1.0, 2.0], [1.0])
+
+
+# --- what is folded --------------------------------------------------------------------------
+
+
+def test_what_is_known_is_folded():
+    tape = Tape()
+    x, y = tape.loads(0, 0, 2)
+    before = len(tape.operations)
+    minus = -x
+    assert (-minus).index == x.index
+    for same in (x + 0, 0 + x, x - 0, x + 0.0, x * 1, 1.0 * x, x / 1, x + np.float64(0)):
+        assert same.index == x.index
+    for nothing in (x * 0, 0.0 * x, 0 / x, x - x, dot([0.0, x], [y, 0.0])):
+        assert nothing == 0.0 and not isinstance(nothing, Expression)
+    assert dot([1.0, 0.0, 0.0], [x, y, y]).index == x.index
+    assert len(tape.operations) == before + 1  # the one negation
+    assert (x * -1).index == (-x).index == (0 - x).index == (x / -1).index
+
+
+def test_equal_operations_are_done_once():
+    tape = Tape()
+    x, y = tape.loads(0, 0, 2)
+    assert tape.load(0, 1).index == y.index
+    first = apply("sin", x * y + 2.0) * x
+    count = len(tape.operations)
+    assert (x * apply("sin", 2.0 + y * x)).index == first.index
+    assert len(tape.operations) == count
+    assert (x - y).index != (y - x).index
+    assert (x / y).index != (y / x).index
+
+
+def test_constants_and_operations_of_the_same_number_differ():
+    """Operation number 1 is not the constant 1."""
+
+    def formulas(x):
+        return [
+            value
+            for k in range(len(x))
+            for pair in (
+                (x[0] + float(k), x[0] + x[k]),
+                (x[0] * float(k), x[0] * x[k]),
+                (float(k) - x[3], x[k] - x[3]),
+                (float(k) / x[3], x[k] / x[3]),
+                (maximum(x[0], float(k)), maximum(x[0], x[k])),
+                (with_sign_of(float(k), x[1]), with_sign_of(x[k], x[1])),
+            )
+            for value in pair
+        ]
+
+    x = [10.5, -20.5, 30.5, 40.5, 50.5]
+    wanted = [
+        value
+        for k in range(len(x))
+        for pair in (
+            (x[0] + k, x[0] + x[k]),
+            (x[0] * k, x[0] * x[k]),
+            (k - x[3], x[k] - x[3]),
+            (k / x[3], x[k] / x[3]),
+            (max(x[0], k), max(x[0], x[k])),
+            (-k, -abs(x[k])),
+        )
+        for value in pair
+    ]
+    np.testing.assert_allclose(run(formulas, x), wanted, rtol=1e-15)
+    backwards = run(lambda x: formulas(x)[::-1], x)
+    np.testing.assert_allclose(backwards, wanted[::-1], rtol=1e-15)
+
+
+# --- what is not finite ----------------------------------------------------------------------
+
+ODD = (NAN, INF, -INF, 0.0, 1.0, -2.0)
+
+
+def honest(a, b):
+    return NAN if math.isnan(a) or math.isnan(b) else max(a, b)
+
+
+def test_nan_wins_among_maxima():
+    found = run(lambda x: [maximum(a, b) for a in x for b in x], ODD)
+    np.testing.assert_array_equal(found, [honest(a, b) for a in ODD for b in ODD])
+    for constant in ODD:
+        found = run(
+            lambda x, c=constant: [m for a in x for m in (maximum(a, c), maximum(c, a))], ODD
+        )
+        np.testing.assert_array_equal(found, np.repeat([honest(a, constant) for a in ODD], 2))
+
+
+def test_nan_wins_among_constants():
+    for a in ODD:
+        for b in ODD:
+            np.testing.assert_equal(float(maximum(a, b)), honest(a, b))
+    np.testing.assert_equal(float(largest([NAN])), NAN)
+    np.testing.assert_equal(float(largest([3.0, NAN, 1.0])), NAN)
+
+
+def test_largest_is_of_absolute_values_and_lets_nothing_pass():
+    assert largest([]) == 0.0 and largest([-3.0, 2.0]) == 3.0
+    function = Function([largest(Tape().loads(0, 0, 5))])
+    random = np.random.default_rng(1)
+    for _ in range(20):
+        x = random.normal(size=5)
+        assert function(x)[0] == np.abs(x).max()
+    for at in range(5):
+        for odd, wanted in ((NAN, NAN), (INF, INF), (-INF, INF), (-1e308, 1e308)):
+            x = np.linspace(-1, 1, 5)
+            x[at] = odd
+            np.testing.assert_equal(function(x)[0], wanted)
+            x[(at + 2) % 5] = NAN
+            assert math.isnan(function(x)[0])
+
+
+def test_what_is_not_finite_survives_sums_and_products():
+    x = (NAN, INF, -INF)
+    found = run(lambda x: [f(v) for v in x for f in CARRIED], x)
+    np.testing.assert_array_equal(found, [f(v) for v in x for f in CARRIED])
+    assert np.isnan(run(lambda x: [(x[0] - x[1]) + 1.0], (INF, INF))).all()
+    assert np.isnan(run(lambda x: [x[0] * x[1], x[0] / x[0]], (INF, 0.0))).all()
+    assert run(lambda x: [1.0 / x[0]], (0.0,))[0] == INF
+    constants = run(lambda x: [x[0] + INF, x[0] * NAN, INF - x[0], NAN], (1.0,))
+    np.testing.assert_array_equal(constants, [INF, NAN, INF, NAN])
+
+
+CARRIED = (
+    lambda v: v + 1.0,
+    lambda v: v * 2.0,
+    lambda v: 1.0 - v,
+    lambda v: -v,
+    lambda v: 3 * v - 5,
+)
+
+
+def test_nan_does_not_cancel():
+    def formulas(x):
+        return [(x[0] + x[1]) - x[0], x[0] - (x[0] - x[1]), (2.0 * x[0] + x[1]) - x[0] * 2.0]
+
+    assert np.isnan(run(formulas, (NAN, 1.0))).all()
+
+
+# --- linear systems --------------------------------------------------------------------------
+
+
+def solved(matrix, right):
+    """X and the determinant by traced formulas."""
+    k, width = right.shape
+
+    def formulas(x):
+        rows = [x[k * i : k * i + k] for i in range(k)]
+        sides = [x[k * k + width * i : k * k + width * (i + 1)] for i in range(k)]
+        found, determinant = solve(rows, sides)
+        return [*(value for row in found for value in row), determinant]
+
+    return Function(formulas(Tape().loads(0, 0, k * k + k * width)))
+
+
+def check(function, matrix, right, tolerance=1e-12):
+    out = function([*matrix.ravel(), *right.ravel()])
+    wanted = np.linalg.solve(matrix, right)
+    bound = tolerance * max(1.0, np.linalg.cond(matrix) / 1e2) * np.abs(wanted).max()
+    assert np.abs(out[:-1].reshape(right.shape) - wanted).max() <= bound
+    assert out[-1] == pytest.approx(np.linalg.det(matrix), rel=1e-12 * np.linalg.cond(matrix))
+    assert np.sign(out[-1]) == np.linalg.slogdet(matrix)[0]
+
+
+@pytest.mark.parametrize("k", range(1, 9))
+def test_solve_equals_numpy(k):
+    random = np.random.default_rng(k)
+    width = 1 + k % 3
+    function = solved(np.eye(k), np.zeros((k, width)))
+    signs = set()
+    for trial in range(60):
+        matrix, right = random.normal(size=(k, k)), random.normal(size=(k, width))
+        if np.linalg.cond(matrix) > 1e3:
+            continue
+        if trial % 3 == 0:
+            matrix *= 10.0 ** random.integers(-3, 4)
+        check(function, matrix, right)
+        signs.add(np.linalg.slogdet(matrix)[0])
+    assert signs == {1.0, -1.0}
+
+
+@pytest.mark.parametrize("k", range(2, 9))
+def test_solve_needs_no_pivots(k):
+    random = np.random.default_rng(10 + k)
+    function = solved(np.eye(k), np.zeros((k, 2)))
+    right = random.normal(size=(k, 2))
+    well = np.eye(k) + 0.3 * random.normal(size=(k, k))
+    signs = random.choice([-1.0, 1.0], k)
+    for matrix in (
+        np.eye(k), -np.eye(k), np.diag(signs), np.fliplr(np.eye(k)),
+        np.roll(np.eye(k), 1, axis=0), np.eye(k)[random.permutation(k)] * signs,
+        np.triu(well), np.tril(well), -np.triu(well), np.roll(np.triu(well), 1, axis=0),
+        well - np.diag(np.diag(well)) + np.roll(np.eye(k), 1, axis=1),
+    ):  # fmt: skip
+        if abs(np.linalg.det(matrix)) > 1e-6:
+            check(function, matrix, right)
+    zero_first = well.copy()
+    zero_first[0, 0] = 0.0  # a zero leading pivot, then one that is nearly zero
+    check(function, zero_first, right)
+    zero_first[0, 0] = 1e-17
+    check(function, zero_first, right)
+
+
+@pytest.mark.parametrize("k", range(1, 7))
+def test_solve_folds_what_it_knows(k):
+    """Constants of every sign among the entries, as the loops of machines have them."""
+    random = np.random.default_rng(20 + k)
+    tested = 0
+    while tested < 6:
+        matrix, right = random.normal(size=(k, k)), random.normal(size=(k, 2))
+        known = random.random((k, k)) < 0.5
+        matrix[known] = random.choice([-1.0, 0.0, 1.0, 0.5], known.sum())
+        if np.linalg.cond(matrix) > 50:
+            continue
+        right[random.random((k, 2)) < 0.4] = 0.0
+
+        def formulas(x, matrix=matrix, right=right, known=known):
+            rows = [
+                [float(matrix[i, j]) if known[i, j] else x[k * i + j] for j in range(k)]
+                for i in range(k)
+            ]
+            found, determinant = solve(rows, right.tolist())
+            return [*(value for row in found for value in row), determinant]
+
+        out = run(formulas, matrix.ravel())
+        wanted = np.linalg.solve(matrix, right)
+        np.testing.assert_allclose(out[:-1].reshape(k, 2), wanted, rtol=0, atol=1e-12)
+        assert out[-1] == pytest.approx(np.linalg.det(matrix), rel=1e-12)
+        tested += 1
+
+
+@pytest.mark.parametrize("small", [0.0, 1e-12, 1e-9, 1e-5, 0.3])
+@pytest.mark.parametrize("pivot", [-1.0, 1.0])
+def test_a_constant_pivot_above_small_entries(pivot, small):
+    matrix = np.array([[pivot, 0.3, 0.2], [small, 2.0, 0.5], [-small, 0.1, 3.0]])
+
+    def formulas(x):
+        rows = [[pivot, x[1], x[2]], x[3:6], x[6:9]]
+        found, determinant = solve(rows, [[1.0], [2.0], [3.0]])
+        return [*(row[0] for row in found), determinant]
+
+    out = run(formulas, matrix.ravel())
+    np.testing.assert_allclose(out[:3], np.linalg.solve(matrix, [1.0, 2.0, 3.0]), rtol=1e-12)
+    assert out[3] == pytest.approx(np.linalg.det(matrix), rel=1e-12)
+
+
+def test_solve_of_constants_needs_no_tape():
+    random = np.random.default_rng(3)
+    for k in range(1, 6):
+        matrix, right = random.normal(size=(k, k)) - 2 * np.eye(k), random.normal(size=(k, 2))
+        found, determinant = solve(matrix.tolist(), right.tolist())
+        np.testing.assert_allclose(found, np.linalg.solve(matrix, right), rtol=1e-11)
+        assert determinant == pytest.approx(np.linalg.det(matrix), rel=1e-12)
+
+
+def test_singular_matrices_are_not_finite():
+    for k in range(1, 6):
+        function = solved(np.eye(k), np.zeros((k, 1)))
+        for fill in (0.0, NAN):
+            out = function([fill] * (k * k) + [1.0] * k)
+            assert not np.isfinite(out[:-1]).any()
+            assert not abs(out[-1]) > 0
+        matrix = np.eye(k)
+        matrix[k - 1, 0] = NAN
+        assert np.isnan(function([*matrix.ravel(), *np.ones(k)])).any()
+
+
+@pytest.mark.parametrize("k", range(1, 9))
+def test_solve_positive_equals_numpy(k):
+    random = np.random.default_rng(k)
+
+    def formulas(x):
+        return solve_positive([x[k * i : k * i + k] for i in range(k)], x[k * k :])
+
+    function = Function(formulas(Tape().loads(0, 0, k * k + k)))
+    for trial in range(30):
+        root = random.normal(size=(k, k))
+        matrix, right = root @ root.T + 0.1 * np.eye(k), random.normal(size=k)
+        scales = 10.0 ** random.uniform(-2, 2, k) if trial % 2 else np.ones(k)
+        matrix = scales[:, None] * matrix * scales
+        wanted = np.linalg.solve(matrix, right)
+        found = function([*matrix.ravel(), *right])
+        assert np.abs((found - wanted) * scales).max() <= 1e-12 * np.abs(wanted * scales).max()
+    exact = solve_positive(matrix.tolist(), right.tolist())
+    np.testing.assert_allclose(exact, found, rtol=1e-10)
+
+
+# --- programs --------------------------------------------------------------------------------
+
+
+def test_functions_of_constants_and_of_nothing():
+    assert Function([2.0, 0.0, -1, NAN])([])[:3].tolist() == [2.0, 0.0, -1.0]
+    assert len(Function([])([])) == 0
+    x = Tape().load(0, 3)
+    np.testing.assert_array_equal(Function([1e-310, x, x, -0.0])([0, 0, 0, 7]), [1e-310, 7, 7, 0])
+
+
+def test_arguments_are_told_apart():
+    tape = Tape()
+    program = Program()
+    program.add("f", 3, [tape.load(2, 0) - tape.load(0, 1) * tape.load(1, 2)])
+    program.compile()
+    arrays = [np.arange(3) + 10.0 * i for i in range(3)]
+    out = np.empty(1)
+    call = program.function("f", *[c_void_p] * 4)
+    call(*(array.ctypes.data for array in arrays), out.ctypes.data)
+    assert out[0] == 20.0 - 1.0 * 12.0
+
+
+def test_functions_of_one_program_share_it_and_programs_do_not_mix():
+    x, y = Tape().load(0, 0), Tape().load(0, 0)
+    one = Function([x + 1.5], [x * 3.0, x * x])
+    two = Function([y - 1.5])
+    for _ in range(2):
+        assert one([2.0])[0] == 3.5
+        np.testing.assert_array_equal(one([2.0], 1), [6.0, 4.0])
+        assert two([2.0])[0] == 0.5
+        many = [Function([Tape().load(0, 0) * (i + 0.5)]) for i in range(20)]
+        assert [f([2.0])[0] for f in many] == [2 * i + 1.0 for i in range(20)]
+        del many
+        gc.collect()
+
+
+def test_a_program_may_end_before_others():
+    code = """
+import gc
+import numpy as np
+import crane
+machine = crane.load("mini_forwarder")
+home = np.array(machine.home[machine.closure.active])
+rest = np.zeros(3)
+first = crane.Dynamics(machine)
+wanted = first.inverse(home, rest, rest)
+for _ in range(3):
+    other = crane.Dynamics(machine)
+    other.gravity(home)
+    other.gravity(home[None])
+    del other
+    gc.collect()
+    assert (first.inverse(home, rest, rest) == wanted).all()
+del first
+gc.collect()
+second = crane.Dynamics(machine.with_payload(crane.Payload("link7_tip", 0.1)))
+del machine
+gc.collect()
+assert np.abs(second.inverse(home, rest, rest) - wanted).max() > 0.1
+"""
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_threads_call_at_once():
+    tape = Tape()
+    value = x = tape.load(0, 0)
+    for k in range(200):
+        value = apply("sin", value * 1.1 + k) + 0.5 * x
+    function = Function([value])
+    inputs = np.random.default_rng(0).normal(size=(4, 300))
+    alone = np.array([[function([x])[0] for x in row] for row in inputs])
+    together = np.zeros_like(alone)
+    start = threading.Barrier(4)
+
+    def work(i):
+        start.wait()
+        together[i] = [function([x])[0] for x in inputs[i]]
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    np.testing.assert_array_equal(together, alone)
