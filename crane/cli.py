@@ -144,8 +144,9 @@ def check(file: MachineName) -> None:
         _say(f"warning: {warning.message}")
     residual = float(loaded.closure.residual(loaded.home))
     loops = len(loaded.closure.equations.loops)
+    freedom = loaded.closure.degrees_of_freedom
     print(
-        f"{loaded.name}: {len(loaded.joints)} joints, {loops} loops, {len(loaded.active)} "
+        f"{loaded.name}: {len(loaded.joints)} joints, {loops} loops, {freedom} "
         f"degrees of freedom, loops closed to {residual:.1e} m at home"
     )
     if caught:

@@ -17,9 +17,9 @@ from crane.straight.scalar import add, dot, scale
 
 # State: q (nq), v_A (n), the controller's (k), work, dissipated energy.
 # observe gives the state's rate and then [tau, friction, kinetic, potential]; finish the next
-# state and by how much a joint moves at most; newton see `FastClosure`.
+# state and by how much a joint moves at most; close_loops see `FastClosure`.
 _RUN = """
-define i64 @run(i64 %steps, ptr %newton, ptr %geometry, ptr %numbers, ptr %control, ptr %refs,
+define i64 @run(i64 %steps, ptr %close_loops, ptr %geometry, ptr %numbers, ptr %control, ptr %refs,
                 ptr %state, ptr %work, ptr %out, ptr %h, double %rounded, double %closed) {{
 entry:
   %next = getelementptr double, ptr %work, i64 0
@@ -30,9 +30,6 @@ entry:
   %k3 = getelementptr double, ptr %k2, i64 {size}
   %k4 = getelementptr double, ptr %k3, i64 {size}
   %result = getelementptr double, ptr %k4, i64 {size}
-  %change_at = getelementptr double, ptr %result, i64 1
-  %good_at = getelementptr double, ptr %result, i64 2
-  %corrected = getelementptr double, ptr %result, i64 3
   %half = getelementptr double, ptr %h, i64 1
   br label %step
 step:
@@ -61,32 +58,10 @@ stages:
   %calm = fcmp olt double %peak, 1.0
   br i1 %calm, label %close, label %done
 close:
-  %k = phi i64 [0, %stages], [%kn, %again]
-  %before = phi double [0x7FF0000000000000, %stages], [%residual, %again]
-  call void %newton(ptr %geometry, ptr %next, ptr %result)
-  %residual = load double, ptr %result
-  %tight = fcmp ole double %residual, %rounded
-  br i1 %tight, label %judge, label %maybe
-maybe:
-  %near = fcmp ole double %residual, %closed
-  %quarter = fmul double %before, 0.25
-  %slow = fcmp ogt double %residual, %quarter
-  %stalled = and i1 %near, %slow
-  br i1 %stalled, label %judge, label %correct
-correct:
-  %change = load double, ptr %change_at
-  %fine = fcmp olt double %change, 0.1
-  %kn = add i64 %k, 1
-  %time = icmp slt i64 %kn, 8
-  %on = and i1 %fine, %time
-  br i1 %on, label %again, label %done
-again:
-  call void @llvm.memcpy.p0.p0.i64(ptr %next, ptr %corrected, i64 {bytes}, i1 false)
-  br label %close
-judge:
-  %good = load double, ptr %good_at
-  %regular = fcmp ogt double %good, 0.0
-  br i1 %regular, label %accept, label %done
+  %got = call i64 %close_loops(ptr %geometry, ptr %next, ptr %result,
+                               double %rounded, double %closed)
+  %ok = icmp eq i64 %got, 1
+  br i1 %ok, label %accept, label %done
 accept:
   call void @llvm.memcpy.p0.p0.i64(ptr %state, ptr %next, i64 {size_bytes}, i1 false)
   %i1 = add i64 %i, 1
@@ -215,7 +190,6 @@ class CompiledStepper:
                 row=self._size + self._seen,
                 size_bytes=8 * self._size,
                 seen_bytes=8 * self._seen,
-                bytes=8 * nq,
                 refs=control.columns,
                 two_refs=2 * control.columns,
             )
@@ -242,7 +216,7 @@ class CompiledStepper:
         arrays = (self._fast.geometry.numbers, self._numbers, settings, references)
         return int(
             self._run(
-                len(times), self._fast.newton_address, *(array.ctypes.data for array in arrays),
+                len(times), self._fast.close_address, *(array.ctypes.data for array in arrays),
                 state.ctypes.data, self._work.ctypes.data, out.ctypes.data, steps.ctypes.data,
                 *self._fast.bounds,
             )
@@ -260,7 +234,7 @@ class CompiledStepper:
         mean = add(k1, scale(2.0, add(k2, k3)), k4)
         after = add(state, scale(h * (1.0 / 6.0), mean))
         # the largest of all changes, so that NaN and infinity anywhere show
-        move = h * largest([*k1[:nq], *scale(1e-9, mean)])
+        move = h * largest([*k1[:nq], *k2[:nq], *k3[:nq], *scale(1e-9, mean)])
         program.add("finish", 6, [*after, move])
 
 

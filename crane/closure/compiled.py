@@ -17,9 +17,51 @@ _STEEP = 1e3  # an entry of gamma above this is looked at closely by `Branch`
 _NEAR = 1e-6  # residual of a guess that is as good as closed
 _SURPLUS = 1e-9  # residual of redundant equations, likewise
 
+# Newton's method in place: 1 where it closes the loops on the home branch, else 0. newton gives
+# [residual, change, regular, corrected q, gamma].
+_CLOSE = """
+define i64 @close(ptr %numbers, ptr %q, ptr %result, double %rounded, double %closed) {{
+entry:
+  %change_at = getelementptr double, ptr %result, i64 1
+  %good_at = getelementptr double, ptr %result, i64 2
+  %next_at = getelementptr double, ptr %result, i64 3
+  br label %newton
+newton:
+  %k = phi i64 [0, %entry], [%k1, %again]
+  %before = phi double [0x7FF0000000000000, %entry], [%residual, %again]
+  call void @newton(ptr %numbers, ptr %q, ptr %result)
+  %residual = load double, ptr %result
+  %tight = fcmp ole double %residual, %rounded
+  br i1 %tight, label %judge, label %maybe
+maybe:
+  %near = fcmp ole double %residual, %closed
+  %quarter = fmul double %before, 0.25
+  %slow = fcmp ogt double %residual, %quarter
+  %stalled = and i1 %near, %slow
+  br i1 %stalled, label %judge, label %step
+step:
+  %change = load double, ptr %change_at
+  %fine = fcmp olt double %change, 1.0
+  %k1 = add i64 %k, 1
+  %time = icmp slt i64 %k1, 8
+  %on = and i1 %fine, %time
+  br i1 %on, label %again, label %fail
+again:
+  call void @llvm.memcpy.p0.p0.i64(ptr %q, ptr %next_at, i64 {bytes}, i1 false)
+  br label %newton
+judge:
+  %good = load double, ptr %good_at
+  %regular = fcmp ogt double %good, 0.0
+  br i1 %regular, label %pass, label %fail
+pass:
+  ret i64 1
+fail:
+  ret i64 0
+}}
+"""
+
 # Follows a stack of targets as `Branch` does while a single step leads from one to the next, and
 # stops where it does not: `Branch` takes that sample. `at` holds [q, gamma] of the last sample.
-# newton gives [residual, change, regular, corrected q, gamma].
 _FOLLOW = """
 define i64 @follow(i64 %count, ptr %numbers, ptr %targets, ptr %at, ptr %work, ptr %out,
                    double %rounded, double %closed) {{
@@ -29,8 +71,6 @@ entry:
   %move_at = getelementptr double, ptr %first, i64 {nq}
   %verdict = getelementptr double, ptr %move_at, i64 1
   %result = getelementptr double, ptr %verdict, i64 1
-  %change_at = getelementptr double, ptr %result, i64 1
-  %good_at = getelementptr double, ptr %result, i64 2
   %next_at = getelementptr double, ptr %result, i64 3
   %gamma_new = getelementptr double, ptr %next_at, i64 {nq}
   %gamma_at = getelementptr double, ptr %at, i64 {nq}
@@ -48,34 +88,9 @@ begin:
   br i1 %small, label %start, label %done
 start:
   call void @llvm.memcpy.p0.p0.i64(ptr %guess, ptr %first, i64 {bytes}, i1 false)
-  br label %newton
-newton:
-  %k = phi i64 [0, %start], [%k1, %again]
-  %before = phi double [0x7FF0000000000000, %start], [%residual, %again]
-  call void @newton(ptr %numbers, ptr %guess, ptr %result)
-  %residual = load double, ptr %result
-  %tight = fcmp ole double %residual, %rounded
-  br i1 %tight, label %judge, label %maybe
-maybe:
-  %near = fcmp ole double %residual, %closed
-  %quarter = fmul double %before, 0.25
-  %slow = fcmp ogt double %residual, %quarter
-  %stalled = and i1 %near, %slow
-  br i1 %stalled, label %judge, label %step
-step:
-  %change = load double, ptr %change_at
-  %fine = fcmp olt double %change, 1.0
-  %k1 = add i64 %k, 1
-  %time = icmp slt i64 %k1, 8
-  %on = and i1 %fine, %time
-  br i1 %on, label %again, label %done
-again:
-  call void @llvm.memcpy.p0.p0.i64(ptr %guess, ptr %next_at, i64 {bytes}, i1 false)
-  br label %newton
-judge:
-  %good = load double, ptr %good_at
-  %regular = fcmp ogt double %good, 0.0
-  br i1 %regular, label %compare, label %done
+  %got = call i64 @close(ptr %numbers, ptr %guess, ptr %result, double %rounded, double %closed)
+  %ok = icmp eq i64 %got, 1
+  br i1 %ok, label %compare, label %done
 compare:
   call void @distance(ptr %first, ptr %guess, ptr %verdict)
   %off = load double, ptr %verdict
@@ -159,6 +174,7 @@ class FastClosure:
         programs: Further machine code for this machine, by what it depends on.
         bounds: Residuals that count as rounding, and as closed if they no longer fall.
         address: Of the function `follow`, for other machine code to call.
+        close_address: Likewise of `close`.
     """
 
     def __init__(
@@ -178,6 +194,7 @@ class FastClosure:
         program = Program()
         self.add_newton(program, self._signs(home))
         self._add_moves(program)
+        program.add_text(_CLOSE.format(bytes=8 * nq))
         program.add_text(_FOLLOW.format(n=n, nq=nq, bytes=8 * nq, gamma_bytes=8 * rows * n))
         self._add_gamma(program)
         program.compile()
@@ -187,7 +204,7 @@ class FastClosure:
         self._gamma = program.function("gammas", c_int64, *[c_void_p] * 4, result=c_int64)
         self._newton = program.function("newton", *[c_void_p] * 3)
         self.address = program.address("follow")
-        self.newton_address = program.address("newton")
+        self.close_address = program.address("close")
         self.programs: dict[tuple, Program] = {}
         self._rows = rows
         self._home = home
