@@ -1,7 +1,7 @@
 """Controllers: forces of the active joints from time, coordinates and velocities."""
 
 from collections.abc import Callable, Mapping
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +32,26 @@ class Controller(Protocol):
         """Active forces (n,) [N], [N m], and the rate of the controller's states."""
 
 
+class Traced(NamedTuple):
+    """What a controller sees while it becomes part of the machine code.
+
+    Attributes:
+        sweep: The machine's dynamics at this instant.
+        q: (nq,) coordinates of all joints.
+        v_a: (n,) active velocities.
+        state: (k,) the controller's own states.
+        settings: (s,) its `settings`.
+        reference: (c,) its row of references.
+    """
+
+    sweep: Sweep
+    q: list[Number]
+    v_a: list[Number]
+    state: list[Number]
+    settings: list[Number]
+    reference: list[Number]
+
+
 @runtime_checkable
 class TracedController(Controller, Protocol):
     """A controller that can become part of the simulation's machine code.
@@ -47,16 +67,8 @@ class TracedController(Controller, Protocol):
     def references(self, times: Array) -> Array:
         """What it follows, (N, c) at times (N,) [s]."""
 
-    def trace(
-        self,
-        sweep: Sweep,
-        q: list[Number],
-        v_a: list[Number],
-        state: list[Number],
-        settings: list[Number],
-        reference: list[Number],
-    ) -> tuple[list[Number], list[Number]]:
-        """`__call__` as formulas, with q of all joints."""
+    def trace(self, at: Traced) -> tuple[list[Number], list[Number]]:
+        """`__call__` as formulas."""
 
 
 class Free:
@@ -81,17 +93,9 @@ class Free:
         """See `TracedController`."""
         return np.zeros((len(times), 0))
 
-    def trace(
-        self,
-        sweep: Sweep,
-        q: list[Number],
-        v_a: list[Number],
-        state: list[Number],
-        settings: list[Number],
-        reference: list[Number],
-    ) -> tuple[list[Number], list[Number]]:
+    def trace(self, at: Traced) -> tuple[list[Number], list[Number]]:
         """See `TracedController`."""
-        return [0.0] * len(v_a), state
+        return [0.0] * len(at.v_a), at.state
 
 
 class PI:
@@ -156,22 +160,14 @@ class PI:
         """See `TracedController`."""
         return self._reference.position(times)
 
-    def trace(
-        self,
-        sweep: Sweep,
-        q: list[Number],
-        v_a: list[Number],
-        state: list[Number],
-        settings: list[Number],
-        reference: list[Number],
-    ) -> tuple[list[Number], list[Number]]:
+    def trace(self, at: Traced) -> tuple[list[Number], list[Number]]:
         """See `TracedController`."""
         n = self.columns
         columns = self._machine.closure.active
-        error = [x - q[i] for x, i in zip(reference, columns, strict=True)]
+        error = [x - at.q[i] for x, i in zip(at.reference, columns, strict=True)]
         tau = [
             kp * e + ki * z
-            for kp, ki, e, z in zip(settings[:n], settings[n:], error, state, strict=True)
+            for kp, ki, e, z in zip(at.settings[:n], at.settings[n:], error, at.state, strict=True)
         ]
         return tau, error
 
@@ -210,25 +206,17 @@ class ComputedTorque:
         """See `TracedController`."""
         return np.concatenate(self._reference(times), axis=1)
 
-    def trace(
-        self,
-        sweep: Sweep,
-        q: list[Number],
-        v_a: list[Number],
-        state: list[Number],
-        settings: list[Number],
-        reference: list[Number],
-    ) -> tuple[list[Number], list[Number]]:
+    def trace(self, at: Traced) -> tuple[list[Number], list[Number]]:
         """See `TracedController`."""
-        w, n = settings[0], len(v_a)
-        q_a = [q[i] for i in self._active]
+        w, n, reference = at.settings[0], len(at.v_a), at.reference
+        q_a = [at.q[i] for i in self._active]
         wanted = [
             a_ref + 2.0 * w * (v_ref - v) + w * w * (q_ref - x)
             for q_ref, v_ref, a_ref, x, v in zip(
-                reference[:n], reference[n : 2 * n], reference[2 * n :], q_a, v_a, strict=True
+                reference[:n], reference[n : 2 * n], reference[2 * n :], q_a, at.v_a, strict=True
             )
         ]
-        return sweep.inverse(wanted, friction=True), state
+        return at.sweep.inverse(wanted, friction=True), at.state
 
 
 class Feedback:

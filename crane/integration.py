@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from crane.closure.traced import Constants, folded
-from crane.control import Controller, TracedController
+from crane.control import Controller, Traced, TracedController
 from crane.dynamics import Dynamics
 from crane.dynamics.traced import Sweep
 from crane.errors import ClosureError, SimulationError
@@ -173,9 +173,8 @@ class CompiledStepper:
             v_a, own = tape.loads(4, nq, n), tape.loads(4, nq + n, states)
             sweep = Sweep(posture, loops, Constants(tape, 1, self._numbers), q, v_a)
             settings = tape.loads(2, 0, len(control.settings))
-            tau, own_rate = control.trace(
-                sweep, q, v_a, own, settings, tape.loads(3, 0, control.columns)
-            )
+            reference = tape.loads(3, 0, control.columns)
+            tau, own_rate = control.trace(Traced(sweep, q, v_a, own, settings, reference))
             a_a = sweep.forward(tau, friction=True)
             powers = [dot(tau, v_a), sweep.dissipation]
             outputs = [*sweep.rates[1:], *a_a, *own_rate, *powers]

@@ -72,8 +72,8 @@ class Push:
     def references(self, times):
         return np.zeros((len(times), 0))
 
-    def trace(self, sweep, q, v_a, state, settings, reference):
-        return list(settings), state
+    def trace(self, at):
+        return list(at.settings), at.state
 
 
 @pytest.fixture

@@ -113,10 +113,11 @@ class Closure:
     def solve(self, q_a: ArrayLike, guess: ArrayLike | None = None) -> Array:
         """Close the loops: q = f(q_A), equation (3) of the reduced-scale forwarder paper.
 
-        Newton's method from the nearest known posture, in steps along the straight line of
-        q_A that are halved whenever Newton hesitates or would change the assembly branch. A
-        stack is tracked like a path, each sample from the one before it or from the home
-        posture, whichever is nearer. The result is closed to rounding or an error is raised.
+        Newton's method from the last posture this thread solved (or the guess), in one step where
+        that follows the branch; else from home, along the straight line of q_A, in steps that are
+        halved whenever Newton hesitates or would change the assembly branch. A stack is tracked
+        like a path; one of far samples is sorted for that. The result is closed to rounding, on
+        the home posture's branch whatever was solved before, or an error is raised.
 
         Args:
             q_a: (n,) or (N, n) active coordinates [m], [rad]. Limits are not checked here.
