@@ -1,7 +1,7 @@
 """Motion in time: the classical Runge-Kutta method, in machine code or Python, and scipy's."""
 
 from collections.abc import Callable
-from ctypes import c_double, c_int64, c_void_p
+from ctypes import c_int64, c_void_p
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from crane.straight.scalar import add, dot, scale
 # state and by how much a joint moves at most; close_loops see `FastClosure`.
 _RUN = """
 define i64 @run(i64 %steps, ptr %close_loops, ptr %geometry, ptr %numbers, ptr %control, ptr %refs,
-                ptr %state, ptr %work, ptr %out, ptr %h, double %rounded, double %closed) {{
+                ptr %state, ptr %work, ptr %out, ptr %h, ptr %bounds) {{
 entry:
   %next = getelementptr double, ptr %work, i64 0
   %peak_at = getelementptr double, ptr %work, i64 {size}
@@ -58,8 +58,7 @@ stages:
   %calm = fcmp olt double %peak, 1.0
   br i1 %calm, label %close, label %done
 close:
-  %got = call i64 %close_loops(ptr %geometry, ptr %next, ptr %result,
-                               double %rounded, double %closed)
+  %got = call i64 %close_loops(ptr %geometry, ptr %next, ptr %result, ptr %bounds)
   %ok = icmp eq i64 %got, 1
   br i1 %ok, label %accept, label %done
 accept:
@@ -161,7 +160,7 @@ class CompiledStepper:
             self._fast.programs[key] = self._compile(nq, n, states)
         self._program = self._fast.programs[key]
         self._run = self._program.function(
-            "run", c_int64, *[c_void_p] * 9, c_double, c_double, result=c_int64
+            "run", c_int64, *[c_void_p] * 10, result=c_int64
         )
         self._work = np.zeros(5 * self._size + self._seen + 4 + 2 * nq * (n + 1))
 
@@ -217,7 +216,7 @@ class CompiledStepper:
             self._run(
                 len(times), self._fast.close_address, *(array.ctypes.data for array in arrays),
                 state.ctypes.data, self._work.ctypes.data, out.ctypes.data, steps.ctypes.data,
-                *self._fast.bounds,
+                self._fast.bounds.ctypes.data,
             )
         )  # fmt: skip
 

@@ -29,6 +29,8 @@ class Path:
     def __init__(self, curve: PPoly | BPoly, tip: "Path | None" = None):
         self.duration = float(curve.x[-1])
         self.tip = tip
+        if isinstance(curve, BPoly):
+            curve = PPoly.from_bernstein_basis(curve)  # 15 times faster to evaluate
         self._curves = (curve, curve.derivative(), curve.derivative(2))
 
     def position(self, time: ArrayLike) -> Array:

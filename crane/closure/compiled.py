@@ -1,6 +1,6 @@
 """Closing loops in machine code made for one machine."""
 
-from ctypes import c_double, c_int64, c_void_p
+from ctypes import c_int64, c_void_p
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,10 +18,16 @@ _NEAR = 1e-6  # residual of a guess that is as good as closed
 _SURPLUS = 1e-9  # residual of redundant equations, likewise
 
 # Newton's method in place: 1 where it closes the loops on the home branch, else 0. newton gives
-# [residual, change, regular, corrected q, gamma].
+# [residual, change, regular, corrected q, gamma]. A change so small that its square is rounding is
+# the last one.
 _CLOSE = """
-define i64 @close(ptr %numbers, ptr %q, ptr %result, double %rounded, double %closed) {{
+define i64 @close(ptr %numbers, ptr %q, ptr %result, ptr %bounds) {{
 entry:
+  %closed_at = getelementptr double, ptr %bounds, i64 1
+  %small_at = getelementptr double, ptr %bounds, i64 2
+  %rounded = load double, ptr %bounds
+  %closed = load double, ptr %closed_at
+  %small = load double, ptr %small_at
   %change_at = getelementptr double, ptr %result, i64 1
   %good_at = getelementptr double, ptr %result, i64 2
   %next_at = getelementptr double, ptr %result, i64 3
@@ -48,7 +54,8 @@ step:
   br i1 %on, label %again, label %fail
 again:
   call void @llvm.memcpy.p0.p0.i64(ptr %q, ptr %next_at, i64 {bytes}, i1 false)
-  br label %newton
+  %last = fcmp ole double %change, %small
+  br i1 %last, label %judge, label %newton
 judge:
   %good = load double, ptr %good_at
   %regular = fcmp ogt double %good, 0.0
@@ -64,7 +71,7 @@ fail:
 # stops where it does not: `Branch` takes that sample. `at` holds [q, gamma] of the last sample.
 _FOLLOW = """
 define i64 @follow(i64 %count, ptr %numbers, ptr %targets, ptr %at, ptr %work, ptr %out,
-                   double %rounded, double %closed) {{
+                   ptr %bounds) {{
 entry:
   %guess = getelementptr double, ptr %work, i64 0
   %first = getelementptr double, ptr %work, i64 {nq}
@@ -88,7 +95,7 @@ begin:
   br i1 %small, label %start, label %done
 start:
   call void @llvm.memcpy.p0.p0.i64(ptr %guess, ptr %first, i64 {bytes}, i1 false)
-  %got = call i64 @close(ptr %numbers, ptr %guess, ptr %result, double %rounded, double %closed)
+  %got = call i64 @close(ptr %numbers, ptr %guess, ptr %result, ptr %bounds)
   %ok = icmp eq i64 %got, 1
   br i1 %ok, label %compare, label %done
 compare:
@@ -172,7 +179,7 @@ class FastClosure:
     Attributes:
         geometry: What the formulas were traced from.
         programs: Further machine code for this machine, by what it depends on.
-        bounds: Residuals that count as rounding, and as closed if they no longer fall.
+        bounds: Residuals that count as rounding, and as closed if they no longer fall; a small change.
         address: Of the function `follow`, for other machine code to call.
         close_address: Likewise of `close`.
     """
@@ -199,7 +206,7 @@ class FastClosure:
         self._add_gamma(program)
         program.compile()
         self._program = program  # the functions live as long as it
-        kinds = [c_int64, *[c_void_p] * 5, c_double, c_double]
+        kinds = [c_int64, *[c_void_p] * 6]
         self._follow = program.function("follow", *kinds, result=c_int64)
         self._gamma = program.function("gammas", c_int64, *[c_void_p] * 4, result=c_int64)
         self._newton = program.function("newton", *[c_void_p] * 3)
@@ -208,7 +215,7 @@ class FastClosure:
         self.programs: dict[tuple, Program] = {}
         self._rows = rows
         self._home = home
-        self.bounds = (1e-15 * size, 1e-13 * size)
+        self.bounds = np.array([1e-15 * size, 1e-13 * size, 1e-9 * min(1.0, size)])
 
     def cursor(self) -> "Cursor":
         """A place to follow stacks from, at home."""
@@ -245,7 +252,7 @@ class FastClosure:
         return int(
             self._follow(
                 len(targets), numbers.ctypes.data, targets.ctypes.data, cursor.at.ctypes.data,
-                cursor.work.ctypes.data, out.ctypes.data, *self.bounds,
+                cursor.work.ctypes.data, out.ctypes.data, self.bounds.ctypes.data,
             )
         )  # fmt: skip
 

@@ -51,6 +51,15 @@ class Geometry:
     numbers: Array
     frame_bodies: tuple[int, ...]
 
+    @property
+    def trunk(self) -> int:
+        """The body in whose frame formulas are shortest: the one that carries all others, if any.
+
+        Seen from there its own joint moves nothing but the world, and what lies in a plane of it
+        stays in that plane.
+        """
+        return int(self.parents.count(0) == 2 and 0 not in self.frame_bodies)
+
 
 def geometry_of(equations: LoopEquations) -> Geometry:
     """Read the geometry off an assembled model."""
@@ -120,7 +129,7 @@ def folded(values: Array) -> bytes:
 
 
 class Posture:
-    """Bodies and loops at traced coordinates.
+    """Bodies and loops at traced coordinates, seen from the geometry's trunk.
 
     Args:
         geometry: The machine's geometry.
@@ -130,32 +139,41 @@ class Posture:
     Attributes:
         rotation: Of every body, (3, 3).
         origin: Of every body, (3,).
-        columns: Of every joint, its spatial column at the world's origin: linear, angular.
+        columns: Of every joint, its spatial column at the trunk's origin: linear, angular.
     """
 
     def __init__(self, geometry: Geometry, constants: Constants, q: Sequence[Number]):
         self.geometry, self._constants = geometry, constants
-        self.rotation: list[list[Vector]] = [[[float(r == c) for c in range(3)] for r in range(3)]]
-        self.origin: list[Vector] = [[0.0, 0.0, 0.0]]
+        still = [[float(r == c) for c in range(3)] for r in range(3)]
+        self.rotation: list[list[Vector]] = [still]
+        self.origin: list[Vector] = [[0.0] * 3]
         self.columns: list[tuple[Vector, Vector]] = [([0.0] * 3, [0.0] * 3)]
         for i in range(1, len(geometry.parents)):
-            parent = geometry.parents[i]
-            turn, place = constants.place(i - 1)
-            rotation = product(self.rotation[parent], turn)
-            origin = add(self.origin[parent], times(self.rotation[parent], place))
+            rotation, origin = self._moved(i, q[i - 1])
+            if i == geometry.trunk:
+                back = [list(column) for column in zip(*rotation, strict=True)]
+                self.rotation[0], self.origin[0] = back, scale(-1.0, times(back, origin))
+                rotation, origin = still, [0.0] * 3
             axis = [row[2] for row in rotation]
-            if geometry.revolute[i]:
-                c, s = apply("cos", q[i - 1]), apply("sin", q[i - 1])
-                rotation = [[c * x + s * y, c * y - s * x, z] for x, y, z in rotation]
-                self.columns.append((cross(origin, axis), axis))
-            else:
-                origin = add(origin, scale(q[i - 1], axis))
-                self.columns.append((axis, [0.0] * 3))
+            self.columns.append(
+                (cross(origin, axis), axis) if geometry.revolute[i] else (axis, [0.0] * 3)
+            )
             self.rotation.append(rotation)
             self.origin.append(origin)
 
+    def _moved(self, i: int, q: Number) -> tuple[list[Vector], Vector]:
+        """Rotation and origin of body i, its parent's being known."""
+        parent = self.geometry.parents[i]
+        turn, place = self._constants.place(i - 1)
+        rotation = product(self.rotation[parent], turn)
+        origin = add(self.origin[parent], times(self.rotation[parent], place))
+        if self.geometry.revolute[i]:
+            c, s = apply("cos", q), apply("sin", q)
+            return [[c * x + s * y, c * y - s * x, z] for x, y, z in rotation], origin
+        return rotation, add(origin, scale(q, [row[2] for row in rotation]))
+
     def frame(self, index: int) -> tuple[list[Vector], Vector]:
-        """Axes (columns of a rotation) and origin of a loop frame in the world."""
+        """Axes (columns of a rotation) and origin of a loop frame."""
         body = self.geometry.frame_bodies[index]
         turn, place = self._constants.place(len(self.geometry.parents) - 1 + index)
         axes = product(self.rotation[body], turn)
@@ -305,11 +323,11 @@ class Motion:
         posture: Bodies.
         loops: Loops at that posture.
         rates: (nb + 1,) joint velocities, 0 for the world.
-        gravity: (3,) the world accelerates with -gravity, so that weights need no terms of their
-            own.
+        gravity: (3,) in the trunk's directions; the world accelerates with -gravity, so that
+            weights need no terms of their own.
 
     Attributes:
-        velocity: Of every body, linear at the world's origin, angular.
+        velocity: Of every body, linear at the trunk's origin, angular.
         acceleration: The same at zero joint acceleration.
     """
 

@@ -1,7 +1,7 @@
 """Equations of motion in machine code made for one machine."""
 
 from collections.abc import Callable
-from ctypes import c_double, c_int64, c_void_p
+from ctypes import c_int64, c_void_p
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,7 @@ _FLOAT = np.dtype(np.float64)
 # that is too far from the one before it.
 _EACH = """
 define i64 @each(i64 %count, ptr %follow, ptr %geometry, ptr %numbers, ptr %targets, ptr %inputs,
-                 ptr %at, ptr %work, ptr %q, ptr %out, double %rounded, double %closed) {{
+                 ptr %at, ptr %work, ptr %q, ptr %out, ptr %bounds) {{
 entry:
   br label %sample
 sample:
@@ -51,7 +51,7 @@ close:
   %t0 = mul i64 %i, {n}
   %target = getelementptr double, ptr %targets, i64 %t0
   %got = call i64 %follow(i64 1, ptr %geometry, ptr %target, ptr %at, ptr %work, ptr %q,
-                          double %rounded, double %closed)
+                          ptr %bounds)
   %ok = icmp eq i64 %got, 1
   br i1 %ok, label %evaluate, label %done
 evaluate:
@@ -74,16 +74,16 @@ define i64 @once(ptr %a) {{
 stop:
   ret i64 0
 go:
-  %done = call i64 @each(i64 1, {passed}, double %v10, double %v11)
+  %done = call i64 @each(i64 1, {passed})
   ret i64 %done
 }}
 """
 _LOADS = "\n  ".join(
     f"%p{i} = getelementptr i64, ptr %a, i64 {i}\n  "
-    f"%v{i} = load {'double' if i > 9 else 'ptr'}, ptr %p{i}"
-    for i in range(1, 12)
+    f"%v{i} = load ptr, ptr %p{i}"
+    for i in range(1, 11)
 )
-_PASSED = ", ".join(f"ptr %v{i}" for i in range(1, 10))
+_PASSED = ", ".join(f"ptr %v{i}" for i in range(1, 11))
 
 
 class Formula:
@@ -111,7 +111,7 @@ class Formula:
             fast.programs[key] = _compile(quantity, fast, numbers, n)
         self._program = program = fast.programs[key]
         self.size = program.sizes["formula"]
-        kinds = [c_int64, *[c_void_p] * 9, c_double, c_double]
+        kinds = [c_int64, *[c_void_p] * 10]
         self._each = program.function("each", *kinds, result=c_int64)
         self._formula = program.function("formula", *[c_void_p] * 5)
         self.cursor = fast.cursor()
@@ -122,9 +122,7 @@ class Formula:
         # a single pointer costs a call from Python far less than twelve arguments
         self._once = program.function("once", c_void_p, result=c_int64)
         arguments = self._arguments(self._target[None], self._input[None], self._out[None])
-        self._packed = np.array(
-            [x if isinstance(x, int) else np.float64(x).view(np.int64) for x in arguments]
-        )
+        self._packed = np.array(arguments)
         self._packed_at = self._packed.ctypes.data
 
     def one(self, q_a: Any, v_a: Any, x: Any) -> Array | None:
@@ -164,12 +162,12 @@ class Formula:
         """
         return int(self._each(*self._arguments(targets, inputs, out)))
 
-    def _arguments(self, targets: Array, inputs: Array, out: Array) -> tuple[int | float, ...]:
+    def _arguments(self, targets: Array, inputs: Array, out: Array) -> tuple[int, ...]:
         fast = self._fast
         arrays = (fast.geometry.numbers, self._numbers, targets, inputs)
-        memory = (self.cursor.at, self.cursor.work, self._q, out)
+        memory = (self.cursor.at, self.cursor.work, self._q, out, fast.bounds)
         addresses = [array.ctypes.data for array in (*arrays, *memory)]
-        return (len(targets), fast.address, *addresses, *fast.bounds)
+        return (len(targets), fast.address, *addresses)
 
 
 def _compile(quantity: str, fast: FastClosure, numbers: Array, n: int) -> Program:

@@ -69,7 +69,8 @@ class Sweep:
         bodies = self._size - 1
         self._inertial = [constants.vector(BODY * i, BODY) for i in range(bodies)]
         self._laws = [constants.vector(BODY * bodies + JOINT * i, JOINT) for i in range(bodies)]
-        self._gravity = constants.vector((BODY + JOINT) * bodies)
+        gravity = constants.vector((BODY + JOINT) * bodies)
+        self._gravity = times(posture.rotation[0], gravity)
         self.gamma = loops.gamma
         self.rates: Vector = [0.0, *(dot(self.gamma[i], v_a) for i in range(1, self._size))]
         self._motion = Motion(posture, loops, self.rates, self._gravity)
@@ -81,7 +82,7 @@ class Sweep:
 
     @cached_property
     def _columns(self) -> list[list[tuple[Vector, Vector]]]:
-        """Per body dV/dv_A (linear at the world's origin, angular) by column, then the drift."""
+        """Per body dV/dv_A (linear at the trunk's origin, angular) by column, then the drift."""
         columns: list[list[tuple[Vector, Vector]]] = [[([0.0] * 3, [0.0] * 3)] * (self._n + 1)]
         for i in range(1, self._size):
             linear, angular = self._posture.columns[i]
@@ -96,8 +97,8 @@ class Sweep:
         return columns
 
     @cached_property
-    def _world(self) -> list[tuple[Number, Vector, list[Vector]]]:
-        """Per body mass, COM in the world, inertia about it in the world's directions."""
+    def _bodies(self) -> list[tuple[Number, Vector, list[Vector]]]:
+        """Per body mass, COM, inertia about it, in the trunk's frame."""
         out: list[tuple[Number, Vector, list[Vector]]] = []
         for i in range(1, self._size):
             mass, *rest = self._inertial[i - 1]
@@ -114,7 +115,7 @@ class Sweep:
 
     def _at_centre(self, i: int) -> list[tuple[Vector, Vector]]:
         """Columns of body i: linear at its COM, angular."""
-        _, centre, _ = self._world[i - 1]
+        _, centre, _ = self._bodies[i - 1]
         return [(add(v, cross(w, centre)), w) for v, w in self._columns[i][: self._n]]
 
     @cached_property
@@ -122,7 +123,7 @@ class Sweep:
         """M_A = sum J_b^T I_b J_b."""
         out: list[Vector] = [[0.0] * self._n for _ in range(self._n)]
         for i in range(1, self._size):
-            mass, _, tensor = self._world[i - 1]
+            mass, _, tensor = self._bodies[i - 1]
             columns = self._at_centre(i)
             for k, (v, w) in enumerate(columns):
                 momentum, spin = scale(mass, v), times(tensor, w)
@@ -137,7 +138,7 @@ class Sweep:
         velocity, acceleration = self._motion.velocity, self._motion.acceleration
         out: Vector = [0.0] * self._n
         for i in range(1, self._size):
-            mass, centre, tensor = self._world[i - 1]
+            mass, centre, tensor = self._bodies[i - 1]
             v, w = velocity[i]
             a = add(acceleration[i][0], self._columns[i][self._n][0])
             e = add(acceleration[i][1], self._columns[i][self._n][1])
@@ -152,7 +153,7 @@ class Sweep:
         """gamma^T g(q)."""
         out: Vector = [0.0] * self._n
         for i in range(1, self._size):
-            force = scale(-self._world[i - 1][0], self._gravity)
+            force = scale(-self._bodies[i - 1][0], self._gravity)
             for k, (linear, _) in enumerate(self._at_centre(i)):
                 out[k] = out[k] + dot(linear, force)
         return out
@@ -214,7 +215,7 @@ class Sweep:
         velocity = self._motion.velocity
         total: Number = 0.0
         for i in range(1, self._size):
-            mass, centre, tensor = self._world[i - 1]
+            mass, centre, tensor = self._bodies[i - 1]
             v, w = velocity[i]
             at = add(v, cross(w, centre))
             total = total + 0.5 * mass * dot(at, at) + 0.5 * dot(w, times(tensor, w))
@@ -224,8 +225,9 @@ class Sweep:
     def potential(self) -> Number:
         """Weights, springs, constant forces, end stops [J]."""
         total = self._along_joints[3]
-        for mass, centre, _ in self._world:
-            total = total - mass * dot(self._gravity, centre)
+        for mass, centre, _ in self._bodies:
+            height = subtract(centre, self._posture.origin[0])
+            total = total - mass * dot(self._gravity, height)
         return total
 
     def inverse(self, a_a: Sequence[Number], friction: bool) -> Vector:
@@ -247,7 +249,7 @@ class Sweep:
         for i in range(1, self._size):
             turn = self._posture.geometry.turns[i]
             axes = product(self._posture.rotation[i], turn.T.tolist())  # columns: joint's axes
-            local = list(zip(*axes, strict=True))  # rows: world to joint
+            local = list(zip(*axes, strict=True))  # rows: trunk to joint
             origin = self._posture.origin[i]
             v, w = velocity[i]
             a, e = acceleration[i]

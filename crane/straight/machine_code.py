@@ -5,18 +5,16 @@ import struct
 from collections.abc import Sequence
 from typing import Any
 
+from crane.straight.functions import VECTOR, WIDEST, definitions
 from crane.straight.scalar import Expression, Number
 
 # Products may be fused with sums. Reordering sums would gain nothing and let NaN cancel.
 _FAST = "nsz arcp contract"
 _CALLS = {
-    "sin": "@sin", "cos": "@cos", "tanh": "@tanh", "sqrt": "@llvm.sqrt.f64",
-    "abs": "@llvm.fabs.f64", "maximum": "@larger", "copysign": "@llvm.copysign.f64",
+    "sqrt": "@llvm.sqrt.f64", "abs": "@llvm.fabs.f64", "maximum": "@larger",
+    "copysign": "@llvm.copysign.f64",
 }  # fmt: skip
 _DECLARATIONS = """
-declare double @sin(double)
-declare double @cos(double)
-declare double @tanh(double)
 declare double @llvm.sqrt.f64(double)
 declare double @llvm.fabs.f64(double)
 declare double @llvm.copysign.f64(double, double)
@@ -47,6 +45,7 @@ class Program:
 
     def __init__(self) -> None:
         self._texts = [_DECLARATIONS]
+        self._functions: set[tuple[str, int]] = set()
         self.sizes: dict[str, int] = {}
         self._engine: Any = None
 
@@ -56,7 +55,7 @@ class Program:
         Raises:
             TooLongError: It has too many operations.
         """
-        self._texts.append(_function(name, arrays, outputs))
+        self._texts.append(_function(name, arrays, outputs, self._functions))
         self.sizes[name] = len(outputs)
 
     def add_text(self, text: str) -> None:
@@ -66,7 +65,7 @@ class Program:
     def compile(self) -> None:
         """Translate everything that was added."""
         llvm, target = _target()
-        module = llvm.parse_assembly("\n".join(self._texts))
+        module = llvm.parse_assembly("\n".join([*self._texts, definitions(self._functions)]))
         module.verify()
         options = llvm.create_pipeline_tuning_options(speed_level=2)
         options.slp_vectorization = False  # takes long and gains nothing here
@@ -96,7 +95,10 @@ def _target() -> tuple[Any, Any]:
     return llvm, target
 
 
-def _function(name: str, arrays: int, outputs: Sequence[Number]) -> str:
+def _function(
+    name: str, arrays: int, outputs: Sequence[Number], functions: set[tuple[str, int]]
+) -> str:
+    """LLVM's text; adds to `functions` what it calls of `definitions`."""
     arguments = [f"ptr noalias readonly %in{i}" for i in range(arrays)]
     lines = [f"define void @{name}({', '.join([*arguments, 'ptr noalias %out'])}) {{"]
     tapes = {value.tape for value in outputs if isinstance(value, Expression)}
@@ -104,26 +106,75 @@ def _function(name: str, arrays: int, outputs: Sequence[Number]) -> str:
     needed = _needed(operations, outputs)
     if len(needed) > MOST:
         raise TooLongError
-    for index in needed:
-        kind, *operands = operations[index]
-        if kind == "load":
-            array, at = operands
-            lines.append(f"  %p{index} = getelementptr double, ptr %in{array}, i64 {at}")
-            lines.append(f"  %v{index} = load double, ptr %p{index}")
-            continue
-        words = [_operand(operand) for operand in operands]
-        if kind == "fneg":
-            lines.append(f"  %v{index} = fneg double {words[0]}")
-        elif kind in _CALLS:
-            typed = ", ".join(f"double {word}" for word in words)
-            lines.append(f"  %v{index} = call double {_CALLS[kind]}({typed})")
-        else:
-            lines.append(f"  %v{index} = {kind} {_FAST} double {words[0]}, {words[1]}")
+    for level in _levels(operations, needed):
+        lines += _at_once([(i, operations[i]) for i in level if _vector(operations[i])], functions)
+        for index in level:
+            if not _vector(operations[index]):
+                lines += _single(index, *operations[index])
     for i, value in enumerate(outputs):
         word = _operand(value.index if isinstance(value, Expression) else float(value))
         lines.append(f"  %q{i} = getelementptr double, ptr %out, i64 {i}")
         lines.append(f"  store double {word}, ptr %q{i}")
     return "\n".join([*lines, "  ret void", "}"])
+
+
+def _vector(operation: tuple) -> bool:
+    return operation[0] in VECTOR
+
+
+def _levels(operations: Sequence[tuple], needed: Sequence[int]) -> list[list[int]]:
+    """Operations by how many of `VECTOR` come after each other on the way to them."""
+    level: dict[int, int] = {}
+    out: list[list[int]] = []
+    for index in needed:
+        operation = operations[index]
+        used = [] if operation[0] == "load" else [x for x in operation[1:] if isinstance(x, int)]
+        level[index] = max((level[x] for x in used), default=0) + _vector(operation)
+        while len(out) <= level[index]:
+            out.append([])
+        out[level[index]].append(index)
+    return out
+
+
+def _at_once(calls: list[tuple[int, tuple]], functions: set[tuple[str, int]]) -> list[str]:
+    """Functions of `VECTOR`, each of as many numbers as there are."""
+    lines = []
+    for name in sorted({operation[0] for _, operation in calls}):
+        same = [(index, operand) for index, (kind, operand) in calls if kind == name]
+        for start in range(0, len(same), WIDEST):
+            part = same[start : start + WIDEST]
+            width = 1 << (len(part) - 1).bit_length()
+            functions.add((name, width))
+            kind, vector = f"<{width} x double>", "poison"
+            for lane in range(width):  # the first once more where there are too few
+                index, operand = part[lane] if lane < len(part) else part[0]
+                word, made = _operand(operand), f"%{name}{part[0][0]}_{lane}"
+                lines.append(f"  {made} = insertelement {kind} {vector}, double {word}, i32 {lane}")
+                vector = made
+            result = f"%{name}{part[0][0]}"
+            lines.append(f"  {result} = call {kind} @{name}{width}({kind} {vector})")
+            lines += [
+                f"  %v{index} = extractelement {kind} {result}, i32 {lane}"
+                for lane, (index, _) in enumerate(part)
+            ]
+    return lines
+
+
+def _single(index: int, kind: str, *operands: Any) -> list[str]:
+    """One operation of one number."""
+    if kind == "load":
+        array, at = operands
+        return [
+            f"  %p{index} = getelementptr double, ptr %in{array}, i64 {at}",
+            f"  %v{index} = load double, ptr %p{index}",
+        ]
+    words = [_operand(operand) for operand in operands]
+    if kind == "fneg":
+        return [f"  %v{index} = fneg double {words[0]}"]
+    if kind in _CALLS:
+        typed = ", ".join(f"double {word}" for word in words)
+        return [f"  %v{index} = call double {_CALLS[kind]}({typed})"]
+    return [f"  %v{index} = {kind} {_FAST} double {words[0]}, {words[1]}"]
 
 
 def _needed(operations: Sequence[tuple], outputs: Sequence[Number]) -> list[int]:
