@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.control import Controller
+from crane.dynamics import Dynamics
 from crane.errors import CraneError, InputError
 from crane.machine import Machine
 from crane.samples import Array
@@ -84,7 +85,7 @@ def simulate_batch(
     def run(i: int) -> tuple[Array, ...]:
         machine = machines[i]
         control = None if controller is None else controller(machine)
-        time, states, seen = trajectory(machine, control, starts[i], duration, step)
+        time, states, seen = trajectory(Dynamics(machine), control, starts[i], duration, step)
         nq, n = machine.model.nq, len(active)
         energy = np.column_stack([seen[:, 2 * n :], states[:, -2:]])
         q_a = states[:, :nq][:, machine.closure.active]

@@ -146,6 +146,7 @@ class CompiledStepper:
     def __init__(self, dynamics: Dynamics, control: TracedController, states: int):
         machine = dynamics.machine
         self._fast, self._numbers = machine.closure.fast, dynamics.numbers
+        self._carriers = dynamics.carriers
         self._control = control
         nq, n = machine.model.nq, len(machine.active)
         self._size, self._seen = nq + n + states + 2, 2 * n + 2
@@ -155,13 +156,12 @@ class CompiledStepper:
             len(control.settings),
             states,
             folded(self._numbers),
+            dynamics.carriers,
         )
         if key not in self._fast.programs:
             self._fast.programs[key] = self._compile(nq, n, states)
         self._program = self._fast.programs[key]
-        self._run = self._program.function(
-            "run", c_int64, *[c_void_p] * 10, result=c_int64
-        )
+        self._run = self._program.function("run", c_int64, *[c_void_p] * 10, result=c_int64)
         self._work = np.zeros(5 * self._size + self._seen + 4 + 2 * nq * (n + 1))
 
     def _compile(self, nq: int, n: int, states: int) -> Program:
@@ -170,7 +170,8 @@ class CompiledStepper:
             tape = Tape()
             q, posture, loops = self._fast.trace(tape, 0, 4)
             v_a, own = tape.loads(4, nq, n), tape.loads(4, nq + n, states)
-            sweep = Sweep(posture, loops, Constants(tape, 1, self._numbers), q, v_a)
+            constants = Constants(tape, 1, self._numbers)
+            sweep = Sweep(posture, loops, constants, q, v_a, self._carriers)
             settings = tape.loads(2, 0, len(control.settings))
             reference = tape.loads(3, 0, control.columns)
             tau, own_rate = control.trace(Traced(sweep, q, v_a, own, settings, reference))

@@ -37,6 +37,7 @@ def simulate(
     task: str = "",
     path: str = "compiled",
     method: str = "rk4",
+    formulation: str = "exact",
     progress: Progress | None = None,
 ) -> Recording:
     """Simulate a machine with its friction, passive forces and end stops.
@@ -58,12 +59,14 @@ def simulate(
         path: "compiled" or "pinocchio", see `Dynamics`.
         method: "rk4", or one of scipy's adaptive methods ("DOP853", "Radau", "LSODA", ...) with
             relative tolerance 1e-9, whose dense output is recorded every `step`.
+        formulation: "exact" or "decoupled", see `Dynamics`.
         progress: Called with the finished share, 0 to 1.
 
     Returns:
         Recording with channels for every passive joint, the tip, the references of the path,
         friction_<joint>, and the energies kinetic, potential, work (of the active forces) and
-        dissipated [J]; work = change of (kinetic + potential) + dissipated.
+        dissipated [J]; work = change of (kinetic + potential) + dissipated, of the exact
+        formulation only.
 
     Raises:
         InputError: Arguments of wrong shape or value.
@@ -73,18 +76,19 @@ def simulate(
     if not (isinstance(task, str) and task.isprintable()):
         raise InputError(f"task {task!r} is not one line of text")
     control = _as_controller(controller, machine)
-    _, states, seen = trajectory(machine, control, initial, duration, step, path, method, progress)
-    _warn_of_imbalance(states[:, -2], seen[:, -2:], states[:, -1], step)
+    dynamics = Dynamics(machine, formulation, path)
+    _, states, seen = trajectory(dynamics, control, initial, duration, step, method, progress)
+    if formulation == "exact":
+        _warn_of_imbalance(states[:, -2], seen[:, -2:], states[:, -1], step)
     return _recording(machine, control.path, step, states, seen, task)
 
 
 def trajectory(
-    machine: Machine,
+    dynamics: Dynamics,
     controller: Controller | Force | None,
     initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None,
     duration: float | None,
     step: float,
-    path: str = "compiled",
     method: str = "rk4",
     progress: Progress | None = None,
 ) -> tuple[Array, Array, Array]:
@@ -94,6 +98,7 @@ def trajectory(
         Times (N,); states (N, .) of q (nq), v_A (n), the controller's, work, dissipated;
         observations (N, 2 n + 2) of tau, friction, kinetic, potential.
     """
+    machine = dynamics.machine
     control = _as_controller(controller, machine)
     if duration is None:
         if control.path is None:
@@ -101,7 +106,6 @@ def trajectory(
         duration = control.path.duration
     steps = _count(duration, step)
     q_a, v_a = _start(machine, initial, control.path)
-    dynamics = Dynamics(machine, path=path)
     state = np.concatenate(
         [machine.closure.solve(q_a), v_a, control.start(q_a), np.zeros(_ENERGIES)]
     )

@@ -2,13 +2,14 @@
 
 from ctypes import c_int64, c_void_p
 from dataclasses import dataclass
+from weakref import WeakValueDictionary
 
 import numpy as np
 
 from crane.closure.branch import Posture as ClosedPosture
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import Indices, Structure
-from crane.closure.traced import Constants, Loops, Posture, geometry_of
+from crane.closure.traced import Constants, Loops, Posture, folded, geometry_of
 from crane.samples import Array
 from crane.straight import Number, Program, Tape, largest, maximum
 from crane.straight.scalar import dot
@@ -165,8 +166,27 @@ class Cursor:
         self.at[len(posture.q) :] = posture.gamma.ravel()
 
 
+class _Shared:
+    """Machine code of all machines whose formulas are the same.
+
+    Attributes:
+        loops: What closes loops.
+        programs: Further machine code, by what it depends on.
+    """
+
+    def __init__(self, loops: Program):
+        self.loops = loops
+        self.programs: dict[tuple, Program] = {}
+
+
+# As long as one of these machines is in use. Two threads may both make one; either serves.
+_SHARED: WeakValueDictionary[tuple, _Shared] = WeakValueDictionary()
+
+
 class FastClosure:
     """Machine code for the loops of one machine.
+
+    Machines with the same formulas, which may have different numbers in them, share it.
 
     Args:
         equations: All equations.
@@ -198,24 +218,52 @@ class FastClosure:
         self._active, self._passive = active, passive
         nq, n, rows = equations.model.nq, len(active), len(passive)
         self._nq, self._n = nq, n
-        program = Program()
-        self.add_newton(program, self._signs(home))
-        self._add_moves(program)
-        program.add_text(_CLOSE.format(bytes=8 * nq))
-        program.add_text(_FOLLOW.format(n=n, nq=nq, bytes=8 * nq, gamma_bytes=8 * rows * n))
-        self._add_gamma(program)
-        program.compile()
-        self._program = program  # the functions live as long as it
+        signs = self._signs(home)
+        key = self._key(signs)
+        shared = _SHARED.get(key)
+        if shared is None:
+            shared = _SHARED[key] = _Shared(self._compile(signs))
+        self._shared = shared  # the functions live as long as it
+        program, self.programs = shared.loops, shared.programs
         kinds = [c_int64, *[c_void_p] * 6]
         self._follow = program.function("follow", *kinds, result=c_int64)
         self._gamma = program.function("gammas", c_int64, *[c_void_p] * 4, result=c_int64)
         self._newton = program.function("newton", *[c_void_p] * 3)
         self.address = program.address("follow")
         self.close_address = program.address("close")
-        self.programs: dict[tuple, Program] = {}
         self._rows = rows
         self._home = home
         self.bounds = np.array([1e-15 * size, 1e-13 * size, 1e-9 * min(1.0, size)])
+
+    def _key(self, signs: Array) -> tuple:
+        """All that the formulas depend on."""
+        geometry, equations, structure = self.geometry, self._equations, self._structure
+        arrays = (
+            geometry.turns, equations.axis1, equations.axis2, equations.is_translation,
+            equations.loop_of_row, equations.sign, structure.rows, structure.redundant,
+            self._active, self._passive, signs,
+        )  # fmt: skip
+        return (
+            geometry.parents,
+            geometry.revolute,
+            geometry.frame_bodies,
+            folded(geometry.numbers),
+            tuple(loop.type for loop in equations.loops),
+            tuple((tuple(rows), tuple(columns)) for rows, columns in structure.blocks),
+            *(np.asarray(array).tobytes() for array in arrays),
+        )
+
+    def _compile(self, signs: Array) -> Program:
+        nq, n = self._nq, self._n
+        program = Program()
+        self.add_newton(program, signs)
+        self._add_moves(program)
+        program.add_text(_CLOSE.format(bytes=8 * nq))
+        gamma_bytes = 8 * len(self._passive) * n
+        program.add_text(_FOLLOW.format(n=n, nq=nq, bytes=8 * nq, gamma_bytes=gamma_bytes))
+        self._add_gamma(program)
+        program.compile()
+        return program
 
     def cursor(self) -> "Cursor":
         """A place to follow stacks from, at home."""

@@ -325,6 +325,7 @@ class Motion:
         rates: (nb + 1,) joint velocities, 0 for the world.
         gravity: (3,) in the trunk's directions; the world accelerates with -gravity, so that
             weights need no terms of their own.
+        carriers: (nb + 1,) the body whose motion each body shares, its parent or 0.
 
     Attributes:
         velocity: Of every body, linear at the trunk's origin, angular.
@@ -336,13 +337,14 @@ class Motion:
         posture: Posture,
         loops: Loops,
         rates: Sequence[Number],
-        gravity: Sequence[Number] = (0.0, 0.0, 0.0),
+        gravity: Sequence[Number],
+        carriers: Sequence[int],
     ):
         self._posture, self._loops = posture, loops
         self.velocity: list[tuple[Vector, Vector]] = [([0.0] * 3, [0.0] * 3)]
         self.acceleration: list[tuple[Vector, Vector]] = [([-g for g in gravity], [0.0] * 3)]
         for i in range(1, len(posture.columns)):
-            parent = posture.geometry.parents[i]
+            parent = carriers[i]
             linear, angular = (scale(rates[i], part) for part in posture.columns[i])
             v, w = self.velocity[parent]
             a, e = self.acceleration[parent]

@@ -39,7 +39,7 @@ def read(name: str | Path) -> MachineSpec:
 
 def _read_single(path: Path) -> MachineSpec:
     urdf = read_urdf(path)
-    chain = Chain(path.stem, path, None, path.name)
+    chain = Chain(path.stem, path, None, path.name, urdf.moving)
     tree = Tree()
     tree.add(chain, urdf)
     if not tree.joints:
@@ -113,8 +113,8 @@ def _chains(top: Section, path: Path) -> tuple[tuple[Chain, ...], Tree, dict[str
             raise item.fail(
                 "parent", f"chain '{name}' is first and stands on the world, remove its 'parent'"
             )
-        chain = Chain(name, file, parent, item.where("parent"))
         urdf = read_urdf(file)
+        chain = Chain(name, file, parent, item.where("parent"), urdf.moving)
         if urdf.loops:
             raise DescriptionError(
                 f"{urdf.loops[0].where}: a sub-chain has no <loop>, write it under 'loops' of "
@@ -166,15 +166,24 @@ def _loop(section: Section, tree: Tree) -> LoopSpec:
 
 def _friction(top: Section, tree: Tree) -> dict[str, Friction]:
     found: dict[str, Friction] = {}
-    keys = ("coulomb", "coulomb_offset", "viscous", "viscous_offset", "smoothing")
+    keys = (
+        "coulomb", "coulomb_offset", "viscous", "viscous_offset", "smoothing", "stiction", "stribeck",
+    )  # fmt: skip
     for joint, item in top.mappings("friction", "friction of", *keys):
         tree.check_joint(joint, item.where())
+        stribeck = item.number("stribeck", Friction.stribeck, minimum=0.0)
+        if stribeck == 0:
+            raise item.fail(
+                "stribeck", f"'stribeck' of friction of '{joint}' is 0, give a velocity"
+            )
         friction = Friction(
             coulomb=item.number("coulomb", 0.0, minimum=0.0),
             coulomb_offset=item.number("coulomb_offset", 0.0),
             viscous=item.number("viscous", 0.0, minimum=0.0),
             viscous_offset=item.number("viscous_offset", 0.0),
             smoothing=item.number("smoothing", Friction.smoothing, minimum=0.0),
+            stiction=item.number("stiction", 0.0, minimum=0.0),
+            stribeck=stribeck,
         )
         for kind in ("coulomb", "viscous"):
             mean, offset = getattr(friction, kind), getattr(friction, f"{kind}_offset")

@@ -29,12 +29,14 @@ class Chain:
         urdf: Its file.
         parent: Frame it hangs from; None for the first chain, which stands on the world.
         where: Where it was written, for errors.
+        joints: Its moving joints.
     """
 
     name: str
     urdf: Path
     parent: str | None
     where: str
+    joints: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -84,9 +86,12 @@ LOOP_TYPES: Mapping[str, tuple[int, int, int, int, int, int]] = {
 class Friction:
     """Friction of one tree joint, asymmetric Coulomb and viscous.
 
-    tau = coulomb sign(v) + coulomb_offset + viscous v + viscous_offset |v|, the joint's drive
-    force that the friction consumes, with sign(v) smoothed to tanh(v / smoothing). This is
-    equation (5) of the reduced-scale forwarder paper with the sign that brakes.
+    tau = (coulomb + stiction e^-(v / stribeck)^2) sign(v) + coulomb_offset
+          + viscous v + viscous_offset |v|,
+
+    the joint's drive force that the friction consumes, with sign(v) smoothed to
+    tanh(v / smoothing). Without stiction this is equation (5) of the reduced-scale forwarder
+    paper with the sign that brakes.
 
     Attributes:
         coulomb: [N] or [N m].
@@ -94,6 +99,8 @@ class Friction:
         viscous: [N s/m] or [N m s/rad].
         viscous_offset: Difference between the two directions [N s/m] or [N m s/rad].
         smoothing: Velocity over which the sign changes [m/s] or [rad/s]; 0 for a jump.
+        stiction: By how much friction at rest exceeds Coulomb friction [N] or [N m].
+        stribeck: Velocity over which stiction vanishes [m/s] or [rad/s].
     """
 
     coulomb: float = 0.0
@@ -101,9 +108,13 @@ class Friction:
     viscous: float = 0.0
     viscous_offset: float = 0.0
     smoothing: float = 1e-3
+    stiction: float = 0.0
+    stribeck: float = 1e-2
 
     def __post_init__(self) -> None:
-        _check(self, "friction", "coulomb", "viscous", "smoothing")
+        _check(self, "friction", "coulomb", "viscous", "smoothing", "stiction", "stribeck")
+        if self.stribeck == 0:
+            raise InputError("stribeck of friction is 0, give the velocity where stiction ends")
 
 
 @dataclass(frozen=True)

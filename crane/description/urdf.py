@@ -70,6 +70,12 @@ class Urdf:
     independent: tuple[str, ...] | None
     friction: Mapping[str, Friction]
 
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """Its moving joints."""
+        joints = self.robot.iter("joint")
+        return tuple(joint.get("name") for joint in joints if joint.get("type") in MOVING)
+
 
 def read_urdf(file: Path) -> Urdf:
     """Read and check one URDF.

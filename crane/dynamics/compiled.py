@@ -79,8 +79,7 @@ go:
 }}
 """
 _LOADS = "\n  ".join(
-    f"%p{i} = getelementptr i64, ptr %a, i64 {i}\n  "
-    f"%v{i} = load ptr, ptr %p{i}"
+    f"%p{i} = getelementptr i64, ptr %a, i64 {i}\n  %v{i} = load ptr, ptr %p{i}"
     for i in range(1, 11)
 )
 _PASSED = ", ".join(f"ptr %v{i}" for i in range(1, 11))
@@ -93,6 +92,7 @@ class Formula:
         quantity: A key of `QUANTITIES`.
         machine: The machine.
         numbers: See `numbers_of`.
+        carriers: See `crane.dynamics.formulation`.
 
     Attributes:
         size: Length of the result of one sample.
@@ -102,13 +102,13 @@ class Formula:
         TooLongError: It would take too long to compile.
     """
 
-    def __init__(self, quantity: str, machine: Machine, numbers: Array):
+    def __init__(self, quantity: str, machine: Machine, numbers: Array, carriers: tuple[int, ...]):
         fast = self._fast = machine.closure.fast
         self._numbers = numbers
         nq, n = machine.model.nq, len(machine.active)
-        key = (quantity, folded(numbers))
+        key = (quantity, folded(numbers), carriers)
         if key not in fast.programs:
-            fast.programs[key] = _compile(quantity, fast, numbers, n)
+            fast.programs[key] = _compile(quantity, fast, numbers, n, carriers)
         self._program = program = fast.programs[key]
         self.size = program.sizes["formula"]
         kinds = [c_int64, *[c_void_p] * 10]
@@ -170,10 +170,13 @@ class Formula:
         return (len(targets), fast.address, *addresses)
 
 
-def _compile(quantity: str, fast: FastClosure, numbers: Array, n: int) -> Program:
+def _compile(
+    quantity: str, fast: FastClosure, numbers: Array, n: int, carriers: tuple[int, ...]
+) -> Program:
     tape = Tape()
     q, posture, loops = fast.trace(tape, 0, 2)
-    sweep = Sweep(posture, loops, Constants(tape, 1, numbers), q, tape.loads(3, 0, n))
+    constants = Constants(tape, 1, numbers)
+    sweep = Sweep(posture, loops, constants, q, tape.loads(3, 0, n), carriers)
     outputs = QUANTITIES[quantity](sweep, tape.loads(3, n, n))
     program = Program()
     program.add("formula", 4, outputs)

@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike
 
 from crane.dynamics.compiled import Formula
 from crane.dynamics.elements import JointForces
+from crane.dynamics.formulation import carriers
 from crane.dynamics.traced import numbers_of
 from crane.dynamics.tree import TreeDynamics
 from crane.errors import InputError, known
@@ -12,7 +13,6 @@ from crane.machine import Machine
 from crane.samples import Array, as_samples
 from crane.straight import TooLongError
 
-FORMULATIONS = ("exact",)
 PATHS = ("compiled", "pinocchio")
 
 
@@ -36,7 +36,9 @@ class Dynamics:
 
     Args:
         machine: The machine; its payload and parameters are those at this moment.
-        formulation: "exact".
+        formulation: "exact", or "decoupled": every sub-chain on a base held still, as published.
+            It lacks the forces of a chain on the chain that carries it, so it does not keep
+            energy; `docs/validation/mini_forwarder.md` shows how much that is.
         path: "compiled" or "pinocchio".
 
     Raises:
@@ -44,18 +46,15 @@ class Dynamics:
     """
 
     def __init__(self, machine: Machine, formulation: str = "exact", path: str = "compiled"):
-        for what, name, names in (
-            ("formulation", formulation, FORMULATIONS),
-            ("path", path, PATHS),
-        ):
-            if name not in names:
-                raise InputError(f"{what} '{name}' is unknown, {known(names, name)}")
+        if path not in PATHS:
+            raise InputError(f"path '{path}' is unknown, {known(PATHS, path)}")
         if not isinstance(machine, Machine):
             raise InputError(f"{machine!r} is not a machine, load it with crane.load")
         self.machine = machine
+        self.carriers = carriers(machine, formulation)
         self.forces = JointForces(machine)
         self.path = path if machine.closure.compiled else "pinocchio"
-        self.tree = TreeDynamics(machine, self.forces)
+        self.tree = TreeDynamics(machine, self.forces, self.carriers)
         self._formulas: dict[str, Formula | None] = {}
         self.numbers = np.zeros(0)
         if self.path == "compiled":
@@ -220,7 +219,7 @@ class Dynamics:
         if quantity not in self._formulas:
             try:
                 self._formulas[quantity] = (
-                    Formula(quantity, self.machine, self.numbers)
+                    Formula(quantity, self.machine, self.numbers, self.carriers)
                     if self.path == "compiled"
                     else None
                 )

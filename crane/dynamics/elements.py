@@ -6,7 +6,7 @@ from crane.machine import Machine
 from crane.samples import Array
 
 _LAW = (
-    "coulomb", "coulomb_offset", "viscous", "viscous_offset", "sharpness",
+    "coulomb", "coulomb_offset", "viscous", "viscous_offset", "sharpness", "stiction", "stribeck",
     "stiffness", "damping", "constant", "slack",
     "stop", "stop_damping", "lower", "upper",
 )  # fmt: skip
@@ -20,8 +20,8 @@ class JointForces:
         machine: The machine whose `friction`, `forces` and `end_stops` act.
 
     Attributes:
-        table: (nv, 13) per joint: Coulomb friction, its offset, viscous friction, its offset, one
-            over the smoothing velocity; stiffness, damping, constant force, energy of the spring
+        table: (nv, 15) per joint: Coulomb friction, its offset, viscous friction, its offset, one
+            over the smoothing velocity, stiction, one over its velocity; stiffness, damping, constant force, energy of the spring
             at q = 0; stiffness and damping of the end stops, lower and upper limit.
     """
 
@@ -29,16 +29,18 @@ class JointForces:
         table = self.table = np.zeros((machine.model.nv, len(_LAW)))
         table[:, _LAW.index("sharpness")] = 1.0
         for joint, friction in machine.friction.items():
-            table[machine.column(joint), :5] = (
+            table[machine.column(joint), :7] = (
                 friction.coulomb,
                 friction.coulomb_offset,
                 friction.viscous,
                 friction.viscous_offset,
                 1.0 / friction.smoothing if friction.smoothing else _JUMP,
+                friction.stiction,
+                1.0 / friction.stribeck,
             )
         for element in machine.forces:
             # springs of one joint add up: sum k (q - rest) = K q - sum k rest
-            table[machine.column(element.joint), 5:9] += (
+            table[machine.column(element.joint), 7:11] += (
                 element.stiffness,
                 element.damping,
                 element.force + element.stiffness * element.rest,
@@ -47,18 +49,18 @@ class JointForces:
         for stop in machine.end_stops:
             i = machine.column(stop.joint)
             lower, upper = machine.model.lowerPositionLimit, machine.model.upperPositionLimit
-            table[i, 9:] = stop.stiffness, stop.damping, lower[i], upper[i]
+            table[i, 11:] = stop.stiffness, stop.damping, lower[i], upper[i]
         (
             self._coulomb, self._coulomb_offset, self._viscous, self._viscous_offset,
-            self._sharpness, self._stiffness, self._damping, self._constant, self._slack,
+            self._sharpness, self._stiction, self._stribeck, self._stiffness, self._damping, self._constant, self._slack,
             self._stop, self._stop_damping, self._lower, self._upper,
         ) = np.ascontiguousarray(table.T)  # fmt: skip
 
     def friction(self, v: Array) -> Array:
         """Drive force that friction consumes at every joint.
 
-        tau_F = F_C s + D_C + F_V v + D_V v s with s = tanh(v / smoothing): equation (5) of the
-        reduced-scale forwarder paper with the sign that brakes.
+        tau_F = (F_C + F_S e^-(v / v_S)^2) s + D_C + F_V v + D_V v s with s = tanh(v / smoothing):
+        equation (5) of the reduced-scale forwarder paper with the sign that brakes, and stiction.
 
         Args:
             v: (nv,) [m/s], [rad/s].
@@ -67,8 +69,9 @@ class JointForces:
             (nv,) [N], [N m].
         """
         sign = np.tanh(v * self._sharpness)
+        sticking = self._stiction * np.exp(-((v * self._stribeck) ** 2))
         return (
-            self._coulomb * sign
+            (self._coulomb + sticking) * sign
             + self._coulomb_offset
             + (self._viscous + self._viscous_offset * sign) * v
         )

@@ -23,14 +23,14 @@ from crane.straight.scalar import (
     times,
 )  # fmt: skip
 
-BODY, JOINT = 10, 13  # numbers per body and per joint
+BODY, JOINT = 10, 15  # numbers per body and per joint
 
 
 def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Array:
     """Inertias, force laws and gravity in the order that `Sweep` reads them.
 
     Per body mass, COM (3), inertia about it (xx, xy, xz, yy, yz, zz) in the body's directions of
-    the geometry; per joint the 13 numbers of `JointForces.table`; gravity (3).
+    the geometry; per joint the 15 numbers of `JointForces.table`; gravity (3).
     """
     bodies = []
     for turn, inertia in zip(geometry.turns[1:], list(machine.model.inertias)[1:], strict=True):
@@ -49,10 +49,12 @@ class Sweep:
         constants: See `numbers_of`.
         q: (nb,).
         v_a: (n,).
+        carriers: See `crane.dynamics.formulation`.
 
     Attributes:
         gamma: Rows of gamma by joint.
         rates: (nb + 1,) joint velocities, 0 for the world.
+        drift: (nb + 1,) accelerations of the joints at a_A = 0.
     """
 
     def __init__(
@@ -62,7 +64,9 @@ class Sweep:
         constants: Constants,
         q: Sequence[Number],
         v_a: Sequence[Number],
+        carriers: Sequence[int],
     ):
+        self._carriers = carriers
         self._posture, self._loops, self._q = posture, loops, q
         self._size = len(posture.geometry.parents)
         self._n = len(v_a)
@@ -73,12 +77,12 @@ class Sweep:
         self._gravity = times(posture.rotation[0], gravity)
         self.gamma = loops.gamma
         self.rates: Vector = [0.0, *(dot(self.gamma[i], v_a) for i in range(1, self._size))]
-        self._motion = Motion(posture, loops, self.rates, self._gravity)
-
-    @property
-    def drift(self) -> Vector:
-        """(nb + 1,) accelerations of the joints at a_A = 0."""
-        return self._motion.drift
+        # the loops' drift is that of the whole machine whatever carries a body
+        whole, alone = (
+            Motion(posture, loops, self.rates, self._gravity, parents)
+            for parents in (posture.geometry.parents, carriers)
+        )
+        self.drift, self._motion = whole.drift, alone
 
     @cached_property
     def _columns(self) -> list[list[tuple[Vector, Vector]]]:
@@ -87,7 +91,7 @@ class Sweep:
         for i in range(1, self._size):
             linear, angular = self._posture.columns[i]
             factors = [*self.gamma[i], self.drift[i]]
-            carried = columns[self._posture.geometry.parents[i]]
+            carried = columns[self._carriers[i]]
             columns.append(
                 [
                     (add(v, scale(factor, linear)), add(w, scale(factor, angular)))
@@ -161,13 +165,16 @@ class Sweep:
     def _law(self, i: int) -> tuple[Number, Number, Number, Number]:
         """Of joint i: passive force, friction, power taken out, energy stored."""
         (
-            coulomb, coulomb_offset, viscous, viscous_offset, sharpness,
+            coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck,
             stiffness, damping, constant, slack, stop, stop_damping, lower, upper,
         ) = self._laws[i - 1]  # fmt: skip
         q, rate = self._q[i - 1], self.rates[i]
         friction = viscous * rate + coulomb_offset
-        if coulomb != 0.0 or viscous_offset != 0.0:
+        if coulomb != 0.0 or viscous_offset != 0.0 or stiction != 0.0:
             sign = apply("tanh", sharpness * rate)
+            if stiction != 0.0:
+                slow = stribeck * rate
+                coulomb = coulomb + stiction * apply("exp", -1.0 * (slow * slow))
             friction = friction + (coulomb + viscous_offset * rate) * sign
         force = constant - stiffness * q - damping * rate
         stored = 0.5 * stiffness * q * q - constant * q + slack

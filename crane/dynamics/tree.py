@@ -1,10 +1,12 @@
 """Equations of motion by Pinocchio's algorithms on the spanning tree, projected by gamma."""
 
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
+from crane.closure.structure import Indices
 from crane.dynamics.elements import JointForces
 from crane.machine import Machine
 from crane.samples import Array, solve
@@ -26,19 +28,55 @@ class Motion(NamedTuple):
     drift: Array
 
 
+class _Part:
+    """Bodies that move together, on a base that stands still.
+
+    Args:
+        whole: The machine's tree.
+        bodies: Their indices, a parent before its children.
+
+    Attributes:
+        columns: Of their joints.
+        base: The body of the tree that they stand on.
+        model: Of them alone.
+        data: Its data.
+    """
+
+    def __init__(self, whole: pin.Model, bodies: Sequence[int]):
+        self.columns = np.array(bodies) - 1
+        self.base = whole.parents[bodies[0]]
+        self.model, place = pin.Model(), {self.base: 0}
+        for body in bodies:
+            place[body] = self.model.addJoint(
+                place[whole.parents[body]],
+                whole.joints[body],
+                whole.jointPlacements[body],
+                whole.names[body],
+            )
+            self.model.appendBodyToJoint(place[body], whole.inertias[body], pin.SE3.Identity())
+        self.data = self.model.createData()
+
+
 class TreeDynamics:
     """Any quantity of `QUANTITIES` at a closed posture, with rnea, crba and the tree's regressor.
 
     Args:
         machine: The machine.
         forces: Its friction and passive forces.
+        carriers: See `crane.dynamics.formulation`.
     """
 
-    def __init__(self, machine: Machine, forces: JointForces):
+    def __init__(self, machine: Machine, forces: JointForces, carriers: Sequence[int]):
         # a copy, so that parameters stay those of this moment
         self._model = pin.Model(machine.model)
         self._data = self._model.createData()
         self._closure, self._forces = machine.closure, forces
+        roots: dict[int, list[int]] = {}
+        root_of = {0: 0}
+        for body in range(1, self._model.njoints):
+            root_of[body] = root_of[carriers[body]] or body
+            roots.setdefault(root_of[body], []).append(body)
+        self._parts = [_Part(self._model, bodies) for bodies in roots.values()]
 
     @property
     def parameters(self) -> Array:
@@ -71,8 +109,7 @@ class TreeDynamics:
             case "bias":
                 return self._project(motion, motion.drift, False)
             case "gravity":
-                weight = pin.computeGeneralizedGravity(self._model, self._data, q)
-                return np.asarray(gamma.T @ weight)
+                return gamma.T @ self._inverse(q, np.zeros_like(v), np.zeros_like(v))
             case "friction":
                 return gamma.T @ self._forces.friction(v)
             case "passive":
@@ -85,9 +122,7 @@ class TreeDynamics:
             case "observation":
                 return np.concatenate([gamma.T @ self._forces.friction(v), self._energy(motion)])
             case "regressor":
-                a = gamma @ x + motion.drift
-                tree = pin.computeJointTorqueRegressor(self._model, self._data, q, v, a)
-                return np.asarray(gamma.T @ tree).ravel()
+                return (gamma.T @ self._regressor(q, v, gamma @ x + motion.drift)).ravel()
         raise AssertionError(quantity)
 
     def _forward(self, motion: Motion, tau_a: Array, friction: bool) -> Array:
@@ -96,7 +131,10 @@ class TreeDynamics:
 
     def _energy(self, motion: Motion) -> Array:
         """Kinetic and potential."""
-        kinetic = pin.computeKineticEnergy(self._model, self._data, motion.q, motion.v)
+        kinetic = 0.0
+        for part in self._parts:
+            c = part.columns
+            kinetic += pin.computeKineticEnergy(part.model, part.data, motion.q[c], motion.v[c])
         weight = pin.computePotentialEnergy(self._model, self._data, motion.q)
         return np.array([kinetic, weight + self._forces.potential(motion.q)])
 
@@ -108,13 +146,38 @@ class TreeDynamics:
 
     def _project(self, motion: Motion, a: Array, friction: bool) -> Array:
         """gamma^T (rnea(q, v, a) - f [+ tau_F])."""
-        tau = pin.rnea(self._model, self._data, motion.q, motion.v, a)
-        tau = tau - self._forces.passive(motion.q, motion.v)
+        tau = self._inverse(motion.q, motion.v, a) - self._forces.passive(motion.q, motion.v)
         if friction:
             tau += self._forces.friction(motion.v)
         return np.asarray(motion.gamma.T @ tau)
 
     def _mass(self, motion: Motion) -> Array:
-        upper = np.triu(pin.crba(self._model, self._data, motion.q))
-        mass = upper + np.triu(upper, 1).T
-        return np.asarray(motion.gamma.T @ mass @ motion.gamma)
+        total = np.zeros((motion.gamma.shape[1],) * 2)
+        for part in self._parts:
+            upper = np.triu(pin.crba(part.model, part.data, motion.q[part.columns]))
+            gamma = motion.gamma[part.columns]
+            total += gamma.T @ (upper + np.triu(upper, 1).T) @ gamma
+        return total
+
+    def _inverse(self, q: Array, v: Array, a: Array) -> Array:
+        """Forces along the joints (nv,), part after part."""
+        tau = np.empty_like(v)
+        for part, c in self._turned(q):
+            tau[c] = pin.rnea(part.model, part.data, q[c], v[c], a[c])
+        return tau
+
+    def _regressor(self, q: Array, v: Array, a: Array) -> Array:
+        """Of the tree (nv, 10 nb), part after part."""
+        out = np.zeros((len(v), 10 * len(v)))
+        for part, c in self._turned(q):
+            block = pin.computeJointTorqueRegressor(part.model, part.data, q[c], v[c], a[c])
+            out[np.ix_(c, (10 * c[:, None] + np.arange(10)).ravel())] = block
+        return out
+
+    def _turned(self, q: Array) -> Iterator[tuple[_Part, Indices]]:
+        """The parts and their columns, gravity turned into the directions of their bases."""
+        pin.forwardKinematics(self._model, self._data, q)
+        for part in self._parts:
+            base = self._data.oMi[part.base].rotation
+            part.model.gravity.linear = base.T @ self._model.gravity.linear
+            yield part, part.columns

@@ -149,7 +149,9 @@ def _at_once(calls: list[tuple[int, tuple]], functions: set[tuple[str, int]]) ->
             for lane in range(width):  # the first once more where there are too few
                 index, operand = part[lane] if lane < len(part) else part[0]
                 word, made = _operand(operand), f"%{name}{part[0][0]}_{lane}"
-                lines.append(f"  {made} = insertelement {kind} {vector}, double {word}, i32 {lane}")
+                lines.append(
+                    f"  {made} = insertelement {kind} {vector}, double {word}, i32 {lane}"
+                )
                 vector = made
             result = f"%{name}{part[0][0]}"
             lines.append(f"  {result} = call {kind} @{name}{width}({kind} {vector})")

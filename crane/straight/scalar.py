@@ -10,7 +10,6 @@ from collections.abc import Iterable, Sequence
 from typing import Union
 
 Number = Union["Expression", float]
-_FUNCTIONS = ("sin", "cos", "tanh", "sqrt", "abs")
 
 
 class Tape:
@@ -100,7 +99,7 @@ class Expression:
 
 
 def apply(function: str, x: Number) -> Number:
-    """One of sin, cos, tanh, sqrt, abs."""
+    """One of sin, cos, exp, tanh, sqrt, abs."""
     if isinstance(x, Expression):
         return x.tape.add(function, x.index)
     return abs(x) if function == "abs" else float(getattr(math, function)(x))

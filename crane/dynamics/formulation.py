@@ -1,0 +1,35 @@
+"""What carries what: the exact dynamics, and the published one of chains on bases held still."""
+
+from crane.errors import InputError, known
+from crane.machine import Machine
+
+FORMULATIONS = ("exact", "decoupled")
+
+
+def carriers(machine: Machine, formulation: str) -> tuple[int, ...]:
+    """The body whose motion each body shares.
+
+    "exact": the parent in the tree. "decoupled": the same within a sub-chain, but every sub-chain
+    stands on a base held still at its present pose, equations (16) to (21) of the reduced-scale
+    forwarder paper; what a chain puts on the chain that carries it is left out.
+
+    Args:
+        machine: The machine.
+        formulation: One of `FORMULATIONS`.
+
+    Returns:
+        (nb + 1,) indices of bodies; 0, the world, stands still.
+
+    Raises:
+        InputError: Unknown formulation.
+    """
+    if formulation not in FORMULATIONS:
+        raise InputError(
+            f"formulation '{formulation}' is unknown, {known(FORMULATIONS, formulation)}"
+        )
+    parents = [int(parent) for parent in machine.model.parents]
+    if formulation == "exact":
+        return tuple(parents)
+    chain = {joint: chain.name for chain in machine.chains for joint in chain.joints}
+    names = [None, *(chain[joint] for joint in machine.joints)]
+    return tuple(p if names[p] == names[i] else 0 for i, p in enumerate(parents))
