@@ -22,6 +22,7 @@ from crane.description import (
     PIGains,
     Task,
     bundled,
+    changed,
     examples,
     inertia_problem,
     read,
@@ -71,6 +72,7 @@ class Machine:
         tip: Name of the tip's frame.
         tasks: Named reference motions.
         control: PI gains by active joint.
+        changes: Numbers that are not those of its files, by name.
     """
 
     name: str
@@ -88,6 +90,7 @@ class Machine:
     tip: str | None
     tasks: Mapping[str, Task]
     control: Mapping[str, PIGains]
+    changes: Mapping[str, float]
 
     @property
     def home(self) -> Array:
@@ -203,12 +206,14 @@ class Machine:
         return dataclasses.replace(self, model=model)
 
 
-def load(name: str | Path) -> Machine:
-    """Load a machine.
+def load(name: str | Path, changes: Mapping[str, float] | None = None) -> Machine:
+    """Load a machine, perhaps with some of its numbers changed.
 
     Args:
         name: A bundled machine's name, a robot of example-robot-data by its file's name, or the
             path of a machine file (.yaml) or URDF (.urdf, with `<loop>` elements if it has loops).
+        changes: New values by the names of `crane.description.parameters`, such as
+            {"link3_G.x": 0.1, "link7.mass": 0.25, "payload.mass": 0.1}; SI units.
 
     Returns:
         The machine, its home posture closed.
@@ -216,8 +221,11 @@ def load(name: str | Path) -> Machine:
     Raises:
         DescriptionError: A file is wrong; the message has file and line.
         MechanismError: The parts do not make a machine that can be driven.
+        InputError: A change of a parameter that is not there, or to what cannot be.
     """
     spec = read(name)
+    if changes:
+        spec = changed(spec, changes)
     model = _assemble(spec)
     active = tuple(model.names)[1:] if spec.active is None else spec.active
     try:
@@ -242,6 +250,7 @@ def load(name: str | Path) -> Machine:
         tip=spec.tip,
         tasks=MappingProxyType(dict(spec.tasks)),
         control=MappingProxyType(dict(spec.control)),
+        changes=MappingProxyType(dict(changes or {})),
     )
 
 

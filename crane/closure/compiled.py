@@ -199,7 +199,8 @@ class FastClosure:
     Attributes:
         geometry: What the formulas were traced from.
         programs: Further machine code for this machine, by what it depends on.
-        bounds: Residuals that count as rounding, and as closed if they no longer fall; a small change.
+        bounds: Residuals that count as rounding, and as closed if they no longer fall; a small
+            change.
         address: Of the function `follow`, for other machine code to call.
         close_address: Likewise of `close`.
     """

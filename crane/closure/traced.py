@@ -144,7 +144,7 @@ class Posture:
 
     def __init__(self, geometry: Geometry, constants: Constants, q: Sequence[Number]):
         self.geometry, self._constants = geometry, constants
-        still = [[float(r == c) for c in range(3)] for r in range(3)]
+        still: list[Vector] = [[float(r == c) for c in range(3)] for r in range(3)]
         self.rotation: list[list[Vector]] = [still]
         self.origin: list[Vector] = [[0.0] * 3]
         self.columns: list[tuple[Vector, Vector]] = [([0.0] * 3, [0.0] * 3)]

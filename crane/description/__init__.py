@@ -1,5 +1,6 @@
 """Reading and checking what the user wrote: machine files and URDFs."""
 
+from crane.description.changes import changed, parameters
 from crane.description.inertia import inertia_problem
 from crane.description.machine_file import read
 from crane.description.sources import bundled, examples
@@ -17,5 +18,5 @@ from crane.description.spec import (
 
 __all__ = [
     "LOOP_TYPES", "Chain", "EndStop", "ForceElement", "Friction", "LoopSpec", "MachineSpec",
-    "PIGains", "Task", "bundled", "examples", "inertia_problem", "read",
+    "PIGains", "Task", "bundled", "changed", "examples", "inertia_problem", "parameters", "read",
 ]  # fmt: skip

@@ -167,7 +167,8 @@ def _loop(section: Section, tree: Tree) -> LoopSpec:
 def _friction(top: Section, tree: Tree) -> dict[str, Friction]:
     found: dict[str, Friction] = {}
     keys = (
-        "coulomb", "coulomb_offset", "viscous", "viscous_offset", "smoothing", "stiction", "stribeck",
+        "coulomb", "coulomb_offset", "viscous", "viscous_offset", "smoothing", "stiction",
+        "stribeck",
     )  # fmt: skip
     for joint, item in top.mappings("friction", "friction of", *keys):
         tree.check_joint(joint, item.where())

@@ -21,8 +21,9 @@ class JointForces:
 
     Attributes:
         table: (nv, 15) per joint: Coulomb friction, its offset, viscous friction, its offset, one
-            over the smoothing velocity, stiction, one over its velocity; stiffness, damping, constant force, energy of the spring
-            at q = 0; stiffness and damping of the end stops, lower and upper limit.
+            over the smoothing velocity, stiction, one over its velocity; stiffness, damping,
+            constant force, energy of the spring at q = 0; stiffness and damping of the end stops,
+            lower and upper limit.
     """
 
     def __init__(self, machine: Machine):
@@ -52,7 +53,8 @@ class JointForces:
             table[i, 11:] = stop.stiffness, stop.damping, lower[i], upper[i]
         (
             self._coulomb, self._coulomb_offset, self._viscous, self._viscous_offset,
-            self._sharpness, self._stiction, self._stribeck, self._stiffness, self._damping, self._constant, self._slack,
+            self._sharpness, self._stiction, self._stribeck,
+            self._stiffness, self._damping, self._constant, self._slack,
             self._stop, self._stop_damping, self._lower, self._upper,
         ) = np.ascontiguousarray(table.T)  # fmt: skip
 

@@ -2,7 +2,8 @@
 
 A library's functions take one number each and keep no register alive; these are inlined, take as
 many numbers as a register holds, and have no branches. They are correct to 1.5 units in the last
-place; exp beyond 709 is infinite, below -708 zero. Angles of 2^48 and more, which doubles know to 0.06 at best, give NaN.
+place; exp beyond 709 is infinite, below -708 zero. Angles of 2^48 and more, which doubles know to
+0.06 at best, give NaN.
 """
 
 import math
@@ -72,7 +73,7 @@ class _Text:
         return self.line(f"{operation} {self.whole} {a}, {b}")
 
     def fma(self, a: str, b: str, c: str) -> str:
-        """a b + c, rounded once."""
+        """Fused a b + c."""
         kind = self.kind
         return self.line(
             f"call {kind} @llvm.fma.v{self._width}f64({kind} {a}, {kind} {b}, {kind} {c})"
@@ -94,7 +95,7 @@ class _Text:
         return self.line(f"bitcast {self.whole} {x} to {self.kind}")
 
     def where(self, comparison: str, a: str, b: str, yes: str, no: str) -> str:
-        """yes or no, number by number."""
+        """One of two, number by number."""
         test = self.line(f"fcmp {comparison} {self.kind} {a}, {b}")
         return self.line(
             f"select <{self._width} x i1> {test}, {self.kind} {yes}, {self.kind} {no}"
@@ -105,12 +106,12 @@ class _Text:
         return self.line(f"call {self.kind} @llvm.fabs.v{self._width}f64({self.kind} {x})")
 
     def rounded(self, x: str, per: float) -> tuple[str, str]:
-        """x in units of something, rounded: bits that end with the integer, and as a number."""
+        """Nearest integer of x / per: bits that end with it, and as a number."""
         shifted = self.fma(x, self.number(1.0 / per), self.number(_INTEGER))
         return self.bits(shifted), self.do("fsub", shifted, self.number(_INTEGER))
 
     def less(self, x: str, times: str, units: tuple[float, ...]) -> str:
-        """x - times (sum of units) with little rounding."""
+        """Rest of x - times (sum of units), hardly rounded."""
         back = self.line(f"fneg {self.kind} {times}")
         for unit in units:
             x = self.fma(back, self.number(unit), x)

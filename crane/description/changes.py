@@ -1,0 +1,138 @@
+"""Machines that differ from their files in some numbers."""
+
+import copy
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
+
+from lxml import etree
+
+from crane.description.spec import Friction, MachineSpec
+from crane.errors import InputError, known
+from crane.samples import as_number
+
+PAYLOAD = "payload.mass"
+_TURNS = ("roll", "pitch", "yaw")
+
+
+class _Number:
+    """One number in an attribute of the tree.
+
+    Args:
+        element: Its element.
+        attribute: Its attribute, numbers with blanks between.
+        index: Which of them.
+    """
+
+    def __init__(self, element: etree._Element, attribute: str, index: int = 0):
+        self._element, self._attribute, self._index = element, attribute, index
+
+    def get(self) -> float:
+        return float(self._element.get(self._attribute).split()[self._index])
+
+    def set(self, value: float) -> None:
+        words = self._element.get(self._attribute).split()
+        words[self._index] = repr(value)
+        self._element.set(self._attribute, " ".join(words))
+
+
+def _numbers(tree: etree._Element) -> Iterator[tuple[str, _Number]]:
+    for link in tree.iterfind("link"):
+        name, inertial = link.get("name"), link.find("inertial")
+        if inertial is not None:
+            yield f"{name}.mass", _Number(inertial.find("mass"), "value")
+            for i, axis in enumerate("xyz"):
+                yield f"{name}.com.{axis}", _Number(inertial.find("origin"), "xyz", i)
+            for key in inertial.find("inertia").attrib:
+                yield f"{name}.inertia.{key[1:]}", _Number(inertial.find("inertia"), key)
+    for joint in tree.iterfind("joint"):
+        origin, limit = joint.find("origin"), joint.find("limit")
+        link = joint.find("child").get("link")
+        if origin is not None:
+            for i, (axis, turn) in enumerate(zip("xyz", _TURNS, strict=True)):
+                yield f"{link}.{axis}", _Number(origin, "xyz", i)
+                yield f"{link}.{turn}", _Number(origin, "rpy", i)
+        for key in ("lower", "upper"):
+            if limit is not None and limit.get(key) is not None:
+                yield f"{joint.get('name')}.{key}", _Number(limit, key)
+
+
+def parameters(spec: MachineSpec) -> dict[str, float]:
+    """Numbers of a machine that can be changed, by name.
+
+    `LINK.mass`, `LINK.com.x`, `LINK.inertia.xx` (about the centre of mass), `LINK.x`, `LINK.roll`
+    (where its joint places it on its parent; frames such as pins are links, too), `JOINT.lower`,
+    `friction.JOINT.coulomb`, `control.JOINT.kp`, and `payload.mass`, a point mass at the tip.
+    """
+    found = {name: number.get() for name, number in _numbers(spec.tree)}
+    joints = [j.get("name") for j in spec.tree.iterfind("joint") if j.get("type") != "fixed"]
+    for joint in joints:
+        friction = spec.friction.get(joint, Friction())
+        for field in dataclasses.fields(Friction):
+            found[f"friction.{joint}.{field.name}"] = getattr(friction, field.name)
+    for joint, gains in spec.control.items():
+        for field in dataclasses.fields(gains):
+            found[f"control.{joint}.{field.name}"] = getattr(gains, field.name)
+    if spec.tip is not None:
+        found[PAYLOAD] = 0.0
+    return found
+
+
+def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
+    """A machine with other numbers.
+
+    Args:
+        spec: The machine as read.
+        changes: New values by name, see `parameters`; SI units.
+
+    Raises:
+        InputError: Unknown name, or a value that cannot be.
+    """
+    names = parameters(spec)
+    tree = copy.deepcopy(spec.tree)
+    numbers = dict(_numbers(tree))
+    friction, control = dict(spec.friction), dict(spec.control)
+    for name, given in changes.items():
+        if name not in names:
+            raise InputError(f"parameter '{name}' is unknown, {known(names, name)}")
+        value = as_number(given, f"parameter '{name}'", "")
+        head, _, rest = name.partition(".")
+        if name.endswith(".mass") and value < 0:
+            raise InputError(f"parameter '{name}' is {value:g} kg, it must not be negative")
+        if name == PAYLOAD:
+            _load(tree, str(spec.tip), value)
+        elif head == "friction":
+            _set(friction, rest, value, Friction)
+        elif head == "control":
+            _set(control, rest, value, None)
+        else:
+            numbers[name].set(value)
+    return dataclasses.replace(
+        spec,
+        tree=tree,
+        friction=MappingProxyType(friction),
+        control=MappingProxyType(control),
+        where={**spec.where, "link payload": PAYLOAD},
+    )
+
+
+def _set(by_joint: dict, name: str, value: float, default: Callable | None) -> None:
+    joint, _, field = name.rpartition(".")
+    before = by_joint[joint] if default is None else by_joint.get(joint, default())
+    by_joint[joint] = dataclasses.replace(before, **{field: value})
+
+
+def _load(tree: etree._Element, tip: str, mass: float) -> None:
+    """Fix a point mass to the tip."""
+    if mass == 0:
+        return
+    link = etree.SubElement(tree, "link", name="payload")
+    inertial = etree.SubElement(link, "inertial")
+    etree.SubElement(inertial, "origin", xyz="0 0 0", rpy="0 0 0")
+    etree.SubElement(inertial, "mass", value=repr(mass))
+    etree.SubElement(
+        inertial, "inertia", dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
+    )
+    joint = etree.SubElement(tree, "joint", name="payload_fixed", type="fixed")
+    etree.SubElement(joint, "parent", link=tip)
+    etree.SubElement(joint, "child", link="payload")
