@@ -13,6 +13,7 @@ from lxml import etree
 import crane
 
 Array = np.ndarray
+INTEGRATORS = ("Euler", "implicitfast", "RK4")
 
 
 class ConstraintDynamics:

@@ -80,7 +80,7 @@ def draw(curves: Curves, path: Path) -> None:
             title=f"{DURATION:g} s of the mini forwarder in springs and dampers",
         )
         low = min(t for _, _, t in first)
-        axes.set_xlim(left=1e3 * low / 2.2)
+        axes.set_xlim(left=1e3 * low / 3)
         figure.legend(loc="outside right upper")
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=160)

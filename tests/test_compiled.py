@@ -3,6 +3,7 @@
 import copy
 import threading
 import warnings
+from pathlib import Path
 
 import numpy as np
 import oracles
@@ -13,6 +14,7 @@ import crane.dynamics.tree
 import crane.straight.machine_code
 from crane.errors import CraneError, CraneWarning, InputError, OutOfReachError, WrongBranchError
 
+DATA = Path(__file__).parent / "data"
 # name: arguments besides q_a, and keywords
 QUANTITIES = {
     "inverse": ("va", {}),
@@ -189,6 +191,64 @@ def test_elements_act_in_what_is_compared(machines):
     machine, share = machines["mini"]
     q_a = draw(machine, 40, share=share)["q"]
     assert machine.end_stops and (q_a > machine.upper).any() and (q_a < machine.lower).any()
+
+
+# --- the body that carries all others --------------------------------------------------------
+
+
+def on_a_stand(folder, kind, closed):
+    """The five-bar, closed or cut open, on a stand that moves along or about an oblique axis."""
+    text = (DATA / "five_bar.urdf").read_text()
+    if not closed:
+        text = text[: text.index("<loop")] + "</robot>"
+        text = text.replace('independent="false"', 'independent="true"')
+    path = folder / f"{kind}_{closed}.urdf"
+    path.write_text(
+        text.replace(
+            '<link name="ground"/>',
+            f"""<link name="floor"/>
+            <joint name="stand" type="{kind}" independent="true">
+              <origin xyz="0.4 -0.7 1.1" rpy="0.5 -0.9 0.3"/>
+              <parent link="floor"/><child link="ground"/><axis xyz="0.48 -0.6 0.64"/>
+              <limit lower="-2" upper="2" effort="99" velocity="9"/>
+            </joint>
+            <link name="ground"><inertial>
+              <origin xyz="0.1 0.3 -0.2" rpy="0.4 0.2 0.1"/><mass value="2"/>
+              <inertia ixx="0.05" ixy="0.01" ixz="0" iyy="0.06" iyz="-0.01" izz="0.07"/>
+            </inertial></link>""",
+        )
+    )
+    return crane.load(path)
+
+
+def test_the_trunk_is_the_body_that_carries_all_others(machines, five_bar, tmp_path):
+    def trunk(machine):
+        return machine.closure.fast.geometry.trunk
+
+    for name in ("mini", "loaded mini", "ur5_robot", "xarm7"):
+        assert trunk(machines[name][0]) == 1, name
+    # several children of the world: slider and crank, two cranks, the platform and its legs
+    for machine in (machines["slider_crank"][0], five_bar, machines["stewart"][0]):
+        assert trunk(machine) == 0
+    # one child, but a loop ends in the world
+    held = crane.load(oracles.looped_arm(tmp_path, "revolute", "[0, 0, 1]"))
+    assert list(held.model.parents).count(0) == 2 and trunk(held) == 0
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+@pytest.mark.parametrize("closed", [True, False])
+def test_an_oblique_trunk_agrees_with_pinocchio(tmp_path, kind, closed):
+    machine = dressed(on_a_stand(tmp_path, kind, closed))
+    assert machine.closure.fast.geometry.trunk == 1
+    samples = draw(machine, 40)
+    home, stand = machine.home[machine.closure.active], machine.active.index("stand")
+    moved = samples["q"][:, stand].copy()
+    samples["q"] = home + np.random.default_rng(1).uniform(-0.3, 0.3, samples["q"].shape)
+    samples["q"][:, stand] = moved
+    both = crane.Dynamics(machine), crane.Dynamics(machine, path="pinocchio")
+    for quantity in QUANTITIES:
+        found, wanted = (ask(dynamics, quantity, samples) for dynamics in both)
+        assert off(found, wanted) < 1e-12, quantity
 
 
 # --- closure ---------------------------------------------------------------------------------
@@ -455,6 +515,7 @@ def test_long_formulas_are_left_to_pinocchio(mini, monkeypatch):
     quick = crane.Dynamics(mini)
     wanted = {quantity: ask(quick, quantity, samples) for quantity in QUANTITIES}
     monkeypatch.setattr(crane.straight.machine_code, "MOST", 10)
+    monkeypatch.setattr(crane.closure.compiled, "_SHARED", {})
     asked = []
     at = crane.dynamics.tree.TreeDynamics.at
 

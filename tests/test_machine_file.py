@@ -248,7 +248,7 @@ KEYS = [
     case(
         "friction without value",
         "four_bar.yaml:21: friction of 'coupler' is empty, its keys are coulomb, "
-        "coulomb_offset, viscous, viscous_offset, smoothing",
+        "coulomb_offset, viscous, viscous_offset, smoothing, stiction, stribeck",
         swap("{viscous: 0.01}", ""),
     ),
     case(
@@ -405,6 +405,11 @@ TYPES = [
         "viscous is negative",
         "four_bar.yaml:21: 'viscous' of friction of 'coupler' is -0.01, give at least 0",
         swap("viscous: 0.01", "viscous: -0.01"),
+    ),
+    case(
+        "no Stribeck velocity",
+        "four_bar.yaml:21: 'stribeck' of friction of 'coupler' is 0, give a velocity",
+        swap("viscous: 0.01", "viscous: 0.01, stribeck: 0"),
     ),
     case(
         "force does nothing",

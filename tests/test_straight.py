@@ -1,11 +1,13 @@
 """Traced arithmetic and its machine code against numpy."""
 
+import functools
 import gc
 import math
 import subprocess
 import sys
 import threading
 from ctypes import c_void_p
+from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
@@ -203,6 +205,130 @@ def test_constants_and_operations_of_the_same_number_differ():
     np.testing.assert_allclose(run(formulas, x), wanted, rtol=1e-15)
     backwards = run(lambda x: formulas(x)[::-1], x)
     np.testing.assert_allclose(backwards, wanted[::-1], rtol=1e-15)
+
+
+# --- sin, cos and tanh of several numbers at once ---------------------------------------------
+
+PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459230781640629")
+VECTOR = ("sin", "cos", "tanh")
+
+
+def sine(x):
+    """To some 40 digits, by Taylor's series."""
+    turns = (2 * x / PI).to_integral_value()
+    x -= turns * PI / 2
+    odd = int(turns) % 2
+    term, total, k = (Decimal(1), Decimal(1), 0) if odd else (x, x, 1)
+    while abs(term) > Decimal("1e-60") * abs(total):
+        k += 2
+        term *= -x * x / (k * (k - 1))
+        total += term
+    return -total if int(turns) % 4 >= 2 else total
+
+
+def hyperbolic(x):
+    if abs(x) < Decimal("1e-45"):
+        return x
+    power = (2 * x).exp()
+    return (power - 1) / (power + 1)
+
+
+EXACT = {"sin": sine, "cos": lambda x: sine(x + PI / 2), "tanh": hyperbolic}
+
+
+@functools.cache
+def drawn(name):
+    """Arguments of a function, and what it is there: tiny to large, and where it changes."""
+    random = np.random.default_rng(0)
+    x = [random.uniform(-1, 1, 600), 10.0 ** random.uniform(-12, 0, 200), [1e-300, -1e-300]]
+    if name == "tanh":
+        edges = np.array([0.625, 20.0, *(0.25 * math.log(2.0) * np.arange(1, 40, 2))])
+        x += [random.uniform(-25, 25, 600), np.nextafter(edges, 0), np.nextafter(edges, 99)]
+    else:
+        turns = np.concatenate([np.arange(-40, 41), random.integers(2**47, size=300)])
+        right = 0.5 * math.pi * turns[np.abs(turns) < 2**47.3]
+        x += [right, np.nextafter(right, 0), right + 1e-7, 0.5 * right]
+        x += [random.uniform(-10, 10, 600), 2.0 ** random.uniform(0, 48, 300)]
+    x = np.concatenate(x)
+    with localcontext(prec=110):
+        return x, [EXACT[name](Decimal(value)) for value in x.tolist()]
+
+
+def units_off(found, wanted):
+    """Largest error in units in the last place."""
+    return max(
+        float(abs(Decimal(a) - b) / Decimal(math.ulp(float(b))))
+        for a, b in zip(np.asarray(found).tolist(), wanted, strict=True)
+    )
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 8, 9, 17])
+@pytest.mark.parametrize("name", VECTOR)
+def test_functions_are_correct_to_one_and_a_half_units(name, count):
+    x, wanted = drawn(name)
+    function = Function([apply(name, value) for value in Tape().loads(0, 0, count)])
+    rows = np.resize(x, (-(-len(x) // count), count))  # the first ones again at the end
+    found = np.concatenate([function(row) for row in rows])[: len(x)]
+    assert units_off(found, wanted) <= 1.5
+
+
+def test_the_reference_of_functions_is_right():
+    """Digits of tables: sin 1, cos 1, tanh 1."""
+    with localcontext(prec=110):
+        for name, digits in (
+            ("sin", "0.84147098480789650665250232163029899962256306079837"),
+            ("cos", "0.54030230586813971740093660744297660373231042061792"),
+            ("tanh", "0.76159415595576488811945828260479359041276859725793"),
+        ):
+            assert abs(EXACT[name](Decimal(1)) - Decimal(digits)) < Decimal("1e-49")
+        assert abs(sine(PI / 6) - Decimal("0.5")) < Decimal("1e-60")
+
+
+@pytest.mark.parametrize("name", ["sin", "cos"])
+def test_angles_that_doubles_do_not_know_are_not_numbers(name):
+    odd = np.array([NAN, INF, -INF, 2.0**48, -(2.0**48), 1e300, -1e300])
+    function = Function([apply(name, x) for x in Tape().loads(0, 0, 5)])
+    for at in range(5):
+        for value in odd:
+            x = np.array([0.3, -1.0, 2.0, 5.0, 2.0**48 - 1])
+            x[at] = value
+            found = function(x)
+            assert math.isnan(found[at])
+            others = np.arange(5) != at  # no number touches another
+            np.testing.assert_array_equal(found[others], function(np.where(others, x, 0))[others])
+            assert np.isfinite(found[others]).all()
+
+
+def test_tanh_ends_at_one_and_begins_with_its_argument():
+    tiny = [0.0, 5e-324, -5e-324, 1e-310, 1e-300, -1e-160, 1e-20, -1e-9]
+    large = [INF, -INF, 1e308, -1e308, 800.0, -20.0, 19.5, NAN]
+    x = np.array([*tiny, *large])
+    found = run(lambda x: [apply("tanh", value) for value in x], x)
+    np.testing.assert_array_equal(found[:8], tiny)
+    np.testing.assert_array_equal(found[8:], [1, -1, 1, -1, 1, -1, 1, NAN])
+    assert run(lambda x: [apply("tanh", x[0])], [18.0])[0] < 1.0
+
+
+def test_functions_of_functions_are_taken_in_order():
+    """A program of many levels, some of them wider than a register, with operations between."""
+
+    def formulas(x, do):
+        sines, cosines = ([do(name, value) for value in x] for name in ("sin", "cos"))
+        return [
+            *sines, *cosines,
+            *(do("tanh", s) for s in sines),
+            *(do("sin", c + value) for c, value in zip(cosines, x, strict=True)),
+            *(do("cos", do("tanh", do("sin", 2.0 * s) + s)) for s in sines),
+            do("tanh", x[0]) * sines[1] + do("tanh", do("cos", do("cos", do("cos", x[2])))),
+        ]  # fmt: skip
+
+    x = np.random.default_rng(4).uniform(-3, 3, 11)
+    wanted = formulas(x, lambda name, value: getattr(np, name)(value))
+    np.testing.assert_allclose(
+        run(lambda x: formulas(x, apply), x), wanted, rtol=3e-15, atol=1e-15
+    )
+    backwards = run(lambda x: formulas(x, apply)[::-1], x)
+    np.testing.assert_allclose(backwards[::-1], wanted, rtol=3e-15, atol=1e-15)
 
 
 # --- what is not finite ----------------------------------------------------------------------

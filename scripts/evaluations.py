@@ -1,0 +1,133 @@
+"""Single evaluations and steps of the benchmark, and that all engines agree."""
+
+import numpy as np
+import pinocchio as pin
+from measuring import Call, measure, microseconds, table
+from peers import INTEGRATORS, ConstraintDynamics, MuJoCo
+from subject import START, FormulaLoop, Runner, along
+
+import crane
+from crane.control import PI, Free
+from crane.paths import task_path
+
+
+def agree(machine: crane.Machine) -> str:
+    """That all engines simulate the same machine: mass, and accelerations at the start."""
+    q_a, v_a = START
+    active, rest = machine.closure.active, np.zeros(len(q_a))
+    q = machine.closure.solve(q_a)
+    v = machine.closure.gamma(q) @ v_a
+    ours = crane.Dynamics(machine).forward(q_a, v_a, rest)
+    # MuJoCo's connections give way by (1 - d) / d, d the impedance: three of them tell the limit
+    soft = []
+    for impedance in (0.9999, 0.9998, 0.9996):
+        engine = MuJoCo(machine, 1e-3, "RK4", impedance)
+        engine.start(q, v)
+        soft.append(engine.acceleration()[active])
+    give = np.array([1e-4 / 0.9999, 2e-4 / 0.9998, 4e-4 / 0.9996])
+    others = {
+        "Pinocchio path": (
+            crane.Dynamics(machine, path="pinocchio").forward(q_a, v_a, rest),
+            1e-11,
+        ),
+        "pin.constraintDynamics": (ConstraintDynamics(machine).acceleration(q, v)[active], 1e-9),
+        "MuJoCo": (np.linalg.solve(np.vander(give, increasing=True), np.array(soft))[0], 1e-3),
+    }
+    mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
+    if abs(engine.mass / mass - 1) > 1e-12:
+        raise SystemExit(f"error: MuJoCo's crane has {engine.mass} kg, ours {mass} kg")
+    gaps = []
+    for name, (theirs, bound) in others.items():
+        gap = float(np.abs(theirs - ours).max() / np.abs(ours).max())
+        if not gap < bound:
+            raise SystemExit(f"error: {name} disagrees, {theirs} and {ours}")
+        gaps.append(f"{name} {gap:.0e}")
+    give_way = np.abs(soft[0] - ours).max() / np.abs(ours).max()
+    return (
+        f"All engines carry {mass:.4f} kg. Largest difference of their accelerations at the start "
+        f"from the compiled path, relative: {', '.join(gaps)} (MuJoCo's in the limit of rigid "
+        f"connections; with its largest impedance, 0.9999, it is {give_way:.0e})."
+    )
+
+
+def forward_dynamics(machine: crane.Machine, rounds: int) -> str:
+    """One evaluation, over 2,000 states of a motion."""
+    q_a, v_a = along(2000)
+    tau = np.zeros_like(q_a)
+    q = machine.closure.solve(q_a)
+    ours, slow = crane.Dynamics(machine), crane.Dynamics(machine, path="pinocchio")
+    samples = list(zip(q_a, v_a, tau, strict=True))
+    rates = (ours.at("rates", *sample) for sample in zip(q, v_a, tau, strict=True))
+    states = [(x, rate[: machine.model.nv]) for x, rate in zip(q, rates, strict=True)]
+    formula = FormulaLoop(ours, q, v_a, tau)
+    peer, force = ConstraintDynamics(machine), np.zeros(machine.model.nv)
+    model, data = machine.model, machine.model.createData()
+    few = samples[:100]
+    calls: dict[str, Call] = {
+        "compiled path, the formula in a loop of machine code, posture given": formula.run,
+        "the same, called through ctypes": formula.call_each,
+        "compiled path, a stack (loops closed, everything in machine code)": (
+            lambda: ours.forward(q_a, v_a, tau)
+        ),
+        "compiled path, one sample called from Python (loops closed)": (
+            lambda: [ours.forward(*sample) for sample in samples]
+        ),
+        "`pin.rnea` of the spanning tree, called from Python": (
+            lambda: [pin.rnea(model, data, x, rate, rate) for x, rate in states]
+        ),
+        "`pin.constraintDynamics`, posture given, called from Python": (
+            lambda: [peer.forward(x, rate, force) for x, rate in states]
+        ),
+        "`pin.normalize`, which has nothing to do here, called from Python": (
+            lambda: [pin.normalize(model, x) for x, _ in states]
+        ),
+        "Pinocchio path, one sample called from Python (loops closed)": (
+            lambda: [slow.forward(*sample) for sample in few]
+        ),
+    }
+    counts = dict.fromkeys(calls, len(q_a)) | {list(calls)[-1]: len(few)}
+    times = measure(calls, rounds)
+    if not np.allclose(formula.out, ours.forward(q_a, v_a, tau), rtol=1e-9):
+        raise SystemExit("error: the formula in the loop is not Dynamics.forward")
+    return microseconds("forward dynamics", {name: t / counts[name] for name, t in times.items()})
+
+
+def one_step(mini: crane.Machine, bare: crane.Machine, rounds: int) -> str:
+    """One step of each integrator at 1 ms."""
+    path = task_path(mini, "lift")
+    start = path(0.0)
+    full, plain = Runner(mini, PI(mini, path), *start[:2]), Runner(bare, Free(bare), *START)
+    q = bare.closure.solve(START[0])
+    v = bare.closure.gamma(q) @ START[1]
+    engines = {name: MuJoCo(bare, 1e-3, name) for name in INTEGRATORS}
+
+    def theirs(name: str) -> None:
+        engines[name].start(q, v)
+        engines[name].run(1000)
+
+    calls: dict[str, Call] = {
+        "compiled path, RK4, with friction and PI controllers": lambda: full.run(1e-3, 1000),
+        "compiled path, RK4, springs and dampers only": lambda: plain.run(1e-3, 1000),
+        "MuJoCo Euler, springs and dampers only": lambda: theirs("Euler"),
+        "MuJoCo implicitfast, springs and dampers only": lambda: theirs("implicitfast"),
+        "MuJoCo RK4, springs and dampers only": lambda: theirs("RK4"),
+    }
+    times = measure(calls, rounds)
+    return microseconds("step of 1 ms", {name: t / 1000 for name, t in times.items()})
+
+
+def task(mini: crane.Machine, rounds: int) -> str:
+    """Ten seconds of the controlled lift at 1 ms."""
+    path = task_path(mini, "lift")
+    runner = Runner(mini, PI(mini, path), *path(0.0)[:2])
+    times = measure(
+        {
+            "the loop in machine code alone": lambda: runner.run(1e-3, 10_000),
+            "`crane.simulate`, from call to recording": lambda: crane.simulate(
+                mini, PI(mini, path)
+            ),
+        },
+        rounds,
+    )
+    rows = [(name, f"{t:.3f}", f"{10 / t:.0f}") for name, t in times.items()]
+    return table(("10 s of lifting, PI control and friction", "time [s]", "times real time"), rows)

@@ -1,0 +1,35 @@
+"""Taking times, and showing them as tables."""
+
+import statistics
+import time
+from collections.abc import Callable
+
+Call = Callable[[], object]
+Clock = Callable[[], float]
+
+
+def measure(
+    calls: dict[str, Call], rounds: int, clock: Clock = time.process_time
+) -> dict[str, float]:
+    """Median time of each call [s]; they take turns, after one turn that does not count."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for turn in range(rounds + 1):
+        for name, call in calls.items():
+            start = clock()
+            call()
+            if turn:
+                times[name].append(clock() - start)
+    return {name: statistics.median(samples) for name, samples in times.items()}
+
+
+def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    """As Markdown, numbers to the right."""
+    marks = ["---", *["---:"] * (len(head) - 1)]
+    return "\n".join(f"| {' | '.join(row)} |" for row in (head, tuple(marks), *rows))
+
+
+def microseconds(what: str, times: dict[str, float]) -> str:
+    """A table of times, with their ratios to the first."""
+    unit = next(iter(times.values()))
+    rows = [(name, f"{1e6 * t:.2f}", f"{t / unit:.1f}") for name, t in times.items()]
+    return table((what, "time [us]", "ratio"), rows)

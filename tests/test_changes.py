@@ -1,0 +1,108 @@
+"""Machines loaded with some of their numbers changed."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import crane
+from crane.description import parameters, read
+from crane.errors import InputError
+
+pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+POSE = np.array([0.3, 0.021, 0.012])
+
+
+@pytest.fixture(scope="module")
+def mini():
+    return crane.load("mini_forwarder")
+
+
+def tip(machine, q_a=POSE):
+    return crane.Kinematics(machine).position(q_a)
+
+
+def test_without_changes_nothing_changes(mini):
+    names = parameters(read("mini_forwarder"))
+    same = crane.load("mini_forwarder", dict(list(names.items())[:-1]))  # all but the payload
+    for name in ("mass_matrix", "gravity"):
+        one, two = (getattr(crane.Dynamics(m), name)(POSE) for m in (mini, same))
+        assert np.array_equal(one, two)
+    assert same.friction == {**dict.fromkeys(mini.joints, crane.Friction()), **mini.friction}
+    assert same.control == mini.control
+
+
+def test_a_payload_is_that_of_the_machine(mini):
+    loaded = crane.load("mini_forwarder", {"payload.mass": 0.1})
+    wanted = mini.with_payload(crane.Payload(mini.tip, 0.1))
+    v_a, a_a = np.array([0.3, 0.01, 0.02]), np.array([1.0, 0.1, 0.1])
+    one, two = (crane.Dynamics(m).inverse(POSE, v_a, a_a) for m in (loaded, wanted))
+    assert np.abs(one - two).max() < 1e-13 * np.abs(two).max()
+
+
+def test_a_mass_changes_the_weight_by_its_own(mini):
+    """dV/dm = g z of that body's centre of mass."""
+    heavy = crane.load("mini_forwarder", {"link4.mass": 0.301})
+    gap = crane.Dynamics(heavy).energy(POSE, 0 * POSE)[1]
+    gap -= crane.Dynamics(mini).energy(POSE, 0 * POSE)[1]
+    data = mini.model.createData()
+    pin.forwardKinematics(mini.model, data, mini.closure.solve(POSE))
+    body = mini.model.getJointId("q6")
+    centre = data.oMi[body].act(mini.model.inertias[body].lever)
+    assert gap == pytest.approx(0.1 * 9.81 * centre[2], rel=1e-12)
+
+
+def test_a_pin_moves_the_linkage(mini):
+    """A2's rod eye further out: G stays A2's pin-to-pin length from E, so the boom turns."""
+    moved = crane.load("mini_forwarder", {"link3_G.x": 0.097, "link3_G.y": 0.002})
+    assert np.linalg.norm(tip(moved) - tip(mini)) > 1e-3
+    data = moved.model.createData()
+    pin.framesForwardKinematics(moved.model, data, moved.closure.solve(POSE))
+    boom, pin_g, base = (
+        data.oMf[moved.frame(name)] for name in ("link3", "link3_G", "A2_barrel")
+    )
+    assert np.allclose(boom.actInv(pin_g.translation), [0.097, 0.002, 0.0], atol=1e-15)
+    length = np.linalg.norm(pin_g.translation - base.translation)
+    assert length == pytest.approx(0.0825 + POSE[2], abs=1e-14)
+
+
+def test_friction_control_and_limits():
+    changed = {
+        "friction.X1.coulomb": 20.0,
+        "friction.q3.stiction": 0.5,
+        "control.X2.kp": 17.0,
+        "X1.upper": 0.025,
+    }
+    machine = crane.load("mini_forwarder", changed)
+    assert machine.friction["X1"].coulomb == 20.0 and machine.friction["X1"].viscous == 600.4
+    assert machine.friction["q3"].stiction == 0.5 and machine.friction["q3"].viscous == 0.4
+    assert machine.control["X2"].kp == 17.0 and machine.control["X2"].ki == 20000
+    assert machine.upper[1] == 0.025
+    assert dict(machine.changes) == changed
+
+
+def test_urdfs_can_be_changed_too():
+    nominal, heavy = (crane.load("ur5_robot", changes) for changes in (None, {"forearm_link.mass": 9.0}))
+    q = np.array([0.1, -1.0, 0.8, 0.3, 0.2, 0.1])
+    assert np.abs(crane.Dynamics(heavy).gravity(q) - crane.Dynamics(nominal).gravity(q)).max() > 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"link3G.x": 1.0}, "parameter 'link3G.x' is unknown, did you mean 'link3_G.x'?"),
+        ({"link7.mass": -1.0}, "parameter 'link7.mass' is -1 kg, it must not be negative"),
+        ({"link7.mass": "heavy"}, "parameter 'link7.mass' is not made of real numbers"),
+        ({"link7.mass": float("nan")}, "parameter 'link7.mass' is nan"),
+        ({"friction.X1.coulomb": -1}, "coulomb of friction is -1, it must not be negative"),
+        ({"friction.X1.stribeck": 0}, "stribeck of friction is 0"),
+    ],
+)
+def test_what_cannot_be_is_refused(changes, message):
+    with pytest.raises(InputError) as caught:
+        crane.load("mini_forwarder", changes)
+    assert str(caught.value).startswith(message) and "\n" not in str(caught.value)
+
+
+def test_a_geometry_that_does_not_close_is_refused():
+    with pytest.raises(crane.CraneError, match="link3_G|A2_eye|X2|closed"):
+        crane.load("mini_forwarder", {"link3_G.x": 0.4})
