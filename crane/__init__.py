@@ -7,7 +7,7 @@ if TYPE_CHECKING:
     from crane.batch import Batch, simulate_batch
     from crane.closure import Closure
     from crane.control import PI, ComputedTorque
-    from crane.description import EndStop, ForceElement, Friction, PIGains
+    from crane.description import EndStop, ForceElement, Friction, GasSpring, PIGains
     from crane.dynamics import Dynamics
     from crane.errors import CraneError, CraneWarning
     from crane.kinematics import Kinematics
@@ -15,13 +15,14 @@ if TYPE_CHECKING:
     from crane.paths import Path, point_to_point, polynomial, task_path, tip_path
     from crane.recording import Recording
     from crane.simulation import simulate
+    from crane.studies import Study, study
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "crane.closure": ("Closure",),
     "crane.control": ("PI", "ComputedTorque"),
-    "crane.description": ("EndStop", "ForceElement", "Friction", "PIGains"),
+    "crane.description": ("EndStop", "ForceElement", "Friction", "GasSpring", "PIGains"),
     "crane.dynamics": ("Dynamics",),
     "crane.errors": ("CraneError", "CraneWarning"),
     "crane.kinematics": ("Kinematics",),
@@ -30,13 +31,14 @@ _HOMES = {
     "crane.recording": ("Recording",),
     "crane.batch": ("Batch", "simulate_batch"),
     "crane.simulation": ("simulate",),
+    "crane.studies": ("Study", "study"),
 }
 
 __all__ = [
     "PI", "Batch", "Closure", "ComputedTorque", "CraneError", "CraneWarning", "Dynamics",
-    "EndStop", "ForceElement", "Friction", "Kinematics", "Machine", "PIGains", "Path",
-    "Payload", "Recording", "load", "point_to_point", "polynomial", "simulate",
-    "simulate_batch", "task_path", "tip_path",
+    "EndStop", "ForceElement", "Friction", "GasSpring", "Kinematics", "Machine", "PIGains", "Path",
+    "Payload", "Recording", "Study", "load", "point_to_point", "polynomial", "simulate",
+    "simulate_batch", "study", "task_path", "tip_path",
 ]  # fmt: skip
 
 

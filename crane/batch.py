@@ -13,7 +13,7 @@ from crane.dynamics import Dynamics
 from crane.errors import CraneError, InputError
 from crane.machine import Machine
 from crane.samples import Array
-from crane.simulation import Progress, trajectory
+from crane.simulation import Progress, imbalance, trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +27,7 @@ class Batch:
         tau: (B, N, n) active forces [N], [N m].
         energy: (B, N, 4) kinetic, potential, work of the active forces, dissipated [J].
         failures: Why a simulation failed, by its index.
+        warnings: What is doubtful about one that did not, by its index.
     """
 
     time: Array
@@ -35,6 +36,7 @@ class Batch:
     tau: Array
     energy: Array
     failures: dict[int, str]
+    warnings: dict[int, str]
 
 
 def simulate_batch(
@@ -108,10 +110,12 @@ def simulate_batch(
                     progress((len(results) + len(failures)) / len(machines))
     if not results:
         raise InputError(f"all {len(machines)} simulations failed, the first: {failures[0]}")
-    return _stack(results, failures, len(machines))
+    return _stack(results, failures, len(machines), step)
 
 
-def _stack(results: dict[int, tuple[Array, ...]], failures: dict[int, str], count: int) -> Batch:
+def _stack(
+    results: dict[int, tuple[Array, ...]], failures: dict[int, str], count: int, step: float
+) -> Batch:
     lengths = {len(result[0]) for result in results.values()}
     if len(lengths) > 1:
         raise InputError(
@@ -125,4 +129,9 @@ def _stack(results: dict[int, tuple[Array, ...]], failures: dict[int, str], coun
             stack[i] = result[k]
         stacks.append(stack)
     q, v, tau, energy = stacks
-    return Batch(first[0], q, v, tau, energy, dict(sorted(failures.items())))
+    doubts = {
+        i: text
+        for i in sorted(results)
+        if (text := imbalance(energy[i, :, 2], energy[i, :, :2], energy[i, :, 3], step))
+    }
+    return Batch(first[0], q, v, tau, energy, dict(sorted(failures.items())), doubts)

@@ -18,6 +18,7 @@ from crane.description import (
     EndStop,
     ForceElement,
     Friction,
+    GasSpring,
     MachineSpec,
     PIGains,
     Task,
@@ -68,6 +69,7 @@ class Machine:
         upper: (n,) upper limits of the active joints [m], [rad].
         friction: Friction by joint.
         forces: Passive force elements.
+        gas_springs: Enclosed gas along joints, at most one per joint.
         end_stops: End stops.
         tip: Name of the tip's frame.
         tasks: Named reference motions.
@@ -86,6 +88,7 @@ class Machine:
     upper: Array
     friction: Mapping[str, Friction]
     forces: tuple[ForceElement, ...]
+    gas_springs: tuple[GasSpring, ...]
     end_stops: tuple[EndStop, ...]
     tip: str | None
     tasks: Mapping[str, Task]
@@ -161,17 +164,22 @@ class Machine:
         *,
         friction: Mapping[str, Friction] | None = None,
         forces: tuple[ForceElement, ...] | None = None,
+        gas_springs: tuple[GasSpring, ...] | None = None,
         end_stops: tuple[EndStop, ...] | None = None,
     ) -> "Machine":
-        """The same machine with other friction, passive forces or end stops.
+        """The same machine with other friction, passive forces, gas springs or end stops.
 
         Raises:
-            InputError: A joint is unknown, or an end stop's joint has no limits.
+            InputError: A joint is unknown, has two gas springs, or an end stop but no limits.
         """
         for joint in friction or {}:
             self.column(joint)
         for force in forces or ():
             self.column(force.joint)
+        for spring in gas_springs or ():
+            self.column(spring.joint)
+            if [other.joint for other in gas_springs or ()].count(spring.joint) > 1:
+                raise InputError(f"joint '{spring.joint}' has two gas springs, keep one")
         for stop in end_stops or ():
             column = self.column(stop.joint)
             limits = self.model.lowerPositionLimit[column], self.model.upperPositionLimit[column]
@@ -181,6 +189,7 @@ class Machine:
             self,
             friction=self.friction if friction is None else MappingProxyType(dict(friction)),
             forces=self.forces if forces is None else tuple(forces),
+            gas_springs=self.gas_springs if gas_springs is None else tuple(gas_springs),
             end_stops=self.end_stops if end_stops is None else tuple(end_stops),
         )
 
@@ -246,6 +255,7 @@ def load(name: str | Path, changes: Mapping[str, float] | None = None) -> Machin
         upper=_fixed(upper[closure.active]),
         friction=MappingProxyType(dict(spec.friction)),
         forces=spec.forces,
+        gas_springs=spec.gas_springs,
         end_stops=spec.end_stops,
         tip=spec.tip,
         tasks=MappingProxyType(dict(spec.tasks)),

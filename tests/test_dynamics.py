@@ -7,6 +7,7 @@ import numpy as np
 import oracles
 import pinocchio as pin
 import pytest
+import scipy.integrate
 from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
@@ -492,6 +493,41 @@ def test_conservative_elements_do_virtual_work(bare):
         assert difference == pytest.approx(stored(q_a), abs=1e-12)
         moved = plain.inverse(q_a, rest, rest) - dynamics.inverse(q_a, rest, rest)
         assert relative(moved, force) < 1e-10
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.4])
+@pytest.mark.parametrize("path", ["compiled", "pinocchio"])
+def test_gas_follows_its_law_and_stores_its_work(bare, exponent, path):
+    """p V^n = const on an active and on a passive joint; force = - d/dq_A of -int p dV."""
+    area, pressure, volume, rest = -3e-4, 4e5, 2e-5, 0.01
+    gas = (
+        crane.GasSpring("X1", area, pressure, volume, rest, exponent),
+        crane.GasSpring("q3", 2e-5, 1e5, 8e-5, 1.3, exponent),
+    )
+    dynamics, plain = (crane.Dynamics(bare.replace(gas_springs=g), path=path) for g in (gas, ()))
+    column = bare.column("q3")
+
+    def released(a, p, v, x):
+        """Work of the gas from rest to x."""
+        law = lambda s: a * p * (v / (v + a * s)) ** exponent  # noqa: E731
+        return scipy.integrate.quad(law, 0.0, x, epsrel=1e-13)[0]
+
+    def stored(q_a):
+        joint = bare.closure.solve(q_a)[column]
+        one = released(area, pressure, volume, q_a[1] - rest)
+        return -one - released(2e-5, 1e5, 8e-5, joint - 1.3)
+
+    random = np.random.default_rng(18)
+    for q_a in random.uniform([-1, 1e-3, 1e-3], [1, 0.029, 0.029], (5, 3)):
+        rest_v = np.zeros(3)
+        force = dynamics.passive(q_a, rest_v)
+        slope = [
+            oracles.derivative(lambda t: stored(q_a + t * axis), 1e-4)  # noqa: B023
+            for axis in np.eye(3)
+        ]
+        assert np.abs(force + slope).max() < 1e-8 * np.abs(force).max()
+        gap = dynamics.energy(q_a, rest_v)[1] - plain.energy(q_a, rest_v)[1]
+        assert gap == pytest.approx(stored(q_a), abs=1e-11)
 
 
 def test_dampers_take_power_out(bare):

@@ -129,7 +129,7 @@ TEXT = [
     case(
         "control characters in a key",
         "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, known: "
-        "active, chains, control, end_stops, forces, friction, home, loops, name, "
+        "active, chains, control, end_stops, forces, friction, gas_springs, home, loops, name, "
         "source, tasks, tip",
         swap("tip: coupler_pin", '"tip\\n\\e[31m": coupler_pin'),
     ),
@@ -150,7 +150,7 @@ KEYS = [
     case(
         "unknown key far from all",
         "four_bar.yaml:29: unknown key 'gravity' in the machine file, known: "
-        "active, chains, control, end_stops, forces, friction, home, loops, name, "
+        "active, chains, control, end_stops, forces, friction, gas_springs, home, loops, name, "
         "source, tasks, tip",
         swap("tip: coupler_pin", "gravity: 9.81"),
     ),

@@ -207,10 +207,10 @@ def test_constants_and_operations_of_the_same_number_differ():
     np.testing.assert_allclose(backwards, wanted[::-1], rtol=1e-15)
 
 
-# --- sin, cos and tanh of several numbers at once ---------------------------------------------
+# --- sin, cos, exp, log and tanh of several numbers at once -----------------------------------
 
 PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459230781640629")
-VECTOR = ("sin", "cos", "tanh")
+VECTOR = ("sin", "cos", "exp", "log", "tanh")
 
 
 def sine(x):
@@ -233,7 +233,13 @@ def hyperbolic(x):
     return (power - 1) / (power + 1)
 
 
-EXACT = {"sin": sine, "cos": lambda x: sine(x + PI / 2), "tanh": hyperbolic}
+EXACT = {
+    "sin": sine,
+    "cos": lambda x: sine(x + PI / 2),
+    "exp": Decimal.exp,
+    "log": Decimal.ln,
+    "tanh": hyperbolic,
+}
 
 
 @functools.cache
@@ -244,6 +250,11 @@ def drawn(name):
     if name == "tanh":
         edges = np.array([0.625, 20.0, *(0.25 * math.log(2.0) * np.arange(1, 40, 2))])
         x += [random.uniform(-25, 25, 600), np.nextafter(edges, 0), np.nextafter(edges, 99)]
+    elif name == "exp":
+        x += [random.uniform(-705, 705, 600), 0.5 * math.log(2.0) * np.arange(-99.0, 99.0, 2)]
+    elif name == "log":
+        x = [10.0 ** random.uniform(-307, 308, 600), random.uniform(0.5, 2.0, 600)]
+        x += [np.nextafter([0.5, 1.0, 2.0, 0.5**0.5], 9), [0.5, 1.0, 2.0, 0.5**0.5, 2.0**-1022]]
     else:
         turns = np.concatenate([np.arange(-40, 41), random.integers(2**47, size=300)])
         right = 0.5 * math.pi * turns[np.abs(turns) < 2**47.3]
@@ -307,6 +318,15 @@ def test_tanh_ends_at_one_and_begins_with_its_argument():
     np.testing.assert_array_equal(found[:8], tiny)
     np.testing.assert_array_equal(found[8:], [1, -1, 1, -1, 1, -1, 1, NAN])
     assert run(lambda x: [apply("tanh", x[0])], [18.0])[0] < 1.0
+
+
+def test_exp_and_log_end_where_they_must():
+    x = np.array([-INF, -1e300, -708.5, 0.0, 709.5, 1e300, INF, NAN])
+    found = run(lambda x: [apply("exp", value) for value in x], x)
+    np.testing.assert_array_equal(found, [0, 0, 0, 1, INF, INF, INF, NAN])
+    x = np.array([-INF, -1.0, -0.0, 0.0, 5e-324, 1.0, INF, NAN])
+    found = run(lambda x: [apply("log", value) for value in x], x)
+    np.testing.assert_array_equal(found, [NAN, NAN, NAN, NAN, NAN, 0, NAN, NAN])
 
 
 def test_functions_of_functions_are_taken_in_order():

@@ -10,6 +10,7 @@ from crane.description.spec import (
     EndStop,
     ForceElement,
     Friction,
+    GasSpring,
     LoopSpec,
     MachineSpec,
     PIGains,
@@ -17,6 +18,7 @@ from crane.description.spec import (
 )
 
 __all__ = [
-    "LOOP_TYPES", "Chain", "EndStop", "ForceElement", "Friction", "LoopSpec", "MachineSpec",
-    "PIGains", "Task", "bundled", "changed", "examples", "inertia_problem", "parameters", "read",
+    "LOOP_TYPES", "Chain", "EndStop", "ForceElement", "Friction", "GasSpring", "LoopSpec",
+    "MachineSpec", "PIGains", "Task", "bundled", "changed", "examples", "inertia_problem",
+    "parameters", "read",
 ]  # fmt: skip

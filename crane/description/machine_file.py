@@ -11,6 +11,7 @@ from crane.description.spec import (
     EndStop,
     ForceElement,
     Friction,
+    GasSpring,
     LoopSpec,
     MachineSpec,
     PIGains,
@@ -22,7 +23,8 @@ from crane.description.urdf import read_urdf
 from crane.errors import CraneWarning, DescriptionError, known
 
 _KEYS = (
-    "name", "source", "chains", "loops", "active", "home", "friction", "forces", "end_stops",
+    "name", "source", "chains", "loops", "active", "home", "friction", "forces",
+    "gas_springs", "end_stops",
     "tip", "tasks", "control",
 )  # fmt: skip
 
@@ -85,6 +87,7 @@ def _read_machine(path: Path) -> MachineSpec:
             where[f"home {joint}"] = section.where(joint)
     friction |= _friction(top, tree)
     forces = _forces(top, tree)
+    gas_springs = _gas_springs(top, tree)
     end_stops = _end_stops(top, tree)
     tip = top.text("tip", None)
     if tip is not None and tip not in tree.links:
@@ -95,7 +98,7 @@ def _read_machine(path: Path) -> MachineSpec:
     control = _control(top, active)
     return MachineSpec(
         name, source, path, chains, tree.robot, loops, active, home, friction, forces,
-        end_stops, tip, tasks, control, where,
+        gas_springs, end_stops, tip, tasks, control, where,
     )  # fmt: skip
 
 
@@ -219,6 +222,22 @@ def _forces(top: Section, tree: Tree) -> tuple[ForceElement, ...]:
             )
         forces.append(element)
     return tuple(forces)
+
+
+def _gas_springs(top: Section, tree: Tree) -> tuple[GasSpring, ...]:
+    springs = []
+    keys = ("area", "pressure", "volume", "rest", "exponent")
+    for joint, item in top.mappings("gas_springs", "gas spring of", *keys):
+        tree.check_joint(joint, item.where())
+        area = item.number("area")
+        volume = item.number("volume", minimum=0.0)
+        exponent = item.number("exponent", GasSpring.exponent, minimum=0.0)
+        for key, value in (("area", area), ("volume", volume), ("exponent", exponent)):
+            if value == 0:
+                raise item.fail(key, f"'{key}' of gas spring of '{joint}' is 0, give one")
+        pressure, rest = item.number("pressure", minimum=0.0), item.number("rest", 0.0)
+        springs.append(GasSpring(joint, area, pressure, volume, rest, exponent))
+    return tuple(springs)
 
 
 def _end_stops(top: Section, tree: Tree) -> tuple[EndStop, ...]:

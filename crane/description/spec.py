@@ -140,6 +140,37 @@ class ForceElement:
 
 
 @dataclass(frozen=True)
+class GasSpring:
+    """Enclosed gas that acts along one tree joint: a counterbalance, an accumulator.
+
+    f = area pressure (V0 / V)^exponent,    V = V0 + area (q - rest).
+
+    Attributes:
+        joint: The joint it acts on, active or passive.
+        area: Of the piston, positive where the gas drives the joint in its positive direction
+            [m2], or [m3/rad].
+        pressure: At `rest` [Pa], above the outside's.
+        volume: V0, at `rest` [m3].
+        rest: Coordinate they belong to [m] or [rad].
+        exponent: Of the polytropic change; 1 at constant temperature, 1.4 without heat flow.
+    """
+
+    joint: str
+    area: float
+    pressure: float
+    volume: float
+    rest: float = 0.0
+    exponent: float = 1.0
+
+    def __post_init__(self) -> None:
+        what = f"gas spring of '{self.joint}'"
+        _check(self, what, "pressure", "volume", "exponent")
+        for name in ("area", "volume", "exponent"):
+            if getattr(self, name) == 0:
+                raise InputError(f"{name} of {what} is 0, give one")
+
+
+@dataclass(frozen=True)
 class EndStop:
     """Elastic stops at both limits of a joint, after Hunt and Crossley.
 
@@ -208,6 +239,7 @@ class MachineSpec:
     home: Mapping[str, float] = field(default_factory=dict)
     friction: Mapping[str, Friction] = field(default_factory=dict)
     forces: tuple[ForceElement, ...] = ()
+    gas_springs: tuple[GasSpring, ...] = ()
     end_stops: tuple[EndStop, ...] = ()
     tip: str | None = None
     tasks: Mapping[str, Task] = field(default_factory=dict)

@@ -23,14 +23,14 @@ from crane.straight.scalar import (
     times,
 )  # fmt: skip
 
-BODY, JOINT = 10, 15  # numbers per body and per joint
+BODY, JOINT = 10, 19  # numbers per body and per joint
 
 
 def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Array:
     """Inertias, force laws and gravity in the order that `Sweep` reads them.
 
     Per body mass, COM (3), inertia about it (xx, xy, xz, yy, yz, zz) in the body's directions of
-    the geometry; per joint the 15 numbers of `JointForces.table`; gravity (3).
+    the geometry; per joint the 19 numbers of `JointForces.table`; gravity (3).
     """
     bodies = []
     for turn, inertia in zip(geometry.turns[1:], list(machine.model.inertias)[1:], strict=True):
@@ -167,6 +167,7 @@ class Sweep:
         (
             coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck,
             stiffness, damping, constant, slack, stop, stop_damping, lower, upper,
+            gas, gas_share, gas_rest, gas_exponent,
         ) = self._laws[i - 1]  # fmt: skip
         q, rate = self._q[i - 1], self.rates[i]
         friction = viscous * rate + coulomb_offset
@@ -179,6 +180,16 @@ class Sweep:
         force = constant - stiffness * q - damping * rate
         stored = 0.5 * stiffness * q * q - constant * q + slack
         lost = (friction + damping * rate) * rate
+        if gas != 0.0:
+            swollen = 1.0 + gas_share * (q - gas_rest)
+            if gas_exponent == 1.0:
+                force = force + gas / swollen
+                stored = stored - gas / gas_share * apply("log", swollen)
+            else:
+                less = 1.0 - gas_exponent
+                power = apply("exp", less * apply("log", swollen))
+                force = force + gas * power / swollen
+                stored = stored - gas / gas_share * ((power - 1.0) / less)
         if stop != 0.0:
             over, under = maximum(q - upper, 0.0), maximum(lower - q, 0.0)
             push = stop * over * maximum(1.0 + stop_damping * rate, 0.0)

@@ -1,9 +1,9 @@
-"""sin, cos, exp and tanh of several numbers at once, in LLVM's language.
+"""sin, cos, exp, log and tanh of several numbers at once, in LLVM's language.
 
 A library's functions take one number each and keep no register alive; these are inlined, take as
 many numbers as a register holds, and have no branches. They are correct to 1.5 units in the last
-place; exp beyond 709 is infinite, below -708 zero. Angles of 2^48 and more, which doubles know to
-0.06 at best, give NaN.
+place. exp beyond 709 is infinite, below -708 zero; log of what is not positive and normal is NaN,
+and so are sin and cos of angles of 2^48 and more, which doubles know to 0.06 at best.
 """
 
 import math
@@ -29,10 +29,22 @@ _EXP_P = (1.26177193074810590878e-4, 3.02994407707441961300e-2, 9.99999999999999
 _EXP_Q = (
     3.00198505138664455042e-6, 2.52448340349684104192e-3, 2.27265548208155028766e-1, 2.0,
 )  # fmt: skip
+# Minimax polynomial of FDLIBM (e_log.c) in s^2, s = f / (2 + f), highest power first.
+_LOG = (
+    1.479819860511658591e-01, 1.531383769920937332e-01, 1.818357216161805012e-01,
+    2.222219843214978396e-01, 2.857142874366239149e-01, 3.999999999940941908e-01,
+    6.666666666666735130e-01,
+)  # fmt: skip
+_LN2_PARTS = 6.93147180369123816490e-01, 1.90821492927058770002e-10  # the first has 32 bits
 # A sum with it has the other term, rounded to an integer, in its last bits.
 _INTEGER = 1.5 * 2.0**52
 _RIGHT_ANGLE = 0.5 * math.pi, 6.123233995736766e-17, -1.4973849048591833e-33  # to 159 bits
 _LN2 = 6.93145751953125e-1, 1.42860682030941723212e-6  # the first has 21 bits
+
+
+def _bits(value: float) -> int:
+    (bits,) = struct.unpack(">Q", struct.pack(">d", value))
+    return int(bits)
 
 
 class _Text:
@@ -57,8 +69,7 @@ class _Text:
 
     def number(self, value: float) -> str:
         """The same number everywhere."""
-        (bits,) = struct.unpack(">Q", struct.pack(">d", value))
-        return "<" + ", ".join([f"double 0x{bits:016X}"] * self._width) + ">"
+        return "<" + ", ".join([f"double 0x{_bits(value):016X}"] * self._width) + ">"
 
     def integer(self, value: int) -> str:
         """The same integer everywhere."""
@@ -188,7 +199,34 @@ def _exponential(name: str, width: int) -> str:
     return text.end(text.where("ogt", "%x", most, text.number(math.inf), found))
 
 
-_MAKERS = {"sin": _circular, "cos": _circular, "exp": _exponential, "tanh": _hyperbolic}
+def _logarithm(name: str, width: int) -> str:
+    """With x = 2^k (1 + f), log x = k ln 2 + f - (f^2 / 2 - s (f^2 / 2 + R(s^2)))."""
+    text = _Text(name, width)
+    # the power of two that leaves sqrt(1/2) <= 1 + f < sqrt(2)
+    above = text.on_bits("sub", text.bits("%x"), text.integer(_bits(math.sqrt(0.5))))
+    power = text.on_bits("ashr", above, text.integer(52))
+    down = text.on_bits("shl", power, text.integer(52))
+    mantissa = text.from_bits(text.on_bits("sub", text.bits("%x"), down))
+    f = text.do("fsub", mantissa, text.number(1.0))
+    k = text.line(f"sitofp {text.whole} {power} to {text.kind}")
+    s = text.do("fdiv", f, text.do("fadd", f, text.number(2.0)))
+    square = text.do("fmul", s, s)
+    rest = text.do("fmul", square, text.polynomial(_LOG, square))
+    half = text.do("fmul", text.do("fmul", f, text.number(0.5)), f)
+    high, low = (text.number(part) for part in _LN2_PARTS)
+    small = text.fma(s, text.do("fadd", half, rest), text.do("fmul", k, low))
+    found = text.fma(k, high, text.do("fsub", f, text.do("fsub", half, small)))
+    normal = text.where("oge", "%x", text.number(2.0**-1022), found, text.number(math.nan))
+    return text.end(text.where("olt", "%x", text.number(math.inf), normal, text.number(math.nan)))
+
+
+_MAKERS = {
+    "sin": _circular,
+    "cos": _circular,
+    "exp": _exponential,
+    "log": _logarithm,
+    "tanh": _hyperbolic,
+}
 VECTOR = frozenset(_MAKERS)
 
 

@@ -99,7 +99,7 @@ class Expression:
 
 
 def apply(function: str, x: Number) -> Number:
-    """One of sin, cos, exp, tanh, sqrt, abs."""
+    """One of sin, cos, exp, log, tanh, sqrt, abs."""
     if isinstance(x, Expression):
         return x.tape.add(function, x.index)
     return abs(x) if function == "abs" else float(getattr(math, function)(x))

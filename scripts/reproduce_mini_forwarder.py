@@ -1,0 +1,89 @@
+"""The reduced-scale forwarder paper again: its tables and figures beside ours.
+
+    python scripts/reproduce_mini_forwarder.py                        # print
+    python scripts/reproduce_mini_forwarder.py --write docs/validation/mini_forwarder.md
+
+Nothing is fitted to the published numbers except the two pins that the paper does not print.
+"""
+
+import argparse
+import warnings
+from pathlib import Path
+
+import numpy as np
+from forwarder import figures, page
+from forwarder.paper import TASKS
+from forwarder.runs import (
+    FORMULATIONS,
+    READINGS,
+    Run,
+    cycle_work,
+    feasible_set,
+    neglected,
+    run_of,
+    simulate,
+    tip_errors,
+)
+
+import crane
+from crane.output import replacing
+from crane.rig import Rig
+
+SEED = 1  # of the virtual rig
+DRAWS = 40  # of the feasible set, per kind of variation
+
+
+def main() -> None:
+    """Compute, print and write."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--write", type=Path, help="page to write, figures go beside it")
+    parser.add_argument("--draws", type=int, default=DRAWS, help="of the feasible set")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore", crane.CraneWarning)
+    machine = crane.load("mini_forwarder")
+    rig = Rig(machine, SEED)
+    paths = {task: crane.task_path(machine, task) for task in TASKS}
+    runs: dict[str, dict[tuple[str, str], Run]] = {}
+    measured: dict[str, Run] = {}
+    for task, path in paths.items():
+        runs[task] = {
+            (formulation, reading): simulate(machine, path, formulation, reading)
+            for formulation in FORMULATIONS
+            for reading in READINGS
+        }
+        recording = rig.run(path, task=task)
+        measured[task] = run_of(recording, path, recording.tau)
+    sensitivity = page.Ranges(feasible_set(options.draws, seed=0), options.draws)
+    parts = [
+        page.scoreboard(runs, sensitivity),
+        page.rig_errors(runs, measured, rig),
+        page.sensitivity(sensitivity),
+        page.neglected(neglected(machine), cycle_work(machine)),
+        page.tracking({task: tip_errors(machine, path) for task, path in paths.items()}),
+        page.misprints(),
+    ]
+    text = page.whole(parts)
+    print(text)
+    if options.write is None:
+        return
+    folder = options.write.parent / "images"
+    braking = {
+        task: {name: runs[task][name, "braking"] for name in FORMULATIONS} for task in TASKS
+    }
+    for number, task in enumerate(TASKS, 1):
+        shown = {"virtual rig": measured[task], **braking[task]}
+        reference = paths[task](measured[task].time)[:2]
+        figure = figures.trajectory(number, shown, reference)
+        figures.save(figure, folder / f"mini_forwarder_{number}.png")
+    rms = {task: {name: run.rms for name, run in both.items()} for task, both in braking.items()}
+    ranges = {
+        task: {name: np.array(sensitivity.over(task, name, "all")) for name in FORMULATIONS}
+        for task in TASKS
+    }
+    figures.save(figures.scoreboard(rms, ranges), folder / "mini_forwarder_scoreboard.png")
+    with replacing(options.write) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
