@@ -26,6 +26,7 @@ from crane.description import (
     changed,
     examples,
     inertia_problem,
+    locked,
     read,
 )
 from crane.errors import DescriptionError, InputError, LimitError, MechanismError, known
@@ -215,14 +216,19 @@ class Machine:
         return dataclasses.replace(self, model=model)
 
 
-def load(name: str | Path, changes: Mapping[str, float] | None = None) -> Machine:
-    """Load a machine, perhaps with some of its numbers changed.
+def load(
+    name: str | Path,
+    changes: Mapping[str, float] | None = None,
+    lock: Mapping[str, float] | None = None,
+) -> Machine:
+    """Load a machine, perhaps with some of its numbers changed, or joints locked.
 
     Args:
         name: A bundled machine's name, a robot of example-robot-data by its file's name, or the
             path of a machine file (.yaml) or URDF (.urdf, with `<loop>` elements if it has loops).
         changes: New values by the names of `crane.description.parameters`, such as
             {"link3_G.x": 0.1, "link7.mass": 0.25, "payload.mass": 0.1}; SI units.
+        lock: Coordinates [m], [rad] of joints to be fixed, by name.
 
     Returns:
         The machine, its home posture closed.
@@ -235,6 +241,13 @@ def load(name: str | Path, changes: Mapping[str, float] | None = None) -> Machin
     spec = read(name)
     if changes:
         spec = changed(spec, changes)
+    if lock:
+        spec = locked(spec, lock)
+    for joint in spec.mimics:
+        raise DescriptionError(
+            f"{spec.where[f'joint {joint}']}: joint '{joint}' mimics another, which is not "
+            "supported: make it fixed, or lock it"
+        )
     model = _assemble(spec)
     active = tuple(model.names)[1:] if spec.active is None else spec.active
     try:

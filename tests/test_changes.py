@@ -57,9 +57,7 @@ def test_a_pin_moves_the_linkage(mini):
     assert np.linalg.norm(tip(moved) - tip(mini)) > 1e-3
     data = moved.model.createData()
     pin.framesForwardKinematics(moved.model, data, moved.closure.solve(POSE))
-    boom, pin_g, base = (
-        data.oMf[moved.frame(name)] for name in ("link3", "link3_G", "A2_barrel")
-    )
+    boom, pin_g, base = (data.oMf[moved.frame(name)] for name in ("link3", "link3_G", "A2_barrel"))
     assert np.allclose(boom.actInv(pin_g.translation), [0.097, 0.002, 0.0], atol=1e-15)
     length = np.linalg.norm(pin_g.translation - base.translation)
     assert length == pytest.approx(0.0825 + POSE[2], abs=1e-14)
@@ -107,3 +105,45 @@ def test_what_cannot_be_is_refused(changes, message):
 def test_a_geometry_that_does_not_close_is_refused():
     with pytest.raises(crane.CraneError, match="link3_G|A2_eye|X2|closed"):
         crane.load("mini_forwarder", {"link3_G.x": 0.4})
+
+
+# --- locked joints ---------------------------------------------------------------------------
+
+
+def test_a_locked_joint_stays_where_it_is_put(mini):
+    """The tip of the machine with X2 and q1 locked is that of the whole machine there."""
+    locked = crane.load("mini_forwarder", lock={"q1": 0.4, "X2": 0.013})
+    assert locked.active == ("X1",) and set(locked.joints) == set(mini.joints) - {"q1", "X2"}
+    for x1 in (0.002, 0.015, 0.028):
+        assert np.abs(tip(locked, [x1]) - tip(mini, [0.4, x1, 0.013])).max() < 1e-12
+    whole = crane.Dynamics(mini).inverse([0.4, 0.02, 0.013], [0, 0.01, 0], [0, 0.1, 0])
+    alone = crane.Dynamics(locked).inverse([0.02], [0.01], [0.1])
+    assert alone[0] == pytest.approx(whole[1], rel=1e-12)
+
+
+def test_fingers_that_mimic_can_be_locked():
+    with pytest.raises(crane.CraneError, match="panda_finger_joint2' mimics another.*lock it"):
+        crane.load("panda")
+    arm = crane.load("panda", lock={"panda_finger_joint1": 0.02, "panda_finger_joint2": 0.02})
+    assert len(arm.joints) == 7
+    urdf = arm.path.read_text()
+    whole = pin.buildModelFromXML(urdf)
+    q = pin.neutral(whole)
+    q[-2:] = 0.02
+    wanted = pin.buildReducedModel(whole, [8, 9], q)
+    rng = np.random.default_rng(1)
+    q, v, a = rng.normal(size=(3, 7))
+    tau = pin.rnea(wanted, wanted.createData(), q, v, a)
+    bare = arm.replace(friction={})
+    assert np.abs(crane.Dynamics(bare).inverse(q, v, a) - tau).max() < 1e-10
+
+
+def test_what_cannot_be_locked():
+    for lock, message in (
+        ({"q12": 0.0}, "joint 'q12' to lock is unknown, did you mean 'q2'"),
+        ({"q1": float("inf")}, "the coordinate to lock 'q1' at is inf"),
+        ({"q1": 0, "X1": 0.01, "X2": 0.01}, "with q1, X1, X2 locked nothing drives the machine"),
+    ):
+        with pytest.raises(InputError) as caught:
+            crane.load("mini_forwarder", lock=lock)
+        assert str(caught.value).startswith(message)

@@ -370,7 +370,8 @@ JOINTS = [
     ),
     case(
         "mimic",
-        "ground.urdf:10: joint 'crank' mimics another, which is not supported: make it fixed",
+        "ground.urdf:10: joint 'crank' mimics another, which is not supported: "
+        "make it fixed, or lock it",
         swap(
             '<limit lower="-1.5" upper="2.5" effort="10" velocity="5"/>',
             '<limit lower="-1.5" upper="2.5" effort="10" velocity="5"/><mimic joint="coupler"/>',

@@ -1,10 +1,11 @@
-"""Machines that differ from their files in some numbers."""
+"""Machines that differ from their files: other numbers, locked joints."""
 
 import copy
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 
+import numpy as np
 from lxml import etree
 
 from crane.description.spec import Friction, MachineSpec
@@ -114,6 +115,75 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
         control=MappingProxyType(control),
         where={**spec.where, "link payload": PAYLOAD},
     )
+
+
+def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
+    """A machine with some joints fixed.
+
+    What refers to a locked joint, such as its friction, goes with it, and so do tasks of active
+    joints if one of them is locked.
+
+    Args:
+        spec: The machine as read.
+        lock: Coordinate [m], [rad] by joint.
+
+    Raises:
+        InputError: No such joint, no finite coordinate, or the last active joint.
+    """
+    tree = copy.deepcopy(spec.tree)
+    joints = {j.get("name"): j for j in tree.iterfind("joint") if j.get("type") != "fixed"}
+    for name, given in lock.items():
+        if name not in joints:
+            raise InputError(f"joint '{name}' to lock is unknown, {known(joints, name)}")
+        _fix(joints[name], as_number(given, f"the coordinate to lock '{name}' at", ""))
+    active = spec.active and tuple(name for name in spec.active if name not in lock)
+    if active == () or not joints.keys() - lock.keys():
+        raise InputError(f"with {', '.join(lock)} locked nothing drives the machine, lock less")
+    chains = tuple(
+        dataclasses.replace(chain, joints=tuple(j for j in chain.joints if j not in lock))
+        for chain in spec.chains
+    )
+    return dataclasses.replace(
+        spec,
+        tree=tree,
+        chains=chains,
+        active=active,
+        home={joint: value for joint, value in spec.home.items() if joint not in lock},
+        friction={joint: value for joint, value in spec.friction.items() if joint not in lock},
+        control={joint: value for joint, value in spec.control.items() if joint not in lock},
+        forces=tuple(item for item in spec.forces if item.joint not in lock),
+        gas_springs=tuple(item for item in spec.gas_springs if item.joint not in lock),
+        end_stops=tuple(item for item in spec.end_stops if item.joint not in lock),
+        tasks={
+            name: task
+            for name, task in spec.tasks.items()
+            if task.space == "tip" or not task.coefficients.keys() & lock.keys()
+        },
+        mimics=tuple(name for name in spec.mimics if name not in lock),
+    )
+
+
+def _fix(joint: etree._Element, value: float) -> None:
+    """Make a joint fixed where its coordinate has a value."""
+    from scipy.spatial.transform import Rotation
+
+    origin = joint.find("origin")
+    xyz, rpy, axis = (
+        np.array([float(word) for word in text.split()])
+        for text in (origin.get("xyz"), origin.get("rpy"), joint.find("axis").get("xyz"))
+    )
+    turn = Rotation.from_euler("xyz", rpy)
+    if joint.get("type") == "prismatic":
+        xyz = xyz + turn.apply(value * axis)
+    else:
+        turn = turn * Rotation.from_rotvec(value * axis)
+    origin.set("xyz", " ".join(map(repr, xyz.tolist())))
+    if value and joint.get("type") != "prismatic":
+        origin.set("rpy", " ".join(map(repr, turn.as_euler("xyz").tolist())))
+    joint.set("type", "fixed")
+    for tag in ("axis", "limit"):
+        for element in joint.findall(tag):
+            joint.remove(element)
 
 
 def _set(by_joint: dict, name: str, value: float, default: Callable | None) -> None:

@@ -63,6 +63,7 @@ def _read_single(path: Path) -> MachineSpec:
         active=urdf.independent,
         friction=urdf.friction,
         tip=tree.only_leaf(),
+        mimics=urdf.mimics,
         where=tree.where | {f"loop {loop.name}": loop.where for loop in urdf.loops},
     )
 
@@ -70,7 +71,7 @@ def _read_single(path: Path) -> MachineSpec:
 def _read_machine(path: Path) -> MachineSpec:
     top = Section.read(path, _KEYS)
     name, source = top.text("name"), top.text("source", "")
-    chains, tree, friction = _chains(top, path)
+    chains, tree, friction, mimics = _chains(top, path)
     loops = _loops(top, tree)
     active = top.names("active")
     for joint in active:
@@ -98,14 +99,17 @@ def _read_machine(path: Path) -> MachineSpec:
     control = _control(top, active)
     return MachineSpec(
         name, source, path, chains, tree.robot, loops, active, home, friction, forces,
-        gas_springs, end_stops, tip, tasks, control, where,
+        gas_springs, end_stops, tip, tasks, control, mimics, where,
     )  # fmt: skip
 
 
-def _chains(top: Section, path: Path) -> tuple[tuple[Chain, ...], Tree, dict[str, Friction]]:
+def _chains(
+    top: Section, path: Path
+) -> tuple[tuple[Chain, ...], Tree, dict[str, Friction], tuple[str, ...]]:
     chains: list[Chain] = []
     tree = Tree()
     friction: dict[str, Friction] = {}
+    mimics: tuple[str, ...] = ()
     for item in top.sections("chains", "chain", "name", "urdf", "parent"):
         name, parent, file = item.text("name"), item.text("parent", None), item.file("urdf")
         if any(chain.name == name for chain in chains):
@@ -126,11 +130,12 @@ def _chains(top: Section, path: Path) -> tuple[tuple[Chain, ...], Tree, dict[str
         tree.add(chain, urdf)
         chains.append(chain)
         friction |= urdf.friction
+        mimics += urdf.mimics
     if not chains:
         raise top.fail("chains", "there are no chains, add one under 'chains:'")
     if not tree.joints:
         raise top.fail("chains", "no joint of these chains moves, add one")
-    return tuple(chains), tree, friction
+    return tuple(chains), tree, friction, mimics
 
 
 def _loops(top: Section, tree: Tree) -> tuple[LoopSpec, ...]:

@@ -244,4 +244,5 @@ class MachineSpec:
     tip: str | None = None
     tasks: Mapping[str, Task] = field(default_factory=dict)
     control: Mapping[str, PIGains] = field(default_factory=dict)
+    mimics: tuple[str, ...] = ()  # joints that mimic another, which have to be locked
     where: Mapping[str, str] = field(default_factory=dict)  # section -> "file:line"

@@ -60,6 +60,7 @@ class Urdf:
         loops: Loops of `<loop>` elements.
         independent: Joints marked `independent="true"`; None where no joint has the attribute.
         friction: Friction of `<dynamics>` elements.
+        mimics: Joints that mimic another.
     """
 
     file: Path
@@ -69,6 +70,7 @@ class Urdf:
     loops: tuple[LoopSpec, ...]
     independent: tuple[str, ...] | None
     friction: Mapping[str, Friction]
+    mimics: tuple[str, ...]
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -117,7 +119,8 @@ def read_urdf(file: Path) -> Urdf:
             raise xml.fail(joints[joint], f"joint '{joint}' has the name of a loop's, rename it")
         _add_joint(robot, joint, "fixed", frame.placement, (frame.link, frame.name))
         lines |= {("link", frame.name): frame.where, ("joint", joint): frame.where}
-    return Urdf(file, robot, root, lines, loops, driven, friction)
+    mimics = tuple(name for name, joint in joints.items() if joint.find("mimic") is not None)
+    return Urdf(file, robot, root, lines, loops, driven, friction, mimics)
 
 
 def _named(xml: XmlFile, kind: str) -> dict[str, etree._Element]:
@@ -262,8 +265,7 @@ def _write_joint(
     robot: etree._Element,
 ) -> None:
     what, kind = f"joint '{name}'", joint.get("type")
-    if xml.only(joint, "mimic", what) is not None:
-        raise xml.fail(joint, f"{what} mimics another, which is not supported: make it fixed")
+    xml.only(joint, "mimic", what)
     clean = _add_joint(robot, name, kind, xml.placement(joint, what), ends)
     if kind != "fixed":
         axis = xml.direction(joint, what, (1.0, 0.0, 0.0))
