@@ -1,4 +1,4 @@
-"""The command line: crane list, info, check, simulate, view, plot, demo."""
+"""The command line: crane list, info, check, simulate, study, view, plot, demo."""
 
 import os
 import sys
@@ -194,6 +194,50 @@ def simulate(
 
 
 @app.command()
+def study(
+    machine: MachineName,
+    out: Out,
+    vary: Annotated[
+        list[str],
+        typer.Option(
+            metavar="NAME=VALUES",
+            help="A parameter and its values start:stop:count, or with --draws low~high.",
+        ),
+    ],
+    task: Annotated[
+        list[str] | None, typer.Option(help="A task to measure with; all if not given.")
+    ] = None,
+    measure: Annotated[
+        list[str] | None, typer.Option(help="What to report, such as peak_X2; all if not given.")
+    ] = None,
+    draws: Annotated[int | None, typer.Option(help="Number of random variants.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the random variants.")] = 0,
+    processes: Annotated[
+        int | None, typer.Option(help="To compute with; one per core if not given.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster to compute on.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Measure variants of a machine: any parameters over a grid or at random."""
+    from crane.runs import check_folder, write_study
+    from crane.studies import ranges
+    from crane.studies import study as run
+
+    check_folder(out, force)
+    axes = ranges(vary, draws)
+    with _progress("computing variants") as progress:
+        result = run(
+            machine, axes, task, measure, draws=draws, seed=seed, scheduler=scheduler,
+            processes=(os.cpu_count() or 1) if processes is None else processes,
+            progress=progress,
+        )  # fmt: skip
+    write_study(out, result)
+    print(f"{result.to_text()}\nwritten to {out}")
+
+
+@app.command()
 def view(
     what: Annotated[
         str, typer.Argument(metavar="WHAT", help="A machine, a run's folder, or a recording.")
@@ -345,10 +389,10 @@ def _progress(what: str) -> Iterator[Callable[[float], None]]:
 
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        job = bar.add_task(what, total=1.0)
+        job = bar.add_task("compiling the machine's formulas", total=1.0)
 
         def report(share: float) -> None:
-            bar.update(job, completed=share)
+            bar.update(job, description=what, completed=share)
 
         yield report
 

@@ -1,17 +1,47 @@
 """The tip (or any other frame) as a function of the active coordinates, and back."""
 
 import itertools
+from ctypes import c_int64, c_void_p
 from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
+from scipy.interpolate import make_interp_spline
 
+from crane.closure.traced import Constants, Motion, folded
 from crane.errors import ClosureError, InputError, UnreachableTipError
 from crane.machine import Machine
 from crane.samples import Array, as_sample, as_samples, per_sample
+from crane.straight import Number, Program, Tape, TooLongError
+from crane.straight.scalar import add, cross, dot, scale, subtract, times
 
 _ACCURACY = 1e-11  # [m] per metre of machine
+_STRIDE = 16  # samples of a path between those that are searched for one by one
+_BESIDE = 0.02  # share of the strokes by which a sample may miss the curve through those
+
+_ROWS = """
+define void @rows(i64 %count, ptr %geometry, ptr %place, ptr %q, ptr %v, ptr %out) {{
+entry:
+  br label %sample
+sample:
+  %i = phi i64 [0, %entry], [%i1, %evaluate]
+  %more = icmp slt i64 %i, %count
+  br i1 %more, label %evaluate, label %done
+evaluate:
+  %q0 = mul i64 %i, {nq}
+  %q_at = getelementptr double, ptr %q, i64 %q0
+  %v0 = mul i64 %i, {n}
+  %v_at = getelementptr double, ptr %v, i64 %v0
+  %o0 = mul i64 %i, {size}
+  %o_at = getelementptr double, ptr %out, i64 %o0
+  call void @formula(ptr %geometry, ptr %place, ptr %q_at, ptr %v_at, ptr %o_at)
+  %i1 = add i64 %i, 1
+  br label %sample
+done:
+  ret void
+}}
+"""
 
 
 class Kinematics:
@@ -47,7 +77,10 @@ class Kinematics:
         Returns:
             (3,) or (N, 3) [m].
         """
-        return per_sample(self.position_at, self.machine.closure.solve(q_a))
+        q = self.machine.closure.solve(q_a)
+        if q.ndim == 2 and self._fast is not None:
+            return self._fast.rows(q)[:, :3]
+        return per_sample(self.position_at, q)
 
     def position_at(self, q: Array) -> Array:
         """Position (3,) [m] of one posture (nq,)."""
@@ -64,7 +97,10 @@ class Kinematics:
         Returns:
             (3, n) or (N, 3, n).
         """
-        return per_sample(self._jacobian, self.machine.closure.solve(q_a))
+        q = self.machine.closure.solve(q_a)
+        if q.ndim == 2 and self._fast is not None:
+            return self._fast.rows(q)[:, 3:-3].reshape(len(q), 3, -1)
+        return per_sample(self._jacobian, q)
 
     def bias(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
         """Acceleration of the frame at a_A = 0.
@@ -88,14 +124,19 @@ class Kinematics:
             return np.array(acceleration.linear)
 
         v_a = as_samples(v_a, len(names), "v_a", names)
-        return per_sample(one, self.machine.closure.solve(q_a), v_a)
+        q = self.machine.closure.solve(q_a)
+        if q.ndim == 2 and q.shape[:1] == v_a.shape[:-1] and self._fast is not None:
+            return self._fast.rows(q, v_a)[:, -3:]
+        return per_sample(one, q, v_a)
 
     def inverse(self, position: ArrayLike, guess: ArrayLike | None = None) -> Array:
         """Active coordinates within their limits that put the frame at a position.
 
         Levenberg-Marquardt on the reduced Jacobian with the limits as bounds, from the guess or
-        the nearest of a grid of postures. A stack is tracked like a path. Where there are
-        more active joints than directions, each step of the descent is the shortest.
+        the nearest of a grid of postures. A stack is tracked like a path: where its samples are
+        near each other, some of them, and Newton's method from the curve through these for all.
+        Where there are more active joints than directions, each step of the descent is the
+        shortest.
 
         Args:
             position: (3,) or (N, 3) in the world [m].
@@ -119,10 +160,62 @@ class Kinematics:
             return self._inverse(targets, start, "")
         if len(targets) == 0:
             raise InputError("position is an empty stack, give at least one sample")
+        if (tracked := self._track(targets, start)) is not None:
+            return tracked
         out = np.empty((len(targets), len(self.machine.active)))
         for i, target in enumerate(targets):
             start = out[i] = self._inverse(target, start, f" (sample {i})")
         return out
+
+    @cached_property
+    def _fast(self) -> "_FastFrame | None":
+        """Machine code for stacks; None where the machine is too large for it."""
+        try:
+            return _FastFrame(self.machine, self._frame)
+        except TooLongError:
+            return None
+
+    def _track(self, targets: Array, start: Array | None) -> Array | None:
+        """Strokes along a dense path (N, 3), or None where that takes a closer look.
+
+        Every sample is as exact as those searched for one by one, or None is returned.
+
+        Raises:
+            UnreachableTipError: The path leaves the reach.
+        """
+        machine, n = self.machine, len(self.machine.active)
+        if n > targets.shape[1] or len(targets) < 4 * _STRIDE or self._fast is None:
+            return None
+        knots = np.unique(np.r_[0 : len(targets) : _STRIDE, len(targets) - 1])
+        searched = np.empty((len(knots), n))
+        for i, knot in enumerate(knots):
+            try:
+                start = searched[i] = self._inverse(targets[knot], start, "")
+            except UnreachableTipError:
+                # say which sample is the first one, or see that it can be reached after all
+                for k in range(knots[max(i - 1, 0)], knot + 1):
+                    start = self._inverse(targets[k], start, f" (sample {k})")
+                return None
+        try:
+            curve = make_interp_spline(knots, searched)(np.arange(len(targets)))
+            q_a = curve = np.clip(curve, machine.lower, machine.upper)
+            best, before = q_a, np.full(len(targets), np.inf)
+            for _ in range(10):
+                rows = self._fast.rows(machine.closure.solve(q_a))
+                error = targets - rows[:, :3]
+                distance = np.linalg.norm(error, axis=1)
+                closer = distance < before
+                best = np.where(closer[:, None], q_a, best)
+                before = np.minimum(distance, before)
+                if not (closer & (distance > 1e-15)).any():  # [m] rounding
+                    break
+                step = np.linalg.pinv(rows[:, 3:-3].reshape(-1, 3, n)) @ error[:, :, None]
+                q_a = np.clip(q_a + step[:, :, 0], machine.lower, machine.upper)
+        except (ClosureError, np.linalg.LinAlgError):
+            return None
+        beside = np.abs(best - curve) <= _BESIDE * self._scale
+        tolerance = 1e-2 * _ACCURACY * max(1.0, float(np.abs(targets).max()))
+        return best if beside.all() and before.max() <= tolerance else None
 
     def _jacobian(self, q: Array) -> Array:
         tree = pin.computeFrameJacobian(
@@ -214,3 +307,68 @@ class Kinematics:
                     break
                 damping = max(10 * damping, 1e-9)
         return distance, q
+
+
+class _FastFrame:
+    """Position, reduced Jacobian and bias of a frame as machine code.
+
+    Args:
+        machine: The machine.
+        frame: Pinocchio's index of the frame.
+
+    Raises:
+        TooLongError: It would take too long to compile.
+    """
+
+    def __init__(self, machine: Machine, frame: int):
+        fast = self._closure = machine.closure.fast
+        placed = machine.model.frames[frame]
+        self._body = placed.parentJoint
+        self._place = fast.geometry.turns[self._body].T @ placed.placement.translation
+        self._n = len(machine.active)
+        key = ("frame", self._body, folded(self._place))
+        if key not in fast.programs:
+            fast.programs[key] = self._compile(machine.model.nq)
+        self._program = fast.programs[key]
+        self._rows = self._program.function("rows", c_int64, *[c_void_p] * 5)
+
+    def rows(self, q: Array, v_a: Array | None = None) -> Array:
+        """Rows [x (3), J gamma (3 n), bias (3)] at postures (N, nq) and velocities (N, n)."""
+        v_a = np.zeros((len(q), self._n)) if v_a is None else np.ascontiguousarray(v_a)
+        out = np.empty((len(q), self._program.sizes["formula"]))
+        arrays = (self._closure.geometry.numbers, self._place, np.ascontiguousarray(q), v_a, out)
+        self._rows(len(q), *(array.ctypes.data for array in arrays))
+        return out
+
+    def _compile(self, nq: int) -> Program:
+        tape, n, body = Tape(), self._n, self._body
+        _, posture, loops = self._closure.trace(tape, 0, 2)
+        v_a, parents = tape.loads(3, 0, n), posture.geometry.parents
+        rates: list[Number] = [0.0]
+        rates += [dot(loops.gamma[i], v_a) for i in range(1, len(parents))]
+        motion = Motion(posture, loops, rates, [0.0] * 3, parents)
+        place = Constants(tape, 1, self._place).vector(0)
+        point = add(posture.origin[body], times(posture.rotation[body], place))
+        columns: list[list[Number]] = [[0.0] * 3 for _ in range(n)]
+        (v, w), (a, e) = motion.velocity[body], motion.acceleration[body]
+        i = body
+        while i > 0:  # what the joints that carry it do to the point
+            linear, angular = posture.columns[i]
+            moved = add(linear, cross(angular, point))
+            columns = [
+                add(column, scale(factor, moved))
+                for column, factor in zip(columns, loops.gamma[i], strict=True)
+            ]
+            a = add(a, scale(motion.drift[i], linear))
+            e = add(e, scale(motion.drift[i], angular))
+            i = parents[i]
+        bend = add(a, cross(e, point), cross(w, add(v, cross(w, point))))
+        world = [list(axis) for axis in zip(*posture.rotation[0], strict=True)]
+        jacobian = [times(world, column) for column in columns]
+        outputs = times(world, subtract(point, posture.origin[0]))
+        outputs += [column[row] for row in range(3) for column in jacobian]
+        program = Program()
+        program.add("formula", 4, [*outputs, *times(world, bend)])
+        program.add_text(_ROWS.format(nq=nq, n=n, size=6 + 3 * n))
+        program.compile()
+        return program

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import BPoly, PPoly, make_interp_spline
+from scipy.interpolate import PPoly, make_interp_spline
 
 from crane.errors import InputError, known
 from crane.kinematics import Kinematics
@@ -26,11 +26,9 @@ class Path:
         tip: See above.
     """
 
-    def __init__(self, curve: PPoly | BPoly, tip: "Path | None" = None):
+    def __init__(self, curve: PPoly, tip: "Path | None" = None):
         self.duration = float(curve.x[-1])
         self.tip = tip
-        if isinstance(curve, BPoly):
-            curve = PPoly.from_bernstein_basis(curve)  # 15 times faster to evaluate
         self._curves = (curve, curve.derivative(), curve.derivative(2))
 
     def position(self, time: ArrayLike) -> Array:
@@ -127,13 +125,35 @@ def tip_path(machine: Machine, tip: Path, guess: ArrayLike | None = None) -> Pat
     q_a = kinematics.inverse(x, guess)
     if q_a.shape[1] > x.shape[1]:
         spline = make_interp_spline(time, q_a, k=5)
-        knots = np.stack([q_a, spline(time, 1), spline(time, 2)], axis=1)
-        return Path(BPoly.from_derivatives(time, knots), tip)
+        return Path(_quintics(time, q_a, spline(time, 1), spline(time, 2)), tip)
     jacobian = np.linalg.pinv(kinematics.jacobian(q_a))
     v_a = np.einsum("ijk,ik->ij", jacobian, x_rate)
     a_a = np.einsum("ijk,ik->ij", jacobian, x_second - kinematics.bias(q_a, v_a))
-    knots = np.stack([q_a, v_a, a_a], axis=1)
-    return Path(BPoly.from_derivatives(time, knots), tip)
+    return Path(_quintics(time, q_a, v_a, a_a), tip)
+
+
+def _quintics(time: Array, x: Array, v: Array, a: Array) -> PPoly:
+    """Polynomials of fifth order between knots (N,) with values and derivatives (N, n).
+
+    With u = t - t_i, h = t_i+1 - t_i and what the second order misses at u = h,
+
+        d = x_i+1 - x_i - v_i h - a_i h^2/2,   e = v_i+1 - v_i - a_i h,   f = a_i+1 - a_i,
+        x = x_i + v_i u + a_i u^2/2 + (10 d - 4 e h + f h^2/2) (u/h)^3
+            + (-15 d + 7 e h - f h^2) (u/h)^4 + (6 d - 3 e h + f h^2/2) (u/h)^5.
+    """
+    h = np.diff(time)[:, None]
+    d = x[1:] - x[:-1] - h * (v[:-1] + h * a[:-1] / 2)
+    e = h * (v[1:] - v[:-1] - h * a[:-1])
+    f = h * h * (a[1:] - a[:-1])
+    rows = [
+        (6 * d - 3 * e + f / 2) / h**5,
+        (-15 * d + 7 * e - f) / h**4,
+        (10 * d - 4 * e + f / 2) / h**3,
+        a[:-1] / 2,
+        v[:-1],
+        x[:-1],
+    ]
+    return PPoly(np.array(rows), time)
 
 
 def task_path(machine: Machine, task: str) -> Path:

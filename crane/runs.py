@@ -7,6 +7,7 @@ from crane.errors import OutputError, RecordingError
 from crane.machine import Machine
 from crane.output import staging
 from crane.recording import Recording
+from crane.studies.table import Study
 from crane.summary import summarize
 
 RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
@@ -68,6 +69,19 @@ def write_views(folder: Path, machine: Machine, recording: Recording) -> None:
 
     plot_recording(recording, folder / FIGURE)
     write_page(machine, folder / PAGE, recording)
+
+
+def write_study(folder: Path, study: Study) -> None:
+    """Write table and picture of a study into a folder, created where there is none.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.study_plots import plot_study
+
+    with staging(folder) as part:
+        study.to_csv(part / "study.csv")
+        plot_study(study, part / "study.png")
 
 
 def read_run(path: Path) -> Recording:

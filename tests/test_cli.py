@@ -274,3 +274,37 @@ def test_demo(tmp_path):
         names = {path.name for path in (tmp_path / "demo" / task).iterdir()}
         assert names == {"recording.csv", "summary.md", "figure.png", "view.html"}
     assert Path(tmp_path / "demo" / "summary.md").read_text().count("# mini_forwarder: ") == 3
+
+
+def test_study(tmp_path):
+    command = (
+        "study", "mini_forwarder", "--vary", "payload.mass=0:0.1:3", "--task", "lift",
+        "--measure", "peak_X1", "--processes", "1", "--out", "study",
+    )  # fmt: skip
+    result = run(*command, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "*                 0      60.90" in result.stdout
+    assert "3 variants, best peak_X1 first" in result.stdout
+    assert {path.name for path in (tmp_path / "study").iterdir()} == {"study.csv", "study.png"}
+    assert "is not empty" in one_error(run(*command, cwd=tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--vary", "payload.mass=0:1"], "'0:1' is no grid, give NAME=start:stop:count"),
+        (["--vary", "payload.mas=0:1:2"], "did you mean 'payload.mass'?"),
+        (["--vary", "payload.mass=0~1"], "say how often with --draws"),
+        (["--vary", "payload.mass=0:1:2", "--task", "lft"], "did you mean 'lift'?"),
+        (
+            ["--vary", "payload.mass=0:1:2", "--scheduler", "no"],
+            "'no' is no address of a scheduler",
+        ),
+        ([], "Missing option '--vary'"),
+    ],
+)
+def test_wrong_studies_are_one_line_and_write_nothing(arguments, text, tmp_path):
+    assert text in one_error(
+        run("study", "mini_forwarder", "--out", "s", *arguments, cwd=tmp_path)
+    )
+    assert list(tmp_path.iterdir()) == []

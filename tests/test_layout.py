@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).parents[1] / "crane"
 ORDER = [
     "errors", "samples", "output", "timeseries", "straight", "description", "closure", "machine",
     "dynamics", "kinematics", "paths", "control", "integration", "recording", "summary",
-    "simulation", "batch", "view", "runs", "demo", "cli",
+    "simulation", "batch", "studies", "rig", "identification", "view", "runs", "demo", "cli",
 ]  # fmt: skip
 
 

@@ -1,0 +1,1 @@
+"""Parameters of closed machines from recordings."""

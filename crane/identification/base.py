@@ -1,0 +1,160 @@
+"""Base parameters: what of a machine's parameters can be told from its drives' forces."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.errors import ClosureError, InputError
+from crane.identification.model import Model, Samples
+from crane.machine import Machine
+from crane.samples import Array
+
+_RANK = 1e-8  # of a column's norm, what of it must be new
+_NOTHING = 1e-10  # of the largest norm, below which a column is zero
+_SPAN = 1.0  # [m], [rad] of joints without limits
+# Preferred as base parameters, first: what is told from one axis before what needs many.
+_ORDER = {
+    "Izz": 0,
+    "mx": 1,
+    "my": 1,
+    "mz": 2,
+    "Ixx": 3,
+    "Ixy": 3,
+    "Ixz": 3,
+    "Iyz": 3,
+    "Iyy": 4,
+    "m": 5,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Base:
+    """The smallest set of parameters with the same effect: W beta = W[:, independent] K beta.
+
+    Attributes:
+        names: (p,) of all parameters.
+        independent: (r,) columns of W that carry the base parameters.
+        grouping: K (r, p): base parameters are K beta; identity in the independent columns.
+        unobservable: Names of parameters without any effect.
+    """
+
+    names: tuple[str, ...]
+    independent: Array
+    grouping: Array
+    unobservable: tuple[str, ...]
+
+    @property
+    def rank(self) -> int:
+        """Number of base parameters."""
+        return len(self.independent)
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Each base parameter in words, such as "link7.mx + 0.22 payload.m"."""
+        out = []
+        for row, first in zip(self.grouping, self.independent, strict=True):
+            others = []
+            for i, (share, name) in enumerate(zip(row, self.names, strict=True)):
+                if share != 0 and i != first:
+                    factor = "" if abs(abs(share) - 1) < 1e-9 else f"{abs(share):.6g} "
+                    others.append(f"{'-' if share < 0 else '+'} {factor}{name}")
+            out.append(" ".join([self.names[first], *others]))
+        return tuple(out)
+
+    def values(self, parameters: Array) -> Array:
+        """Base parameters (r,) of parameters (p,)."""
+        return self.grouping @ parameters
+
+
+def random_samples(model: Model, count: int, seed: int = 0) -> Samples:
+    """Closed postures all over the strokes, with random velocities and accelerations.
+
+    Raises:
+        InputError: The loops close nowhere within the limits.
+    """
+    machine, rng = model.machine, np.random.default_rng(seed)
+    lower, upper = _range(machine)
+    q_a: list[Array] = []
+    for _ in range(20 * count):
+        trial = rng.uniform(lower, upper)
+        try:
+            machine.closure.solve(trial)
+        except ClosureError:
+            continue
+        q_a.append(trial)
+        if len(q_a) == count:
+            break
+    if len(q_a) < count:
+        raise InputError(
+            f"the loops of '{machine.name}' close in {len(q_a)} of {20 * count} random postures "
+            "within its limits, narrow the limits"
+        )
+    # joints that move little per coordinate are moved faster, so that all columns are alike
+    span = upper - lower
+    v_a, a_a = (size * span * rng.normal(size=(count, len(lower))) for size in (1.0, 3.0))
+    return model.samples(np.array(q_a), v_a, a_a)
+
+
+def _range(machine: Machine) -> tuple[Array, Array]:
+    """Limits of the active joints; those without are taken around home."""
+    home = machine.home[machine.closure.active]
+    span = machine.upper - machine.lower
+    endless = ~np.isfinite(span)
+    return (
+        np.where(endless, home - _SPAN, machine.lower),
+        np.where(endless, home + _SPAN, machine.upper),
+    )
+
+
+def base_parameters(model: Model, samples: Samples | None = None, seed: int = 0) -> Base:
+    """Base parameters of a model, numerically (Gautier, 1991).
+
+    The columns of W over random closed postures are taken one by one, those of Izz, mx, my and
+    of the last bodies first; one that is a combination of those before it joins their groups.
+
+    Args:
+        model: The model.
+        samples: A motion, if what it can tell is asked for; all of the strokes if not given.
+        seed: Of the random postures.
+
+    Raises:
+        InputError: The loops close nowhere within the limits.
+    """
+    p, n = len(model.names), len(model.machine.active)
+    if samples is None:
+        samples = random_samples(model, max(60, 4 * p // n), seed)
+    rows = model.regressor(samples).reshape(-1, p)
+    norms = np.linalg.norm(rows, axis=0)
+    zero = norms <= _NOTHING * norms.max(initial=0.0)
+    scaled = rows / np.where(zero, 1.0, norms)
+    order = sorted(np.flatnonzero(~zero), key=lambda i: _preference(model, int(i)))
+    chosen: list[int] = []
+    directions = np.empty((len(rows), 0))
+    for i in order:
+        rest = scaled[:, i]
+        for _ in range(2):  # twice is enough (Kahan, Parlett)
+            rest = rest - directions @ (directions.T @ rest)
+        length = np.linalg.norm(rest)
+        if length > _RANK:
+            chosen.append(i)
+            directions = np.column_stack([directions, rest / length])
+    independent = np.array(sorted(chosen), dtype=np.intp)
+    grouping = np.zeros((len(independent), p))
+    if len(independent):
+        basis = scaled[:, independent]
+        q, r = np.linalg.qr(basis)
+        share = np.linalg.solve(r, q.T @ scaled)
+        share[np.abs(share) < 1e-9] = 0.0
+        grouping = share * np.where(zero, 0.0, norms) / norms[independent][:, None]
+        grouping[:, independent] = np.eye(len(independent))
+    names = tuple(name for name, gone in zip(model.names, zero, strict=True) if gone)
+    return Base(model.names, independent, grouping, names)
+
+
+def _preference(model: Model, column: int) -> tuple[int, int, int]:
+    """Bodies before other parameters of the same effect, distal ones first."""
+    bodies = 10 * len(model.bodies)
+    if column >= bodies:
+        return (1, 0, column)
+    kind = model.names[column].rpartition(".")[2]
+    return (0, _ORDER[kind], -column)

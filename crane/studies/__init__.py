@@ -1,0 +1,7 @@
+"""Model-based design studies: measures of a machine over its parameters."""
+
+from crane.studies.ranges import ranges
+from crane.studies.run import study
+from crane.studies.table import Study
+
+__all__ = ["Study", "ranges", "study"]

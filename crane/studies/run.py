@@ -1,0 +1,245 @@
+"""Design studies: the same measures of many variants, here or on a cluster."""
+
+import itertools
+import multiprocessing
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.description import parameters, read
+from crane.dynamics import Dynamics
+from crane.errors import CraneError, CraneWarning, InputError, known
+from crane.machine import Machine, load
+from crane.samples import Array, as_number, as_samples
+from crane.studies.measures import of_strokes, of_task, stroke_measures, task_measures, together
+from crane.studies.table import Study
+
+_MOST = 100_000  # variants
+
+Progress = Callable[[float], None]
+
+# One machine per set of formulas: as long as it lives, variants share its machine code.
+_KEPT: dict[int, Machine] = {}
+
+
+class Job(NamedTuple):
+    """What a variant is computed from, wherever that happens.
+
+    Attributes:
+        machine: What `load` takes.
+        changes: Of its parameters.
+        tasks: To measure it with.
+        strokes: Whether to measure its strokes.
+    """
+
+    machine: str
+    changes: dict[str, float]
+    tasks: tuple[str, ...]
+    strokes: bool
+
+
+def study(
+    machine: str | Path,
+    vary: Mapping[str, ArrayLike],
+    tasks: Sequence[str] | None = None,
+    measures: Sequence[str] | None = None,
+    *,
+    draws: int | None = None,
+    seed: int = 0,
+    processes: int = 1,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> Study:
+    """Measure variants of a machine: the grid of all values, or random draws.
+
+    Measures, see `crane.studies.measures`: peak_JOINT, rms_JOINT, energy and work of the active
+    joints over the tasks; reach, range, lower_JOINT and upper_JOINT of the strokes. Every variant
+    is loaded afresh, so its row does not depend on where it is computed, or after what.
+
+    Args:
+        machine: See `crane.load`.
+        vary: By name of a parameter, see `crane.description.parameters`: values, of which all
+            combinations are taken, or with `draws` the two ends of a range.
+        tasks: Of the machine; all if not given.
+        measures: Which ones; all if not given.
+        draws: Number of variants drawn uniformly from the ranges.
+        seed: Of the draws.
+        processes: How many to compute with; more than one need a main module that may be
+            imported (`if __name__ == "__main__":`).
+        scheduler: Address of a Dask scheduler whose workers compute instead.
+        progress: Called with the finished share, 0 to 1.
+
+    Raises:
+        InputError: Unknown names, values that do not go together, or no variant can be measured.
+    """
+    if as_number(processes, "the number of processes", "") < 1:
+        raise InputError(f"the number of processes is {processes}, give at least 1")
+    if as_number(seed, "the seed", "") < 0:
+        raise InputError(f"the seed is {seed}, it must not be negative")
+    base = load(machine)
+    name = base.reference if base.reference == str(machine) else str(base.path.resolve())
+    values, grid = _variants(vary, draws, seed)
+    units = _parameter_units(machine, base, vary)
+    tasks = _chosen("task", base.tasks, tasks)
+    of_tasks = task_measures(base) if tasks else {}
+    available = of_tasks | stroke_measures(base)
+    measures = _chosen("measure", available, measures)
+    if not set(measures) & set(of_tasks):
+        tasks = ()
+    jobs = [
+        Job(
+            name,
+            dict(zip(vary, row.tolist(), strict=True)),
+            tasks,
+            not set(measures) <= set(of_tasks),
+        )
+        for row in values
+    ]
+    rows: dict[int, tuple[dict[str, float], str]] = {}
+    for index, row in _computed(jobs, processes, scheduler):
+        rows[index] = row
+        if progress is not None:
+            progress(len(rows) / len(jobs))
+    columns = dict(zip(vary, values.T, strict=True))
+    for measure in measures:
+        names = [measure]
+        if measure in of_tasks and len(tasks) > 1:
+            names += [f"{measure} {task}" for task in tasks]
+        for column in names:
+            columns[column] = np.array([rows[i][0].get(column, np.nan) for i in range(len(jobs))])
+            units[column] = available[measure]
+    reasons = tuple(rows[i][1] for i in range(len(jobs)))
+    if all(reasons):
+        raise InputError(f"none of {len(jobs)} variants can be measured, the first: {reasons[0]}")
+    return Study(name, tuple(vary), measures, tasks, units, columns, reasons, grid)
+
+
+def variant(job: Job) -> tuple[dict[str, float], str]:
+    """Columns of one variant, and why some are missing."""
+    found: dict[str, float] = {}
+    reasons = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)  # told of the machine itself
+        try:
+            machine = load(job.machine, job.changes)
+        except CraneError as error:
+            return found, str(error)
+        if machine.closure.compiled:
+            _KEPT.setdefault(id(machine.closure.fast.programs), machine)
+        dynamics, done = Dynamics(machine), []
+        for task in job.tasks:
+            try:
+                done.append(of_task(machine, dynamics, task))
+                found |= {f"{name} {task}": value for name, value in done[-1][1].items()}
+            except CraneError as error:
+                reasons.append(f"task '{task}': {error}")
+        if done and len(done) == len(job.tasks):
+            found |= together(done)
+        if job.strokes:
+            found |= of_strokes(machine)
+    return found, "; ".join(reasons)
+
+
+def _variants(
+    vary: Mapping[str, ArrayLike], draws: int | None, seed: int
+) -> tuple[Array, tuple[int, ...]]:
+    """Values (V, parameters), and the shape of the grid."""
+    if not vary:
+        raise InputError("nothing varies, name a parameter and its values")
+    axes = []
+    for name, given in vary.items():
+        axis = np.atleast_1d(given)
+        axes.append(as_samples(axis, len(axis), f"what '{name}' is varied over"))
+        if axis.ndim > 1 or not len(axis):
+            raise InputError(f"parameter '{name}' has no list of values, give one")
+    count = draws if draws is not None else int(np.prod([float(len(axis)) for axis in axes]))
+    if not (isinstance(count, int | np.integer) and 1 <= count <= _MOST):
+        raise InputError(f"{count} variants are not possible, ask for 1 to {_MOST}")
+    if draws is None:
+        return np.array(list(itertools.product(*axes))), tuple(len(axis) for axis in axes)
+    for name, axis in zip(vary, axes, strict=True):
+        if len(axis) != 2 or not axis[0] < axis[1]:
+            raise InputError(f"'{name}' is drawn between two values, give the lower and the upper")
+    low, high = np.array(axes).T
+    return np.random.default_rng(seed).uniform(low, high, (count, len(axes))), ()
+
+
+def _chosen(
+    what: str, available: Mapping[str, object], wanted: Sequence[str] | None
+) -> tuple[str, ...]:
+    """Names without doubles, all if none are given."""
+    for name in wanted or ():
+        if name not in available:
+            raise InputError(f"{what} '{name}' is unknown, {known(available, name)}")
+    return tuple(dict.fromkeys(available if wanted is None else wanted))
+
+
+def _parameter_units(name: str | Path, machine: Machine, vary: Mapping[str, object]) -> dict:
+    """Units by parameter; refuses those that do not exist or change nothing."""
+    names = parameters(read(name))
+    units = {}
+    for wanted in vary:
+        if wanted not in names:
+            raise InputError(f"parameter '{wanted}' is unknown, {known(names, wanted)}")
+        head, *rest = wanted.split(".")
+        if head == "control":
+            raise InputError(
+                f"'{wanted}' changes nothing: the forces are those of the reference motion, "
+                "without a controller; vary something else"
+            )
+        units[wanted] = _unit(machine, head, rest)
+    return units
+
+
+def _unit(machine: Machine, head: str, rest: list[str]) -> str:
+    last = rest[-1]
+    if head == "friction":
+        length = machine.unit(".".join(rest[:-1]))
+        force = "N" if length == "m" else "N m"
+        if last in ("smoothing", "stribeck"):
+            return f"{length}/s"
+        return f"{force} s/{length}" if last.startswith("viscous") else force
+    if last in ("lower", "upper"):
+        return machine.unit(".".join([head, *rest[:-1]]))
+    if "inertia" in rest:
+        return "kg m2"
+    return {"mass": "kg", "x": "m", "y": "m", "z": "m"}.get(last, "rad")
+
+
+def _computed(
+    jobs: list[Job], processes: int, scheduler: str | None
+) -> Iterator[tuple[int, tuple[dict[str, float], str]]]:
+    """Indices and rows as they get ready."""
+    if scheduler is not None:
+        from crane.studies.cluster import computed
+
+        yield from computed(variant, jobs, scheduler)
+    elif processes <= 1 or len(jobs) == 1:
+        for index, job in enumerate(jobs):
+            yield index, variant(job)
+    else:
+        yield from _by_processes(jobs, min(processes, len(jobs)))
+
+
+def _by_processes(
+    jobs: list[Job], processes: int
+) -> Iterator[tuple[int, tuple[dict[str, float], str]]]:
+    # threads would wait for each other: most of a variant is computed in Python
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+    try:
+        futures = {pool.submit(variant, job): index for index, job in enumerate(jobs)}
+        for future in as_completed(futures):
+            yield futures[future], future.result()
+    except BrokenProcessPool:
+        raise InputError(
+            "a process ended before its time: guard what your script runs with "
+            "if __name__ == '__main__':, or take one process"
+        ) from None
+    finally:
+        pool.shutdown(cancel_futures=True)
