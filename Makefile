@@ -8,7 +8,7 @@ READY_BENCH := .venv/.installed-bench
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test slow lint bench clean
+.PHONY: help setup demo test slow lint bench reproduce clean
 
 help:
 	@echo "make setup   create .venv and install the package with its development tools"
@@ -17,6 +17,7 @@ help:
 	@echo "make slow    slow tests: browser, MuJoCo, long simulations"
 	@echo "make lint    ruff and mypy"
 	@echo "make bench   measure speed; results in docs/performance.md"
+	@echo "make reproduce   the reduced-scale forwarder paper again; docs/validation/"
 	@echo "make clean   remove .venv, caches and results"
 
 setup: $(READY)
@@ -41,10 +42,10 @@ demo: $(READY)
 	$(BIN)/crane demo --out demo-output --force
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 2
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 slow: $(READY_BENCH)
-	$(BIN)/python -m pytest -n 2 -m slow
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m slow
 
 lint: $(READY)
 	$(BIN)/python -m ruff check .
@@ -53,6 +54,9 @@ lint: $(READY)
 
 bench: $(READY_BENCH)
 	$(BIN)/python scripts/benchmark.py --write docs/performance.md
+
+reproduce: $(READY)
+	$(BIN)/python scripts/reproduce_mini_forwarder.py --write docs/validation/mini_forwarder.md
 
 clean:
 	rm -rf .venv .hypothesis .mypy_cache .pytest_cache .ruff_cache build dist demo-output

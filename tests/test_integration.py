@@ -317,9 +317,11 @@ def test_long_formulas_step_in_python(steps, monkeypatch):
     machine = crane.load("mini_forwarder")  # with nothing compiled yet
     start = np.array([0.1, 0.012, 0.016])
     monkeypatch.setattr(crane.straight.machine_code, "MOST", 10)
+    monkeypatch.setattr(crane.closure.compiled, "_SHARED", {})
     slow = crane.simulate(machine, None, start, duration=0.02)
     assert steps == {"compiled": 0, "python": 20}
     monkeypatch.undo()
+    machine = crane.load("mini_forwarder")
     fast = crane.simulate(machine, None, start, duration=0.02)
     assert off(fast, slow) < 1e-10
 

@@ -1,6 +1,8 @@
 """Base parameters: what of a machine's parameters can be told from its drives' forces."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -48,6 +50,14 @@ class Base:
         """Number of base parameters."""
         return len(self.independent)
 
+    def narrowed(self, rows: Array) -> "Base":
+        """What of the base parameters a motion tells, rows (m, r) of their columns."""
+        told = group([self.names[i] for i in self.independent], rows)
+        if told.rank == self.rank:
+            return self
+        independent = self.independent[told.independent]
+        return Base(self.names, independent, told.grouping @ self.grouping, self.unobservable)
+
     @property
     def groups(self) -> tuple[str, ...]:
         """Each base parameter in words, such as "link7.mx + 0.22 payload.m"."""
@@ -73,7 +83,7 @@ def random_samples(model: Model, count: int, seed: int = 0) -> Samples:
         InputError: The loops close nowhere within the limits.
     """
     machine, rng = model.machine, np.random.default_rng(seed)
-    lower, upper = _range(machine)
+    lower, upper = strokes(machine)
     q_a: list[Array] = []
     for _ in range(20 * count):
         trial = rng.uniform(lower, upper)
@@ -95,7 +105,7 @@ def random_samples(model: Model, count: int, seed: int = 0) -> Samples:
     return model.samples(np.array(q_a), v_a, a_a)
 
 
-def _range(machine: Machine) -> tuple[Array, Array]:
+def strokes(machine: Machine) -> tuple[Array, Array]:
     """Limits of the active joints; those without are taken around home."""
     home = machine.home[machine.closure.active]
     span = machine.upper - machine.lower
@@ -124,13 +134,19 @@ def base_parameters(model: Model, samples: Samples | None = None, seed: int = 0)
     if samples is None:
         samples = random_samples(model, max(60, 4 * p // n), seed)
     rows = model.regressor(samples).reshape(-1, p)
+    return group(model.names, rows, lambda column: _preference(model, column))
+
+
+def group(
+    names: Sequence[str], rows: Array, preference: Callable[[int], Any] = lambda column: column
+) -> Base:
+    """Base parameters of a regressor (m, p), columns of small preference first."""
     norms = np.linalg.norm(rows, axis=0)
     zero = norms <= _NOTHING * norms.max(initial=0.0)
     scaled = rows / np.where(zero, 1.0, norms)
-    order = sorted(np.flatnonzero(~zero), key=lambda i: _preference(model, int(i)))
     chosen: list[int] = []
     directions = np.empty((len(rows), 0))
-    for i in order:
+    for i in sorted(np.flatnonzero(~zero).tolist(), key=preference):
         rest = scaled[:, i]
         for _ in range(2):  # twice is enough (Kahan, Parlett)
             rest = rest - directions @ (directions.T @ rest)
@@ -139,16 +155,13 @@ def base_parameters(model: Model, samples: Samples | None = None, seed: int = 0)
             chosen.append(i)
             directions = np.column_stack([directions, rest / length])
     independent = np.array(sorted(chosen), dtype=np.intp)
-    grouping = np.zeros((len(independent), p))
-    if len(independent):
-        basis = scaled[:, independent]
-        q, r = np.linalg.qr(basis)
-        share = np.linalg.solve(r, q.T @ scaled)
-        share[np.abs(share) < 1e-9] = 0.0
-        grouping = share * np.where(zero, 0.0, norms) / norms[independent][:, None]
-        grouping[:, independent] = np.eye(len(independent))
-    names = tuple(name for name, gone in zip(model.names, zero, strict=True) if gone)
-    return Base(model.names, independent, grouping, names)
+    q, r = np.linalg.qr(scaled[:, independent])
+    share = np.linalg.solve(r, q.T @ scaled)
+    share[np.abs(share) < 1e-9] = 0.0
+    grouping = share * np.where(zero, 0.0, norms) / norms[independent][:, None]
+    grouping[:, independent] = np.eye(len(independent))
+    gone = tuple(name for name, nothing in zip(names, zero, strict=True) if nothing)
+    return Base(tuple(names), independent, grouping, gone)
 
 
 def _preference(model: Model, column: int) -> tuple[int, int, int]:

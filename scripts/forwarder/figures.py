@@ -4,13 +4,13 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
-from forwarder.paper import JOINTS, SIGNALS, TASKS, published
-from forwarder.runs import Run
 from matplotlib.figure import Figure
 
 from crane.output import replacing
 from crane.samples import Array
 from crane.view.plots import STYLE
+from forwarder.paper import JOINTS, SIGNALS, TASKS, published
+from forwarder.runs import Run
 
 LOOK = {
     "virtual rig": {"color": "#b9b9b9", "linewidth": 1.0},
@@ -58,7 +58,9 @@ def trajectory(number: int, runs: dict[str, Run], reference: tuple[Array, Array]
         for name, run in runs.items():
             space.plot(*(1e3 * run.tip.T), label=name, **LOOK[name])
         space.plot(*(1e3 * wanted.T), label="reference", **LOOK["reference"])
-        for axis, set_label in zip("xyz", (space.set_xlabel, space.set_ylabel, space.set_zlabel), strict=True):
+        for axis, set_label in zip(
+            "xyz", (space.set_xlabel, space.set_ylabel, space.set_zlabel), strict=True
+        ):
             set_label(f"{axis} [mm]")
         space.locator_params(nbins=4)
         space.set_title("tip")
@@ -104,7 +106,5 @@ def scoreboard(rms: dict[str, dict[str, Array]], ranges: dict[str, dict[str, Arr
             axes.set_xlabel("trajectory")
             axes.set_ylabel(f"RMS of {signal} [{'N m' if j == 0 else 'N'}]")
             axes.set_ylim(bottom=0)
-        figure.legend(
-            *axes.get_legend_handles_labels(), loc="outside upper center", ncols=4
-        )
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=4)
     return figure

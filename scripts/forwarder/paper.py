@@ -1,4 +1,4 @@
-"""What the reduced-scale forwarder paper prints: Table 1, Table 2, facts in the text, misprints."""
+"""What the reduced-scale forwarder paper prints: tables, facts in the text, misprints."""
 
 from dataclasses import dataclass
 
@@ -43,6 +43,13 @@ MISPRINTS = (
      "0.0817 g m2"),
     ("Table 4(h)", "the actuators' mass is lost, values shifted by one row",
      "0.034 kg assumed; its influence is below"),
+    ("before (13)", "A_2^0, A_3^0 count links on the left, rows of Table 3(a) on the right: "
+     "read literally, poses are off by 5 cm", "CM3 stands on rows 1 to 3, CM7 on rows 1 to 5"),
+    ("(13), Table 4(b)", "PCY3 in the equation, PCZ3 in the table", "the same length, 0.0109 m"),
+    ("(15)", "a fifth column in the matrix of CMA2", "four"),
+    ("(14), (15)", "K_m is called proportional to the displacement", "the constant factor itself"),
+    ("Table 4(f)", "A2B and A2C rounded to 0.1 mm",
+     "0.042426 m and 0.051614 m, from the triangle"),
     ("not printed", "pins G (rod eye of A2 on link 3) and K (link 6 on link 7)",
      "reconstructed; their influence is below"),
     ("(10), (11)", "trajectory 2 is said to start where trajectory 1 ends: 2 cm apart",

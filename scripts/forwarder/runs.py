@@ -6,6 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+
+import crane
+from crane.control import PI, Traced
+from crane.errors import ClosureError
+from crane.samples import Array
+from crane.straight.scalar import apply
 from forwarder.paper import (
     CRUISE,
     DURATION,
@@ -16,12 +22,6 @@ from forwarder.paper import (
     VISCOUS,
     published,
 )
-
-import crane
-from crane.control import PI, Traced
-from crane.errors import ClosureError
-from crane.samples import Array
-from crane.straight.scalar import apply
 
 FORMULATIONS = ("exact", "decoupled")
 READINGS = ("braking", "as printed")
@@ -44,7 +44,9 @@ class Pushed(PI):
         integral: (3,) see `PI`.
     """
 
-    def __init__(self, machine: crane.Machine, path: crane.Path, smoothing: Array, integral: Array):
+    def __init__(
+        self, machine: crane.Machine, path: crane.Path, smoothing: Array, integral: Array
+    ):
         super().__init__(machine, path, integral=integral)
         self._smoothing = smoothing
         table = np.array([FRICTION[joint] for joint in JOINTS])
@@ -143,9 +145,7 @@ def simulate(machine: crane.Machine, path: crane.Path, formulation: str, reading
 def run_of(recording: crane.Recording, path: crane.Path, tau: Array) -> Run:
     """A recording with its reference."""
     tip = np.column_stack([recording.channels[f"tip_{axis}"] for axis in "xyz"])
-    return Run(
-        recording.time, recording.q, recording.v, tau, tip, path.tip(recording.time)[0]
-    )
+    return Run(recording.time, recording.q, recording.v, tau, tip, path.tip(recording.time)[0])
 
 
 def tip_errors(machine: crane.Machine, path: crane.Path) -> dict[str, Array]:
@@ -184,7 +184,9 @@ def neglected(machine: crane.Machine) -> dict[str, tuple[Array, Array, Array]]:
     Static; at the largest velocities of the tasks in all directions; and with their largest
     accelerations on top.
     """
-    grid = [np.linspace(low, high, 25) for low, high in zip(machine.lower, machine.upper, strict=True)]
+    grid = [
+        np.linspace(low, high, 25) for low, high in zip(machine.lower, machine.upper, strict=True)
+    ]
     grid[0] = np.zeros(1)
     postures = np.array(list(itertools.product(*grid)))
     bare = machine.replace(friction={}, end_stops=())
@@ -285,7 +287,9 @@ def agrees_with_the_text(tasks: dict[str, Coarse]) -> bool:
     return bool(np.abs(cruising - CRUISE).max() < 0.5e-3)
 
 
-def feasible_set(draws: int, seed: int) -> Iterator[tuple[str, dict[str, float], dict[str, Coarse]]]:
+def feasible_set(
+    draws: int, seed: int
+) -> Iterator[tuple[str, dict[str, float], dict[str, Coarse]]]:
     """Variants of G, K and the actuators' mass that the facts allow, with their tasks.
 
     G and K are drawn within 6 mm around the reconstruction, all tasks have to stay within the
@@ -295,7 +299,11 @@ def feasible_set(draws: int, seed: int) -> Iterator[tuple[str, dict[str, float],
     rng = np.random.default_rng(seed)
     nominal = crane.load("mini_forwarder")
     base = {
-        name: float(nominal.model.frames[nominal.frame(name[:-2])].placement.translation["xy".index(name[-1])])
+        name: float(
+            nominal.model.frames[nominal.frame(name[:-2])].placement.translation[
+                "xy".index(name[-1])
+            ]
+        )
         for name in ("link3_G.x", "link3_G.y", "link7_K.x", "link7_K.y")
     }
     for what in ("G", "K", "actuator mass", "all"):

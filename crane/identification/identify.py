@@ -1,0 +1,286 @@
+"""From a recording to parameters."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.errors import InputError, RecordingError, known
+from crane.identification.base import Base, base_parameters
+from crane.identification.estimators import Prior, huber, least_squares, weighted
+from crane.identification.feasible import feasible as feasible_estimate
+from crane.identification.feasible import pseudo_inertia
+from crane.identification.model import Model, Samples, Term
+from crane.identification.result import Comparison, Identification
+from crane.identification.signals import (
+    Motion,
+    check,
+    check_forces,
+    differentiate,
+    filter_rows,
+    moving,
+    resample,
+)
+from crane.machine import Machine
+from crane.recording import Recording
+from crane.samples import Array
+
+METHODS = {"ols": least_squares, "wls": weighted, "huber": huber}
+_SLOW = 0.02  # of a joint's largest velocity, below which its rows are left out
+_FAST = 5.0  # times the frequency below which 99 % of the accelerations are
+_PRIOR = 0.3  # relative standard deviation of a body towards which a feasible estimate is drawn
+_THICKNESS = 0.05  # of a body's size, added to what is thinner in a prior
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Equations of a recording, filtered and thinned: y = W beta.
+
+    Attributes:
+        time: (M,) [s].
+        W: (M, n, r).
+        y: (M, n).
+        offset: (M, n) forces that no parameter changes, to be added to W beta.
+        moving: (M, n).
+    """
+
+    time: Array
+    W: Array
+    y: Array
+    offset: Array
+    moving: np.ndarray
+
+    def stacked(self) -> tuple[Array, Array, np.ndarray, np.ndarray]:
+        """Rows that count: W (m, r), y (m,), joint and instant of each, joints one after another."""
+        joint, instant = np.nonzero(self.moving.T)
+        _, group = np.unique(joint, return_inverse=True)
+        return self.W[instant, joint], self.y[instant, joint], group, instant
+
+
+def motion_of(
+    machine: Machine,
+    recording: Recording,
+    derivatives: str = "kalman",
+    cutoff: float | None = None,
+) -> Motion:
+    """Velocities and accelerations of a recording, which is checked first.
+
+    Args:
+        machine: What was recorded.
+        recording: With all active joints of the machine.
+        derivatives: "kalman" or "lowpass", see `signals.differentiate`.
+        cutoff: [Hz] of "lowpass".
+
+    Raises:
+        RecordingError: What is recorded cannot serve; the message names column and time.
+    """
+    missing = [joint for joint in machine.active if joint not in recording.joints]
+    if missing:
+        raise RecordingError(
+            f"'{missing[0]}' of '{machine.name}' is not recorded, {known(recording.joints)}"
+        )
+    order = [recording.joints.index(joint) for joint in machine.active]
+    q, v, tau = (x[:, order] for x in (recording.q, recording.v, recording.tau))
+    for joint in machine.active:
+        if recording.units[joint] != machine.unit(joint):
+            raise RecordingError(
+                f"'{joint}' is recorded in {recording.units[joint]}, give {machine.unit(joint)}"
+            )
+    limits = np.column_stack([machine.lower, machine.upper])
+    bounded = limits if np.isfinite(limits).all() else None
+    units = {joint: machine.unit(joint) for joint in machine.active}
+    recorded_v = v if np.any(v) else None
+    check(recording.time, q, tau, machine.active, units, recorded_v, bounded)
+    step = float(np.median(np.diff(recording.time)))
+    time, columns = recording.time, np.column_stack([q, tau])
+    if np.abs(np.diff(time) - step).max() > 1e-3 * step:
+        time, columns = resample(time, columns, step)
+    q, tau = np.split(columns, 2, axis=1)
+    found = differentiate(time, q, derivatives, cutoff)
+    return Motion(time, found.q, found.v, found.a, tau)
+
+
+def identify(
+    machine: Machine,
+    recording: Recording | Motion,
+    validation: Recording | Motion | None = None,
+    method: str = "wls",
+    prior: float | Prior | None = None,
+    feasible: bool = False,
+    *,
+    terms: Sequence[Term] | None = None,
+    bandwidth: float | None = None,
+    slow: ArrayLike | None = None,
+) -> Identification:
+    """Base parameters of a machine from recorded strokes and forces.
+
+    tau_A + gamma^T f = W(q_A, v_A, a_A) beta on both sides of a zero-phase low-pass, thinned;
+    rows of a joint near standstill left out.
+
+    Args:
+        machine: The machine, whose geometry is taken as known.
+        recording: What to learn from; a `Motion` if velocities and accelerations are known.
+        validation: What to be judged by, not learned from.
+        method: "ols", "wls" (rows of each joint by its noise) or "huber" (robust).
+        prior: Relative standard deviation of the bodies of the machine's description, about
+            which the estimate is regularised; or means and standard deviations (p,) of all
+            parameters. All parameters come out then, not only the base parameters.
+        feasible: Whether the bodies have to be able to exist and friction must not be negative;
+            all parameters come out.
+        terms: Of the model; bodies and friction if not given, see `model.default_terms`.
+        bandwidth: [Hz] of the low-pass; several times the frequencies of the motion if not
+            given.
+        slow: (n,) velocities below which rows are left out; a share of the largest if not given.
+
+    Returns:
+        Parameters, their confidence, and how well they predict both recordings.
+
+    Raises:
+        InputError: Arguments that do not fit.
+        RecordingError: A recording that cannot serve, and why.
+    """
+    if method not in METHODS:
+        raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
+    model = Model(machine, terms)
+    motion = recording if isinstance(recording, Motion) else motion_of(machine, recording)
+    base = base_parameters(model)
+    if bandwidth is None:
+        bandwidth = _bandwidth(motion)
+    fastest = np.abs(motion.v).max(axis=0)
+    slow = _SLOW * fastest if slow is None else np.broadcast_to(slow, fastest.shape)
+    rows = _equations(model, base, motion, bandwidth, slow)
+    if model.bodies:
+        check_forces(
+            rows.time,
+            rows.y + rows.offset,
+            rows.W @ base.values(model.nominal) + rows.offset,
+            machine.active,
+        )
+    W, y, groups, instants = rows.stacked()
+    if not len(y):
+        raise RecordingError("no joint moves faster than what counts as standstill, move it more")
+    told = base.narrowed(W)
+    picked = np.searchsorted(base.independent, told.independent)
+    prior = _prior(model, prior) if isinstance(prior, int | float) else prior
+    parameters = None
+    if feasible:
+        estimate = METHODS[method](W[:, picked], y, groups, instants)
+        parameters = _possible(model, told, W[:, picked], y, estimate.noise[groups], prior)
+        values, covariance = told.values(parameters), estimate.covariance
+    elif prior is not None:
+        estimate = METHODS[method](W[:, picked] @ told.grouping, y, groups, instants, prior)
+        parameters = estimate.values
+        values = told.values(parameters)
+        covariance = told.grouping @ estimate.covariance @ told.grouping.T
+    else:
+        estimate = METHODS[method](W[:, picked], y, groups, instants)
+        values, covariance = estimate.values, estimate.covariance
+
+    def compare(rows: _Rows) -> Comparison:
+        modelled = rows.W[:, :, picked] @ values + rows.offset
+        return Comparison(
+            rows.time, rows.y + rows.offset, modelled, rows.moving, machine.active
+        )
+
+    judged = None
+    if validation is not None:
+        other = validation if isinstance(validation, Motion) else motion_of(machine, validation)
+        judged = compare(_equations(model, base, other, bandwidth, slow))
+    return Identification(
+        model, told, values, covariance, parameters, estimate, method, feasible,
+        compare(rows), judged,
+    )  # fmt: skip
+
+
+def _equations(
+    model: Model, base: Base, motion: Motion, bandwidth: float, slow: ArrayLike
+) -> _Rows:
+    """Both sides at the samples of a motion, filtered and thinned."""
+    at: Samples = model.samples(motion.q, motion.v, motion.a)
+    W = model.regressor(at)[:, :, base.independent]
+    offset = model.known(at)
+    step = float(motion.time[1] - motion.time[0])
+    thinning = max(1, int(0.25 / (step * bandwidth)))
+    both = np.concatenate([W, offset[:, :, None]], axis=2)
+    if bandwidth * step < 0.25:
+        both, tau = filter_rows(both, motion.tau, step, bandwidth, thinning)
+    else:
+        tau, thinning = motion.tau, 1
+    W, offset = both[:, :, :-1], both[:, :, -1]
+    kept = moving(motion.v, slow)[::thinning]
+    return _Rows(motion.time[::thinning], W, tau - offset, offset, kept)
+
+
+def _bandwidth(motion: Motion) -> float:
+    """Several times the frequency below which 99 % of the accelerations' power is [Hz]."""
+    from scipy.signal import periodogram
+
+    step = float(motion.time[1] - motion.time[0])
+    size = np.maximum(motion.a.std(axis=0), 1e-300)
+    frequency, power = periodogram(motion.a / size, 1 / step, axis=0, window="hann")
+    share = np.cumsum(power, axis=0)
+    last = max(
+        float(frequency[np.searchsorted(column, 0.99 * column[-1])])
+        for column, a in zip(share.T, motion.a.T, strict=True)
+        if np.ptp(a) > 0
+    )
+    return min(_FAST * max(last, frequency[1]), 0.24 / step)
+
+
+def _prior(model: Model, relative: float) -> Prior:
+    """Bodies as described, each known to a share of its mass and size; of others nothing."""
+    if not relative > 0:
+        raise InputError(f"the prior's standard deviation is {relative:g}, give one above 0")
+    std = np.full(len(model.names), np.inf)
+    for i in range(len(model.bodies)):
+        mass, length = _size(model.nominal[10 * i : 10 * i + 10])
+        units = np.array([1.0, *[length] * 3, *[length**2] * 6])
+        std[10 * i : 10 * i + 10] = relative * mass * units
+    mean = np.where(np.isfinite(std), model.nominal, 0.0)
+    return mean, std
+
+
+def _size(body: Array) -> tuple[float, float]:
+    """Mass, and the root of the mean square distance of the mass from the joint's origin."""
+    P = pseudo_inertia(body)
+    return float(body[0]), float(np.sqrt(max(np.trace(P[:3, :3]), 0.0) / body[0]))
+
+
+def _possible(
+    model: Model, base: Base, W: Array, y: Array, noise: Array, prior: Prior | None
+) -> Array:
+    """All parameters, with bodies that can exist."""
+    if not model.bodies:
+        raise InputError("the model has no bodies, so nothing has to be feasible")
+    count = 10 * len(model.bodies)
+    mean, spread, weight = model.nominal.copy(), None, _PRIOR**-2
+    if prior is not None:
+        mean = prior[0].copy()
+        spread = prior[1][count:]
+        sizes = [_size(mean[i : i + 10])[0] for i in range(0, count, 10)]
+        weight = float(np.median(prior[1][:count:10] / sizes)) ** -2
+    for i in range(0, count, 10):
+        mean[i : i + 10] = _thick(mean[i : i + 10])
+    signs = [i for i, sign in enumerate(model.signs) if sign and i >= count]
+    found = feasible_estimate(
+        W @ base.grouping, y, 1 / noise, model.bodies, mean, weight, spread, signs
+    )
+    return found.values
+
+
+def _thick(body: Array) -> Array:
+    """A body at least a share of its size thick in every direction.
+
+    Rods and plates without thickness lie on the edge of what can exist.
+    """
+    from crane.identification.feasible import body_parameters
+
+    P = pseudo_inertia(body)
+    mass, length = _size(body)
+    com = P[:3, 3] / mass
+    second = P[:3, :3] - mass * np.outer(com, com)
+    values, axes = np.linalg.eigh(second)
+    least = mass * (_THICKNESS * length) ** 2
+    P[:3, :3] = axes @ np.diag(np.maximum(values, least)) @ axes.T + mass * np.outer(com, com)
+    return body_parameters(P)

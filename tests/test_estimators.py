@@ -1,0 +1,176 @@
+import numpy as np
+import pytest
+from scipy.signal import butter, lfilter, sosfiltfilt
+from scipy.stats import f, t
+
+from crane.errors import InputError
+from crane.identification.estimators import (
+    essential,
+    huber,
+    instrumental,
+    least_squares,
+    weighted,
+)
+
+
+def white(count=800, size=4, seed=0, noise=0.5):
+    rng = np.random.default_rng(seed)
+    W = rng.standard_normal((count, size)) * np.geomspace(1, 100, size)
+    return W, W @ np.arange(1.0, size + 1) + noise * rng.standard_normal(count)
+
+
+def test_ordinary_least_squares_of_white_noise():
+    W, y = white()
+    found = least_squares(W, y)
+    exact, squares = np.linalg.lstsq(W, y)[:2]
+    np.testing.assert_allclose(found.values, exact, rtol=1e-12)
+    np.testing.assert_allclose(found.residuals, y - W @ exact, atol=1e-11)
+    np.testing.assert_allclose(found.noise**2, squares / 796, rtol=1e-9)
+    np.testing.assert_allclose(found.condition, np.linalg.cond(W), rtol=1e-9)
+    assert found.scaled_condition < 1.3
+    textbook = np.sqrt(squares / 796 * np.diag(np.linalg.inv(W.T @ W)))
+    np.testing.assert_allclose(found.std, textbook, rtol=0.15)
+    half = np.diff(found.interval(0.9))[:, 0] / 2
+    np.testing.assert_allclose(half, t.ppf(0.95, found.freedom) * found.std)
+
+
+def test_without_noise_every_estimator_is_exact():
+    W, y = white(noise=0.0)
+    groups = np.arange(800) % 2
+    for found in (
+        least_squares(W, y),
+        weighted(W, y, groups),
+        huber(W, y, groups),
+        instrumental(W, y, W, groups),
+    ):
+        np.testing.assert_allclose(found.values, [1, 2, 3, 4], rtol=1e-11)
+
+
+def test_weighting_finds_the_noise_of_each_joint():
+    rng = np.random.default_rng(1)
+    W, y = white(4000, noise=0.0)
+    groups = np.arange(4000) % 2
+    sigma = np.array([0.1, 3.0])
+    found = weighted(
+        W, y + sigma[groups] * rng.standard_normal(4000), groups, np.arange(4000) // 2
+    )
+    np.testing.assert_allclose(found.noise, sigma, rtol=0.06)
+    exact = np.sqrt(np.diag(np.linalg.inv((W.T / sigma[groups] ** 2) @ W)))
+    np.testing.assert_allclose(found.std, exact, rtol=0.1)
+
+
+def test_huber_resists_outliers():
+    rng = np.random.default_rng(2)
+    W, y = white(2000)
+    y[rng.choice(2000, 100, replace=False)] += 500
+    found, plain = huber(W, y), least_squares(W, y)
+    assert (np.abs(found.values - [1, 2, 3, 4]) < 4 * found.std).all()
+    assert (found.std < 0.1 * plain.std).all()
+
+
+@pytest.mark.parametrize("estimator", [least_squares, weighted, huber, instrumental])
+def test_prior(estimator):
+    """Known noise: the posterior of normal distributions. A column of zeros keeps its prior."""
+    W, y = white(3000)
+    W[:, 2] = 0
+    y = y - white(3000)[0][:, 2] * 3
+    mean, std = np.array([1.5, 0, 7, 0]), np.array([0.01, np.inf, 0.2, np.inf])
+    kind = {"groups": np.zeros(3000, int), "prior": (mean, std)}
+    found = estimator(W, y, W, **kind) if estimator is instrumental else estimator(W, y, **kind)
+    assert found.values[2] == pytest.approx(7)
+    assert found.std[2] == pytest.approx(0.2)
+    information = W.T @ W / found.noise**2 + np.diag(1 / std**2)
+    exact = np.linalg.solve(information, W.T @ y / found.noise**2 + np.nan_to_num(mean / std**2))
+    # Huber's clips the noise and weighs its rows less, together by a few percent.
+    close = 0.1 if estimator is huber else 2e-3
+    np.testing.assert_allclose(found.values[0], exact[0], rtol=close)
+    np.testing.assert_allclose(found.std[0], np.linalg.inv(information)[0, 0] ** 0.5, rtol=0.1)
+
+
+def test_instruments_remove_the_bias_of_a_noisy_regressor():
+    rng = np.random.default_rng(3)
+    Z, y = white(20_000, 3, noise=0.1)
+    W = Z + 0.5 * Z.std(axis=0) * rng.standard_normal(Z.shape)
+    plain, found = least_squares(W, y), instrumental(W, y, Z)
+    assert (plain.values < 0.85 * np.array([1, 2, 3])).any()
+    assert (np.abs(found.values - [1, 2, 3]) < 4 * found.std).all()
+
+
+def draw(kind, strength, rng, count, joints):
+    """Noise of joints that are correlated with each other at 0.5."""
+    mixed = np.linalg.cholesky(0.5 * np.eye(joints) + 0.5)
+    u = rng.standard_normal((count + 600, joints)) @ mixed.T * np.geomspace(1, 3, joints)
+    if kind == "ar":
+        return lfilter([1], [1, -strength], u, axis=0)[600:]
+    return sosfiltfilt(butter(4, strength, output="sos"), u, axis=0)[300:-300]
+
+
+@pytest.mark.parametrize(
+    ("estimator", "kind", "strength", "gaps", "count"),
+    [
+        (weighted, "ar", -0.5, False, 1000),
+        (weighted, "ar", 0.0, True, 1000),
+        (weighted, "ar", 0.9, False, 1000),
+        (weighted, "ar", 0.95, False, 1000),
+        (weighted, "ar", 0.95, True, 1000),
+        (huber, "ar", 0.9, False, 1000),
+        (weighted, "low", 0.3, True, 1000),
+        (weighted, "low", 0.1, True, 2500),
+    ],
+)
+def test_intervals_cover_the_truth(estimator, kind, strength, gaps, count):
+    """200 runs of two joints with slow, sharp and constant columns: 95 % within 90 to 99 %."""
+    rng, size, joints = np.random.default_rng(4), 6, 2
+    time, truth, covered = 0.01 * np.arange(count), np.arange(1.0, 7.0), []
+    samples, groups = np.indices((count, joints))
+    for _ in range(200):
+        rate, phase = rng.uniform(0.1, 1, (joints, size)), rng.uniform(0, 7, (joints, size))
+        W = np.sin(2 * np.pi * rate * time[:, None, None] + phase)
+        W[..., 0] = np.sign(W[..., 0])
+        W[..., 1] = 1 + 0.1 * W[..., 1]
+        y = W @ truth + draw(kind, strength, rng, count, joints)
+        kept = np.abs(W[..., 2]) > 0.1 * gaps
+        low, high = estimator(W[kept], y[kept], groups[kept], samples[kept]).interval().T
+        covered.append((low < truth) & (truth < high))
+    assert 0.90 <= np.mean(covered) <= 0.99
+
+
+def test_effective_rows_of_autoregressive_noise():
+    rng = np.random.default_rng(5)
+    W = rng.standard_normal((20_000, 2))
+    found = least_squares(W, draw("ar", 0.9, rng, 20_000, 1)[:, 0])
+    assert found.effective[0] == pytest.approx(20_000 * 0.1 / 1.9, rel=0.15)
+
+
+def test_essential_parameters():
+    W, _ = white(500, 6, seed=6)
+    rng = np.random.default_rng(6)
+    y = W @ [2.0, 0, 3, 0, 0, 4] + 0.5 * rng.standard_normal(500)
+    found = least_squares(W, y)
+    assert essential(found, 0.01).tolist() == [0, 2, 5]
+    # The same F as from the sums of squares, where the covariance is the textbook one.
+    dropped = [1, 3, 4]
+    rest = np.linalg.lstsq(W[:, [0, 2, 5]], y)[1][0]
+    full = found.residuals @ found.residuals
+    C = full / 494 * np.linalg.inv(W.T @ W)[np.ix_(dropped, dropped)]
+    theta = found.values[dropped]
+    F = theta @ np.linalg.solve(C, theta) / 3
+    assert pytest.approx((rest - full) / 3 / (full / 494)) == F
+    assert f.ppf(0.99, 3, 494) > F
+
+
+def test_errors():
+    W, y = white(50)
+    with pytest.raises(InputError, match=r"4 columns of the regressor depend on each other"):
+        least_squares(W[:, [0, 1, 1, 2]], y)
+    with pytest.raises(InputError, match="4 rows for 4 parameters are too few, record longer"):
+        least_squares(W[:4], y[:4])
+    with pytest.raises(InputError, match=r"y has the shape \(49,\), give \(50,\)"):
+        least_squares(W, y[:49])
+    with pytest.raises(InputError, match="samples of group 0 do not increase, sort its rows"):
+        least_squares(W, y, samples=np.zeros(50))
+    with pytest.raises(InputError, match="the prior is not means and deviations > 0"):
+        least_squares(W, y, prior=(np.zeros(4), np.zeros(4)))
+    y[7] = np.nan
+    with pytest.raises(InputError, match="forces not finite in row 7, leave such rows out"):
+        least_squares(W, y)

@@ -1,0 +1,144 @@
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.optimize import minimize
+
+from crane.errors import InputError
+from crane.identification.feasible import body_parameters, feasible, pseudo_inertia
+
+
+def body(rng, size, mass):
+    """Ten parameters of 20 point masses."""
+    points = np.column_stack([size * rng.standard_normal((20, 3)) + size, np.ones(20)])
+    return body_parameters(points.T @ (mass * rng.dirichlet(np.ones(20))[:, None] * points))
+
+
+def problem(bodies, others, noise=0.0, rows=3000, seed=0):
+    """Regressor, forces, truth, prior; sizes from 3 cm to 1 m, masses from 0.1 to 100 kg."""
+    rng = np.random.default_rng(seed)
+    truth = [
+        body(rng, s, m)
+        for s, m in zip(np.geomspace(0.03, 1, bodies), np.geomspace(0.1, 100, bodies), strict=True)
+    ]
+    prior = []
+    for p in truth:
+        T = np.eye(4) + np.diag(0.15 * rng.standard_normal(4))
+        T[:3, 3] += 0.1 * np.sqrt(p[9] / p[0]) * rng.standard_normal(3)
+        prior.append(body_parameters(T @ pseudo_inertia(p) @ T.T))
+    friction = rng.uniform(0, 5, others)
+    W = rng.standard_normal((rows, 10 * bodies + others))
+    truth = np.concatenate([*truth, friction])
+    prior = np.concatenate([*prior, 1.2 * friction])
+    return W, W @ truth + noise * rng.standard_normal(rows), truth, prior
+
+
+def names(count):
+    return [f"link{i}" for i in range(count)]
+
+
+def test_pseudo_inertia_is_pinocchios():
+    inertia = pin.Inertia.Random()
+    P = pseudo_inertia(inertia.toDynamicParameters())
+    np.testing.assert_allclose(P, inertia.toPseudoInertia().toMatrix(), atol=1e-12)
+    np.testing.assert_allclose(body_parameters(P), inertia.toDynamicParameters(), atol=1e-12)
+
+
+def test_truth_without_noise():
+    W, y, truth, prior = problem(4, 5)
+    found = feasible(W, y, np.full(len(y), 1e2), names(4), prior, 1e-3, nonnegative=range(40, 45))
+    np.testing.assert_allclose(found.values, truth, atol=1e-5)
+    assert found.smallest.min() > 0
+
+
+def test_bodies_exist_where_least_squares_has_none():
+    W, y, truth, prior = problem(11, 30, noise=5.0)
+    plain = np.linalg.lstsq(W, y)[0]
+    assert np.linalg.eigvalsh(pseudo_inertia(plain[:110].reshape(11, 10))).min() < 0
+    found = feasible(
+        W, y, np.full(len(y), 0.2), names(11), prior, 25.0, nonnegative=range(110, 140)
+    )
+    P = pseudo_inertia(found.values[:110].reshape(11, 10))
+    assert (np.linalg.eigvalsh(P)[:, 0] > 0).all()
+    assert (found.values[110:] >= 0).all()
+    assert found.misfit < 1.05 * len(y)
+    assert np.linalg.norm(found.values - truth) < np.linalg.norm(plain - truth)
+
+
+def test_limits_of_the_prior_weight():
+    W, y, truth, prior = problem(2, 2, noise=1e-3)
+    weights = np.full(len(y), 1e3)
+    spread = np.full(2, 1e-6)
+    strong = feasible(W, y, 1e-9 * weights, names(2), prior, 1e6, spread)
+    np.testing.assert_allclose(strong.values, prior, rtol=1e-4, atol=1e-6)
+    weak = feasible(W, y, weights, names(2), prior, 1e-4)
+    np.testing.assert_allclose(weak.values, np.linalg.lstsq(W, y)[0], atol=1e-6)
+
+
+def test_dependent_columns_are_left_to_the_prior():
+    W, y, truth, prior = problem(2, 0)
+    basis = np.linalg.qr(np.random.default_rng(1).standard_normal((20, 12)))[0]
+    W = W @ basis @ basis.T
+    found = feasible(W, W @ truth, np.full(len(y), 1e2), names(2), prior, 1.0)
+    np.testing.assert_allclose(basis.T @ found.values, basis.T @ truth, atol=1e-3)
+    # The truth exists and explains everything: the prior cannot be farther than from it.
+    apart = 0.0
+    for one, other in zip(truth.reshape(2, 10), prior.reshape(2, 10), strict=True):
+        ratio = np.linalg.solve(pseudo_inertia(other), pseudo_inertia(one))
+        apart += np.trace(ratio) - np.linalg.slogdet(ratio)[1] - 4
+    assert found.misfit + 2 * found.divergence.sum() < 2 * apart
+
+
+def test_a_bound_holds():
+    W, y, truth, prior = problem(1, 2)
+    truth[10] = -3.0
+    found = feasible(W, W @ truth, np.ones(len(y)), names(1), prior, 1.0, nonnegative=[10])
+    assert found.values[10] == pytest.approx(0, abs=1e-6)
+    free = feasible(W, W @ truth, np.ones(len(y)), names(1), prior, 1.0)
+    assert free.values[10] == pytest.approx(-3, abs=1e-2)
+
+
+def test_brute_force_on_one_body():
+    """The same minimum over Cholesky factors by a general optimiser."""
+    W, y, _, prior = problem(1, 1, noise=1.0, rows=40)
+    spread = np.array([0.3])
+    P0 = pseudo_inertia(prior[:10])
+    inverse, lower = np.linalg.inv(P0), np.linalg.cholesky(P0)
+
+    def unpack(x):
+        C = np.zeros((4, 4))
+        C[np.tril_indices(4)] = x[:10]
+        P = lower @ C @ C.T @ lower.T
+        return P, np.append(body_parameters(P), x[10])
+
+    def cost(x):
+        P, theta = unpack(x)
+        ratio = inverse @ P
+        d = np.trace(ratio) - np.linalg.slogdet(ratio)[1] - 4
+        pull = (theta[10] - prior[10]) / spread[0]
+        return np.sum((W @ theta - y) ** 2) + 8 * d + pull**2
+
+    start = np.append(np.eye(4)[np.tril_indices(4)], prior[10])
+    best = minimize(cost, start, method="BFGS", options={"gtol": 1e-7})
+    found = feasible(W, y, np.ones(40), ["link"], prior, 4.0, spread)
+    np.testing.assert_allclose(found.values, unpack(best.x)[1], atol=1e-5)
+
+
+def test_priors_that_cannot_be():
+    W, y, _, prior = problem(2, 1)
+
+    def message(change, index=slice(10, 20)):
+        wrong = prior.copy()
+        wrong[index] = change
+        with pytest.raises(InputError) as error:
+            feasible(W, y, np.ones(len(y)), ["boom", "stick"], wrong, 1.0)
+        return str(error.value)
+
+    assert message(-1.0, 10) == "prior of 'stick' has the mass -1 kg, give it a positive one"
+    assert message([1, 0, 0, 0, 1, 0, 1, 0, 0, 3]).startswith(
+        "prior of 'stick' has an inertia of no possible body: principal moments 1 + 1 < 3 kg m2"
+    )
+    assert message([1, 0, 0, 0, 1, 0, 1, 0, 0, 2]).startswith("prior of 'stick' is flat: second")
+    with pytest.raises(InputError, match=r"spread has the shape \(2,\), give \(1,\)"):
+        feasible(W, y, np.ones(len(y)), ["boom", "stick"], prior, 1.0, np.ones(2))
+    with pytest.raises(InputError, match=r"nonnegative columns \[3\], choose of 20 to 20"):
+        feasible(W, y, np.ones(len(y)), ["boom", "stick"], prior, 1.0, nonnegative=[3])

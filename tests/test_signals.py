@@ -1,0 +1,366 @@
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag
+
+from crane.errors import InputError, RecordingError
+from crane.identification import signals
+from crane.identification.signals import check, check_forces, differentiate
+
+JOINTS, UNITS = ("q1", "X1"), {"q1": "rad", "X1": "m"}
+
+
+def movement(time):
+    """Two joints of a crane: coordinates, velocities, accelerations (N, 2)."""
+    q = v = a = 0
+    for size, rate, phase in (([0.5, 0.1], 1.1, 0.3), ([0.2, 0.03], 3.3, 1.0)):
+        angle = rate * time[:, None] + phase + np.array([0.0, 0.7])
+        q = q + np.array(size) * np.sin(angle)
+        v = v + np.array(size) * rate * np.cos(angle)
+        a = a - np.array(size) * rate**2 * np.sin(angle)
+    return q, v, a
+
+
+def model(h):
+    """F, Q and the process noise's factor of the constant-jerk model, from its definition."""
+    F = np.array([[1, h, h**2 / 2, h**3 / 6], [0, 1, h, h**2 / 2], [0, 0, 1, h], [0, 0, 0, 1]])
+    nodes, weights = np.polynomial.legendre.leggauss(8)
+    b = [
+        np.array([s**3 / 6, s**2 / 2, s, 1]) * math.sqrt(w * h / 2)
+        for s, w in zip((nodes + 1) * h / 2, weights, strict=True)
+    ]
+    return F, h * np.array(b).T @ np.array(b)
+
+
+def rts(y, h):
+    """Textbook Kalman filter and smoother with a wide prior."""
+    F, Q = model(h)
+    x, P, H = np.zeros(4), np.eye(4) * 1e7, np.eye(1, 4)
+    steps = []
+    for k, measured in enumerate(y):
+        if k:
+            x, P = F @ x, F @ P @ F.T + Q
+        predicted = x, P
+        K = P @ H.T / (P[0, 0] + 1)
+        x = x + K[:, 0] * (measured - x[0])
+        A = np.eye(4) - K @ H
+        P = A @ P @ A.T + K @ K.T
+        steps.append((*predicted, x, P))
+    out = [steps[-1][2:]]
+    for (_, _, x, P), (xp, Pp, _, _) in zip(steps[-2::-1], steps[:0:-1], strict=True):
+        C = P @ F.T @ np.linalg.inv(Pp)
+        xs, Ps = out[-1]
+        out.append((x + C @ (xs - xp), P + C @ (Ps - Pp) @ C.T))
+    return [np.array(part) for part in zip(*out[::-1], strict=True)]
+
+
+def whole(y, h):
+    """All states at once: generalised least squares over every equation, nothing known before."""
+    F, Q = model(h)
+    L = np.linalg.inv(np.linalg.cholesky(Q))
+    n = len(y)
+    process = np.kron(np.eye(n - 1, n, 1), L) - np.kron(np.eye(n - 1, n), L @ F)
+    rows = np.vstack([process, block_diag(*[np.eye(1, 4)] * n)])
+    right = np.concatenate([np.zeros(len(process)), y])
+    Q_, R = np.linalg.qr(rows)
+    inverse = np.linalg.inv(R)
+    return (inverse @ (Q_.T @ right)).reshape(n, 4), (inverse**2).sum(1).reshape(n, 4)
+
+
+@pytest.fixture
+def fixed(monkeypatch):
+    """Takes the search for the noise ratio out of the smoother."""
+
+    def smooth(y, step, h):
+        import scipy.optimize
+
+        class Found:
+            x = math.log(h)
+
+        monkeypatch.setattr(scipy.optimize, "minimize_scalar", lambda *_, **__: Found)
+        return signals._smooth(y, step)
+
+    return smooth
+
+
+@pytest.mark.parametrize("h", [0.2, 0.5, 1.5])
+@pytest.mark.parametrize("count", [60, 100])
+def test_smoother_is_the_solution_of_all_equations_at_once(fixed, h, count):
+    y = np.random.default_rng(1).standard_normal(count).cumsum()
+    states, stds, sigma = fixed(y, 0.01, h)
+    exact, variances = whole(y, h)
+    units = (h / 0.01) ** np.arange(3)
+    np.testing.assert_allclose(states, exact[:, :3] * units, atol=1e-7 * units.max(), rtol=1e-7)
+    np.testing.assert_allclose(stds, sigma * np.sqrt(variances[:, :3]) * units, rtol=1e-8)
+
+
+def test_smoother_agrees_with_the_textbook_recursion(fixed):
+    """Within what its wide prior costs in rounding and bias."""
+    h, y = 0.5, np.random.default_rng(2).standard_normal(1500).cumsum()
+    states, stds, sigma = fixed(y, 0.01, h)
+    exact, P = rts(y, h)
+    units = (h / 0.01) ** np.arange(3)
+    np.testing.assert_allclose(states / units, exact[:, :3], atol=1e-4)
+    inner = slice(100, None)
+    variances = np.diagonal(P, axis1=1, axis2=2)[inner, :3]
+    np.testing.assert_allclose(stds[inner] / units / sigma, np.sqrt(variances), rtol=1e-6)
+
+
+def test_likelihood_is_the_density_of_what_polynomials_leave():
+    """With an unknown state, the likelihood is that of the contrasts to cubic polynomials."""
+    rng = np.random.default_rng(3)
+    y, costs, exact = rng.standard_normal(40).cumsum(), [], []
+    for h in (0.3, 0.7, 1.4):
+        costs.append(signals._likelihood(y, h)[0])
+        F, Q = model(h)
+        V, cross = np.zeros((40, 40)), np.zeros((4, 4))
+        for k in range(40):
+            cross = F @ cross @ F.T + Q if k else cross
+            moved = cross[:, 0]
+            for j in range(k, 40):
+                V[k, j] = V[j, k] = moved[0]
+                moved = F @ moved
+        V += np.eye(40)
+        basis = np.linalg.qr(np.vander(np.linspace(-1, 1, 40), 4), "complete")[0][:, 4:]
+        S = basis.T @ V @ basis
+        rest = basis.T @ y
+        exact.append(36 * math.log(rest @ np.linalg.solve(S, rest)) + np.linalg.slogdet(S)[1])
+    np.testing.assert_allclose(np.diff(costs), np.diff(exact), rtol=1e-6)
+
+
+@pytest.mark.parametrize("noise", [1e-5, 1e-4, 1e-3])
+def test_derivatives_of_a_crane_and_their_noise(noise):
+    time = np.arange(30_000) * 1e-3
+    q, v, a = movement(time)
+    rng = np.random.default_rng(4)
+    found = differentiate(time, q + noise * rng.standard_normal(q.shape))
+    np.testing.assert_allclose(found.noise, noise, rtol=0.03)
+    bound_v, bound_a = {1e-5: (2e-4, 3e-3), 1e-4: (1e-3, 1e-2), 1e-3: (7e-3, 4e-2)}[noise]
+    assert (np.std(found.v - v, axis=0) < bound_v * np.std(v, axis=0) * [1, 5]).all()
+    assert (np.std(found.a - a, axis=0) < bound_a * np.std(a, axis=0) * [1, 5]).all()
+    assert found.v.shape == found.std_v.shape == q.shape
+
+
+def test_standard_deviations_cover_the_truth():
+    """Motions drawn from the model itself: errors over standard deviations are standard normal."""
+    rng, step, h, count = np.random.default_rng(5), 1e-2, 0.3, 1000
+    F, Q = model(h)
+    factor = np.linalg.cholesky(Q)
+    errors, noise = [], []
+    for _ in range(16):
+        x, states = np.zeros(4), []
+        for _ in range(count):
+            x = F @ x + factor @ rng.standard_normal(4)
+            states.append(x)
+        truth = np.array(states)[:, :3] * (h / step) ** np.arange(3)
+        found = differentiate(
+            step * np.arange(count), truth[:, :1] + rng.standard_normal((count, 1))
+        )
+        noise.append(found.noise[0])
+        errors.append((found.v[:, 0] - truth[:, 1]) / found.std_v[:, 0])
+        errors.append((found.a[:, 0] - truth[:, 2]) / found.std_a[:, 0])
+    assert abs(np.std(errors) - 1) < 0.06
+    assert 0.93 < np.mean(np.abs(errors) < 1.96) < 0.97
+    assert abs(np.mean(noise) - 1) < 0.02
+    assert np.std(noise) < 0.05
+
+
+def test_without_noise_and_without_motion():
+    time = np.arange(4000) * 1e-3
+    q, v, a = movement(time)
+    found = differentiate(time, np.column_stack([q, np.full(4000, 0.3)]))
+    np.testing.assert_allclose(found.v[:, :2], v, atol=1e-8)
+    np.testing.assert_allclose(found.a[50:-50, :2], a[50:-50], atol=1e-4)
+    assert not found.v[:, 2].any()
+
+
+def test_low_pass_halves_at_the_cutoff_without_delay():
+    time = np.arange(8000) * 1e-3
+    x = np.sin(2 * np.pi * np.array([1.0, 5.0, 50.0]) * time[:, None])
+    y = signals.low_pass(time, x, 5.0)
+    gain = (y * x)[1000:7000].mean(0) / (x * x)[1000:7000].mean(0)
+    np.testing.assert_allclose(gain, [1, 0.5, 0], atol=2e-3)
+    with pytest.raises(InputError, match="cutoff is 600 Hz, give one between 0 and 500 Hz"):
+        signals.low_pass(time, x, 600.0)
+
+
+def test_lowpass_method():
+    time = np.arange(8000) * 1e-3
+    q, v, a = movement(time)
+    found = differentiate(time, q, "lowpass", cutoff=20.0)
+    inner = slice(300, -300)
+    np.testing.assert_allclose(found.v[inner], v[inner], atol=1e-5)
+    np.testing.assert_allclose(found.a[inner], a[inner], atol=1e-4)
+    for method, cutoff in (("spline", None), ("lowpass", None), ("kalman", 5.0)):
+        with pytest.raises(InputError, match=f"method '{method}'"):
+            differentiate(time, q, method, cutoff)
+
+
+def test_resampling():
+    rng = np.random.default_rng(6)
+    time = np.sort(np.arange(4000) * 1e-3 + rng.uniform(0, 4e-4, 4000))
+    with pytest.raises(RecordingError, match="off equidistant samples at .* resample first"):
+        differentiate(time, movement(time)[0])
+    even, q = signals.resample(time, movement(time)[0], 1e-3)
+    assert even[0] == time[0]
+    assert time[-1] - 1e-3 < even[-1] <= time[-1]
+    np.testing.assert_allclose(q, movement(even)[0], atol=1e-10)
+    time[2000:] += 0.1
+    with pytest.raises(RecordingError, match=r"no sample between 1\.99\d* and 2\.1"):
+        signals.resample(time, q, 1e-3)
+
+
+def test_average_of_periods():
+    rng = np.random.default_rng(7)
+    time = np.arange(2650) * 1e-2
+    clean = np.column_stack([np.sin(2 * np.pi * time), np.cos(4 * np.pi * time)])
+    at, mean, error = signals.average_periods(time, clean + rng.standard_normal((2650, 2)), 1.0)
+    assert at.shape == (100,)
+    score = (mean - clean[:100]) / error
+    assert abs(np.mean(error) * math.sqrt(26) - 1) < 0.03
+    assert abs(np.std(score) - math.sqrt(25 / 23)) < 0.15  # Student's t of 25 degrees of freedom
+    with pytest.raises(RecordingError, match="hold fewer than two periods of 20 s"):
+        signals.average_periods(time, clean, 20.0)
+    with pytest.raises(RecordingError, match="no multiple of the step 0.01 s, resample"):
+        signals.average_periods(time, clean, 1.004)
+
+
+def test_filtered_rows_keep_the_parameters():
+    rng = np.random.default_rng(8)
+    regressor = rng.standard_normal((2000, 2, 5))
+    truth = np.arange(1.0, 6.0)
+    W, y = signals.filter_rows(regressor, regressor @ truth, 1e-3, 20.0, 10)
+    assert W.shape == (200, 2, 5)
+    np.testing.assert_allclose(W @ truth, y, atol=1e-12)
+    with pytest.raises(InputError, match="cutoff is 30 Hz, give at most 25 Hz for every 10th"):
+        signals.filter_rows(regressor, y, 1e-3, 30.0, 10)
+    regressor[7, 1, 2] = np.nan
+    with pytest.raises(InputError, match="regressor is not finite at sample 7"):
+        signals.filter_rows(regressor, regressor @ truth, 1e-3, 20.0, 10)
+
+
+def test_thinning_lets_nothing_fold_back():
+    time = np.arange(20_000) * 1e-3
+    high = np.sin(2 * np.pi * 75.1 * time)[:, None]  # seen as 24.9 Hz at 100 Hz
+    _, y = signals.filter_rows(high[:, None], high, 1e-3, 25.0, 10)
+    assert np.abs(y[100:-100]).max() < 1.6e-4
+
+
+def test_moving():
+    v = np.array([[0.1, -0.3], [-0.2, 0.0]])
+    np.testing.assert_array_equal(signals.moving(v, 0.15), [[False, True], [True, False]])
+    np.testing.assert_array_equal(signals.moving(v, [0.05, 1]), [[True, False], [True, False]])
+
+
+def recorded():
+    time = np.arange(5000) * 4e-3
+    q, v, a = movement(time)
+    rng = np.random.default_rng(9)
+    tau = 100 * a + 20 * np.sign(v) + 50 * np.cos(q) + rng.standard_normal(q.shape)
+    return {
+        "time": time,
+        "q": q + 1e-4 * rng.standard_normal(q.shape),
+        "v": v + 1e-3 * rng.standard_normal(q.shape),
+        "tau": tau,
+        "joints": JOINTS,
+        "units": UNITS,
+        "limits": np.array([[-0.8, 0.8], [-0.2, 0.2]]),
+    }
+
+
+def gap(r):
+    r["tau"][300:340, 1] = np.nan
+
+
+def scale(name, column, factor):
+    def spoil(r):
+        r[name][:, column] *= factor
+
+    return spoil
+
+
+def still(r):
+    r["q"] = r["q"][0] + 1e-4 * np.random.default_rng(0).standard_normal(r["q"].shape)
+
+
+def late(seconds):
+    def spoil(r):
+        r["v"][:, 0] = movement(r["time"] - seconds)[1][:, 0]
+
+    return spoil
+
+
+def without_limits(spoil):
+    def both(r):
+        del r["limits"]
+        spoil(r)
+
+    return both
+
+
+def hole(r):
+    r["time"][2000:] += 0.5
+
+
+def dead(r):
+    r["tau"][:, 1] = 3.0
+
+
+def short(r):
+    r.update({x: r[x][:40] for x in ("time", "q", "v", "tau")})
+
+
+SPOILT = {
+    "short": (short, "40 samples are too few, record at least 50"),
+    "nan": (gap, "'X1_force' holds no number from 1.2 to 1.356 s (40 samples in all), cut"),
+    "hole": (hole, "no sample between 7.996 and 8.5 s where the usual step is 0.004 s, cut"),
+    "still": (still, "no joint moves, record a motion"),
+    "dead": (dead, "'X1_force' is constant while 'X1' moves, check it"),
+    "degrees": (scale("q", 0, 57.3), "its limits are -0.8 and 0.8 rad, it looks like deg"),
+    "millimetres": (scale("q", 1, 1e3), "its limits are -0.2 and 0.2 m, it looks like mm"),
+    "beyond": (scale("q", 1, 5), "its limits are -0.2 and 0.2 m, check its zero and unit"),
+    "degrees without limits": (
+        without_limits(scale("q", 0, 57.3)),
+        "times the derivative of 'q1', 'q1' looks like deg, give rad",
+    ),
+    "degrees per second": (
+        scale("v", 0, 57.3),
+        "'q1_velocity' is 57.3 times the derivative of 'q1', 'q1_velocity' looks like deg",
+    ),
+    "late": (late(0.2), "ms behind 'q1', record them with one clock"),
+    "early": (late(-0.12), "ms ahead of 'q1', record them with one clock"),
+    "exchanged": (scale("v", 1, -1), "'X1_velocity' is not the derivative of 'X1'"),
+}
+
+
+@pytest.mark.parametrize(("spoil", "message"), SPOILT.values(), ids=SPOILT.keys())
+def test_bad_recordings_are_explained(spoil, message):
+    recording = recorded()
+    check(**recording)
+    spoil(recording)
+    with pytest.raises(RecordingError) as error:
+        check(**recording)
+    assert message in str(error.value)
+
+
+def test_forces_against_a_model():
+    r = recorded()
+    modelled = 0.6 * r["tau"]
+    check_forces(r["time"], r["tau"], modelled, JOINTS)
+    for factor, message in (
+        (1e3, "'q1_force' is 1.67e+03 times the model's, it looks 1000-fold, give SI units"),
+        (1e-3, "'q1_force' is 0.00167 times the model's, it looks like kN, give SI units"),
+        (100, "'q1_force' is 167 times the model's, look at its unit"),
+    ):
+        with pytest.raises(RecordingError) as error:
+            check_forces(r["time"], factor * r["tau"], modelled, JOINTS)
+        assert message == str(error.value)
+    with pytest.raises(RecordingError, match="'q1_force' is 200 ms behind its model"):
+        check_forces(r["time"][50:], r["tau"][:-50], modelled[50:], JOINTS)
+
+
+def test_delay_between_samples():
+    time = np.arange(5000) * 4e-3
+    found = signals.delay(time, movement(time)[1][:, 0], movement(time - 0.0615)[1][:, 0])
+    assert abs(found - 0.0615) < 1e-3
