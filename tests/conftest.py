@@ -1,13 +1,16 @@
 """Machines that several modules test with, and how property tests run."""
 
+import os
 import warnings
 from pathlib import Path
 
-import pytest
-from hypothesis import settings
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: two processes, two cores
 
-import crane
-from crane.errors import CraneWarning
+import pytest  # noqa: E402
+from hypothesis import settings  # noqa: E402
+
+import crane  # noqa: E402
+from crane.errors import CraneWarning  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 

@@ -18,6 +18,7 @@ Prior = tuple[Array, Array]
 _TURN = 1.345  # robust standard deviations: 95 % efficiency on normal noise (Huber 1964)
 _MAD = 1.482602218505602  # standard deviation over median absolute deviation of normal noise
 _CONVERGED = 1e-6  # standard deviations
+_ROUNDING = 1e-10  # of the forces
 _ROUNDS = 100
 _LEAST_SHARE = 0.2  # of the degrees of freedom, however many parameters take theirs
 _LONGEST_MEMORY = 60  # samples in the autoregressive model of the noise
@@ -225,7 +226,8 @@ class _Rows:
             self.mean, self.weight = mean, 1 / std
         if count + np.count_nonzero(self.weight) <= size:
             raise InputError(f"{count} rows for {size} parameters are too few, record longer")
-        self.smallest = np.finfo(float).eps * max(_rms(y), np.finfo(float).tiny)
+        # of what counts as noise, so that equations that hold to rounding settle
+        self.smallest = _ROUNDING * max(_rms(y), np.finfo(float).tiny)
 
     def scales(self, e: Array) -> Array:
         """Standard deviation of each row's group (m,)."""

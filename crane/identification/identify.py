@@ -28,7 +28,7 @@ from crane.samples import Array
 
 METHODS = {"ols": least_squares, "wls": weighted, "huber": huber}
 _SLOW = 0.02  # of a joint's largest velocity, below which its rows are left out
-_FAST = 5.0  # times the frequency below which 99 % of the accelerations are
+_FAST = 40.0  # times the frequency below which 99 % of the accelerations are
 _PRIOR = 0.3  # relative standard deviation of a body towards which a feasible estimate is drawn
 _THICKNESS = 0.05  # of a body's size, added to what is thinner in a prior
 
@@ -129,8 +129,8 @@ def identify(
         feasible: Whether the bodies have to be able to exist and friction must not be negative;
             all parameters come out.
         terms: Of the model; bodies and friction if not given, see `model.default_terms`.
-        bandwidth: [Hz] of the low-pass; several times the frequencies of the motion if not
-            given.
+        bandwidth: [Hz] of the low-pass; far above the frequencies of the motion if not given.
+            Lower where the motion is measured badly, as by a coarse potentiometer.
         slow: (n,) velocities below which rows are left out; a share of the largest if not given.
 
     Returns:
@@ -179,9 +179,7 @@ def identify(
 
     def compare(rows: _Rows) -> Comparison:
         modelled = rows.W[:, :, picked] @ values + rows.offset
-        return Comparison(
-            rows.time, rows.y + rows.offset, modelled, rows.moving, machine.active
-        )
+        return Comparison(rows.time, rows.y + rows.offset, modelled, rows.moving, machine.active)
 
     judged = None
     if validation is not None:
@@ -197,6 +195,8 @@ def _equations(
     model: Model, base: Base, motion: Motion, bandwidth: float, slow: ArrayLike
 ) -> _Rows:
     """Both sides at the samples of a motion, filtered and thinned."""
+    from scipy.ndimage import binary_dilation
+
     at: Samples = model.samples(motion.q, motion.v, motion.a)
     W = model.regressor(at)[:, :, base.independent]
     offset = model.known(at)
@@ -208,12 +208,19 @@ def _equations(
     else:
         tau, thinning = motion.tau, 1
     W, offset = both[:, :, :-1], both[:, :, -1]
-    kept = moving(motion.v, slow)[::thinning]
+    # near standstill friction is none of its shapes, as far as the filter carries it
+    stuck = ~moving(motion.v, slow)
+    reach = round(0.5 / (step * bandwidth))
+    window = np.ones((2 * reach + 1, 1))
+    kept = ~binary_dilation(stuck, window)[::thinning]
     return _Rows(motion.time[::thinning], W, tau - offset, offset, kept)
 
 
 def _bandwidth(motion: Motion) -> float:
-    """Several times the frequency below which 99 % of the accelerations' power is [Hz]."""
+    """Far above the frequency below which 99 % of the accelerations' power is [Hz].
+
+    What is modelled lies below it; above it is noise, which has to be seen to be known.
+    """
     from scipy.signal import periodogram
 
     step = float(motion.time[1] - motion.time[0])

@@ -1,0 +1,179 @@
+"""Identification from motions whose truth is known."""
+
+import numpy as np
+import pytest
+
+import crane
+from crane.errors import InputError, RecordingError
+from crane.identification.base import base_parameters, random_samples
+from crane.identification.estimators import least_squares
+from crane.identification.feasible import pseudo_inertia
+from crane.identification.identify import identify
+from crane.identification.model import Inertial, Model, friction
+from crane.identification.signals import Motion
+
+pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+NOISE = np.array([5e-3, 0.5, 0.3])  # [N m], [N], [N]
+
+
+@pytest.fixture(scope="module")
+def mini():
+    return crane.load("mini_forwarder")
+
+
+def motion(machine, seed=0, period=10.0, duration=30.0, step=2e-3):
+    """Five harmonics within the strokes, and the forces of the machine's own parameters."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0, duration, step)
+    w = 2 * np.pi / period * np.arange(1, 6)
+    a, b = rng.normal(size=(2, 5, 3))
+    phase = time[:, None] * w
+    q = np.sin(phase) @ (a / w[:, None]) - np.cos(phase) @ (b / w[:, None])
+    v = np.cos(phase) @ a + np.sin(phase) @ b
+    acc = -np.sin(phase) @ (a * w[:, None]) + np.cos(phase) @ (b * w[:, None])
+    size = np.array([1.5, 0.013, 0.013]) / np.abs(q).max(axis=0)
+    q, v, acc = np.array([0, 0.015, 0.015]) + q * size, v * size, acc * size
+    tau = crane.Dynamics(machine).inverse(q, v, acc, friction=True)
+    return Motion(time, q, v, acc, tau)
+
+
+def noisy(given, seed, level=1.0):
+    noise = level * NOISE * np.random.default_rng(seed).normal(size=given.tau.shape)
+    return Motion(given.time, given.q, given.v, given.a, given.tau + noise)
+
+
+def scales(model):
+    """What counts as one of each parameter: masses and sizes of the bodies, friction."""
+    out = np.maximum(np.abs(model.nominal), 0.1)
+    for i in range(0, 10 * len(model.bodies), 10):
+        P = pseudo_inertia(model.nominal[i : i + 10])
+        mass, length = P[3, 3], np.sqrt(np.trace(P[:3, :3]) / P[3, 3])
+        out[i : i + 10] = mass * np.array([1.0, *[length] * 3, *[length**2] * 6])
+    return out
+
+
+def test_base_parameters_come_back_from_exact_forces(mini):
+    """To 1e-8 of the bodies' masses and sizes; the regressor has rank 75."""
+    model = Model(mini)
+    base = base_parameters(model)
+    assert base.rank == 75
+    at = random_samples(model, 1500, seed=3)
+    tau = crane.Dynamics(mini).inverse(at.q_a, at.v_a, at.a_a, friction=True)
+    W = model.regressor(at)[:, :, base.independent].reshape(-1, base.rank)
+    found = least_squares(W, (tau - model.known(at)).ravel()).values
+    error = np.abs(found - base.values(model.nominal))
+    assert (error / np.sqrt(base.grouping**2 @ scales(model) ** 2)).max() < 1e-8
+
+
+@pytest.mark.parametrize("method", ["ols", "wls", "huber"])
+def test_noise_is_all_that_is_left(mini, method):
+    """Within 10 % of what the filter passes of it, on another motion too where a prior helps."""
+    given, other = noisy(motion(mini), 1), noisy(motion(mini, seed=7), 2)
+    result = identify(mini, given, other, method, prior=0.3)
+    step = given.time[1] - given.time[0]
+    bandwidth = 0.25 / (result.training.time[1] - result.training.time[0])
+    floor = NOISE * np.sqrt(2 * bandwidth * step)
+    # ordinary least squares does not look after N m beside N
+    joints = slice(1, 3) if method == "ols" else slice(0, 3)
+    assert np.all(result.training.rmse[joints] < 1.1 * floor[joints])
+    assert np.all(result.validation.rmse[joints] < 1.1 * floor[joints])
+    assert "validation, moving rows" in result.to_text()
+
+
+@pytest.mark.parametrize("method", ["ols", "wls"])
+def test_intervals_cover_the_truth(mini, method):
+    """Of 12 recordings, 90 to 99 % of the 95 % intervals."""
+    model = Model(mini)
+    given, covered = motion(mini, step=4e-3), []
+    for seed in range(12):
+        result = identify(mini, noisy(given, seed), method=method, bandwidth=30.0)
+        truth = result.base.values(model.nominal)
+        low, high = result.interval().T
+        covered.append(np.mean((low <= truth) & (truth <= high)))
+    assert 0.90 < np.mean(covered) < 0.99
+
+
+def test_a_prior_holds_what_forces_do_not_tell(mini):
+    given = noisy(motion(mini), 3)
+    result = identify(mini, given, prior=0.2)
+    assert result.parameters is not None and len(result.parameters) == 130
+    bodies = result.parameters[:110] - result.model.nominal[:110]
+    assert np.abs(bodies / scales(result.model)[:110]).max() < 0.5
+    assert result.training.stacked < 0.01
+    np.testing.assert_allclose(
+        result.values, result.base.values(result.parameters), rtol=1e-12, atol=1e-15
+    )
+
+
+def test_feasible_bodies_can_exist(mini):
+    given = noisy(motion(mini), 4)
+    result = identify(mini, given, feasible=True)
+    for i in range(0, 110, 10):
+        assert np.linalg.eigvalsh(pseudo_inertia(result.parameters[i : i + 10]))[0] > 0
+    friction_of = dict(zip(result.model.names[110:], result.parameters[110:], strict=True))
+    assert min(v for k, v in friction_of.items() if k.endswith((".coulomb", ".viscous"))) >= -1e-9
+    plain = identify(mini, given)
+    assert result.training.stacked < 1.5 * plain.training.stacked
+
+
+def test_predict_is_the_inverse_dynamics_of_what_was_found(mini):
+    given = motion(mini)
+    result = identify(mini, given)
+    other = motion(mini, seed=5, duration=2.0)
+    found = result.predict(other.q, other.v, other.a)
+    assert np.abs(found - other.tau).max() < 1e-6 * np.abs(other.tau).max()
+
+
+def test_a_resting_joint_is_left_out(mini):
+    """Without slewing, what only slewing tells is not told, the rest is."""
+    given = motion(mini)
+    q, v, a = (x.copy() for x in (given.q, given.v, given.a))
+    q[:, 0], v[:, 0], a[:, 0] = 0.3, 0.0, 0.0
+    tau = crane.Dynamics(mini).inverse(q, v, a, friction=True)
+    result = identify(mini, noisy(Motion(given.time, q, v, a, tau), 6))
+    assert result.base.rank < 60
+    assert not any(name.startswith("q1.") for name in result.names)
+    assert np.all(result.training.relative[1:] < 0.02)
+
+
+def test_recordings_of_simulations_serve(mini):
+    """From strokes and forces alone, velocities by the smoother."""
+    path = crane.task_path(mini, "loading")
+    recording = crane.simulate(mini, crane.ComputedTorque(mini, path), path(0.0)[:2])
+    slow = [0.03, 5e-4, 5e-4]
+    result = identify(mini, recording, prior=0.1, slow=slow)
+    assert result.training.stacked < 5e-3
+
+
+def test_what_cannot_be_identified(mini):
+    given = motion(mini)
+    recording = crane.Recording(
+        given.time, mini.active, given.q, given.v, given.tau,
+        {joint: mini.unit(joint) for joint in mini.active},
+    )  # fmt: skip
+    other = crane.load("ur5_robot")
+    for call, kind, message in (
+        (lambda: identify(mini, given, method="lsq"), InputError, "method 'lsq' is unknown"),
+        (lambda: identify(mini, given, prior=0.0), InputError, "the prior's standard deviation"),
+        (lambda: identify(other, recording), RecordingError, "'shoulder_pan_joint' of 'ur5'"),
+        (
+            lambda: identify(mini, given, feasible=True, terms=[friction(mini, "X1")]),
+            InputError,
+            "the model has no bodies",
+        ),
+        (
+            lambda: identify(mini, given, slow=[1e3, 1e3, 1e3], terms=[Inertial(mini)]),
+            RecordingError,
+            "no joint moves faster than",
+        ),
+        (
+            lambda: identify(
+                mini, Motion(given.time, given.q, given.v, given.a, 1e-3 * given.tau)
+            ),
+            RecordingError,
+            "'q1_force' is 0.001 times the model's, it looks like kN",
+        ),
+    ):
+        with pytest.raises(kind) as caught:
+            call()
+        assert str(caught.value).startswith(message), str(caught.value)
