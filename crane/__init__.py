@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from crane.description import EndStop, ForceElement, Friction, GasSpring, PIGains
     from crane.dynamics import Dynamics
     from crane.errors import CraneError, CraneWarning
+    from crane.identification.identify import identify
+    from crane.identification.result import Identification
     from crane.kinematics import Kinematics
     from crane.machine import Machine, Payload, load
     from crane.paths import Path, point_to_point, polynomial, task_path, tip_path
@@ -25,10 +27,12 @@ _HOMES = {
     "crane.description": ("EndStop", "ForceElement", "Friction", "GasSpring", "PIGains"),
     "crane.dynamics": ("Dynamics",),
     "crane.errors": ("CraneError", "CraneWarning"),
+    "crane.identification.identify": ("identify",),
+    "crane.identification.result": ("Identification",),
     "crane.kinematics": ("Kinematics",),
     "crane.machine": ("Machine", "Payload", "load"),
     "crane.paths": ("Path", "point_to_point", "polynomial", "task_path", "tip_path"),
-    "crane.recording": ("Recording",),
+    "crane.recording": ("Recording", "identify",),
     "crane.batch": ("Batch", "simulate_batch"),
     "crane.simulation": ("simulate",),
     "crane.studies": ("Study", "study"),
@@ -36,9 +40,9 @@ _HOMES = {
 
 __all__ = [
     "PI", "Batch", "Closure", "ComputedTorque", "CraneError", "CraneWarning", "Dynamics",
-    "EndStop", "ForceElement", "Friction", "GasSpring", "Kinematics", "Machine", "PIGains", "Path",
-    "Payload", "Recording", "Study", "load", "point_to_point", "polynomial", "simulate",
-    "simulate_batch", "study", "task_path", "tip_path",
+    "EndStop", "ForceElement", "Friction", "GasSpring", "Identification", "Kinematics", "Machine",
+    "PIGains", "Path", "Payload", "Recording", "Study", "identify", "load", "point_to_point",
+    "polynomial", "simulate", "simulate_batch", "study", "task_path", "tip_path",
 ]  # fmt: skip
 
 

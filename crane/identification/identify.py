@@ -52,7 +52,7 @@ class _Rows:
     moving: np.ndarray
 
     def stacked(self) -> tuple[Array, Array, np.ndarray, np.ndarray]:
-        """Rows that count: W (m, r), y (m,), joint and instant of each, joints one after another."""
+        """Rows that count, joint after joint: W (m, r), y (m,), joint and instant of each."""
         joint, instant = np.nonzero(self.moving.T)
         _, group = np.unique(joint, return_inverse=True)
         return self.W[instant, joint], self.y[instant, joint], group, instant
@@ -162,7 +162,7 @@ def identify(
         raise RecordingError("no joint moves faster than what counts as standstill, move it more")
     told = base.narrowed(W)
     picked = np.searchsorted(base.independent, told.independent)
-    prior = _prior(model, prior) if isinstance(prior, int | float) else prior
+    prior = prior_of_bodies(model, prior) if isinstance(prior, int | float) else prior
     parameters = None
     if feasible:
         estimate = METHODS[method](W[:, picked], y, groups, instants)
@@ -211,7 +211,7 @@ def _equations(
     # near standstill friction is none of its shapes, as far as the filter carries it
     stuck = ~moving(motion.v, slow)
     reach = round(0.5 / (step * bandwidth))
-    window = np.ones((2 * reach + 1, 1))
+    window = np.ones((2 * reach + 1, 1), dtype=bool)
     kept = ~binary_dilation(stuck, window)[::thinning]
     return _Rows(motion.time[::thinning], W, tau - offset, offset, kept)
 
@@ -235,8 +235,15 @@ def _bandwidth(motion: Motion) -> float:
     return min(_FAST * max(last, frequency[1]), 0.24 / step)
 
 
-def _prior(model: Model, relative: float) -> Prior:
-    """Bodies as described, each known to a share of its mass and size; of others nothing."""
+def prior_of_bodies(model: Model, relative: float) -> Prior:
+    """Bodies as described, each known to a share of its mass and size; of others nothing.
+
+    Returns:
+        Means (p,) and standard deviations (p,), infinite for what is no body.
+
+    Raises:
+        InputError: The share is not above zero.
+    """
     if not relative > 0:
         raise InputError(f"the prior's standard deviation is {relative:g}, give one above 0")
     std = np.full(len(model.names), np.inf)

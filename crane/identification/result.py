@@ -154,7 +154,8 @@ class Identification:
                     f"{fit.percentage_error[i]:>7.3f} %"
                 )
             lines += [f"all, stacked{'':>19}{100 * fit.stacked:>8.2f} %", ""]
-        lines.append(f"{'parameter':<28}{'value':>13}{'std':>12}{'rel. std':>10}{'description':>14}")
+        head = f"{'parameter':<28}{'value':>13}{'std':>12}{'rel. std':>10}{'description':>14}"
+        lines.append(head)
         for name, value, std, before in zip(
             self.names, self.values, self.std, self.nominal, strict=True
         ):
