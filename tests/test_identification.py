@@ -8,7 +8,7 @@ import pytest
 
 import crane
 from crane.errors import InputError
-from crane.identification.base import base_parameters, random_samples
+from crane.identification.base import base_parameters, group, random_samples
 from crane.identification.model import (
     Along,
     Direction,
@@ -73,6 +73,16 @@ def test_arms_have_as_many_base_parameters_as_the_field_knows(load, level, tilte
         W = model.regressor(random_samples(model, 300, seed=11)).reshape(-1, len(model.names))
         sizes = np.linalg.svd(W, compute_uv=False)
         assert (sizes > 1e-10 * sizes[0]).sum() == count
+
+
+def test_measured_arms():
+    """36 of each arm; the KR300's cylinder adds nine."""
+    assert base_parameters(inertial(crane.load("tx40"))).rank == 36
+    model = inertial(crane.load("kr300"))
+    assert base_parameters(model).rank == 45
+    arm = [i for i, name in enumerate(model.names) if not name.startswith(("barrel", "rod"))]
+    W = model.regressor(random_samples(model, 300, seed=1)).reshape(-1, len(model.names))
+    assert group([model.names[i] for i in arm], W[:, arm]).rank == 36
 
 
 def test_the_mini_forwarder(mini):
