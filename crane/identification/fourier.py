@@ -72,9 +72,7 @@ class Fourier(Path):
         s = steady + np.where(ending, -way, way)
         rate = (u**2 * (3 - 2 * u))[..., None]
         growth = (np.where(ending, -1.0, 1.0) * 6 * u * (1 - u) / lead)[..., None]
-        q, v, a = (
-            basis @ self.coefficients for basis in bases(s, self.harmonics, self.period)
-        )
+        q, v, a = (basis @ self.coefficients for basis in bases(s, self.harmonics, self.period))
         return q, v * rate, a * rate**2 + v * growth
 
 

@@ -33,15 +33,14 @@ class Limits:
     acceleration: Array
     force: Array
 
+    @property
+    def all(self) -> Array:
+        """(4, n) by `QUANTITIES`, of strokes their half lengths."""
+        return np.stack([self.half, self.velocity, self.acceleration, self.force])
+
     def shares(self, q_a: Array, v_a: Array, a_a: Array, tau: Array) -> Array:
         """What of the limits a motion uses, 1 at a limit, (..., 4, n) as in `QUANTITIES`."""
-        parts = (
-            (q_a - self.middle) / self.half,
-            v_a / self.velocity,
-            a_a / self.acceleration,
-            tau / self.force,
-        )
-        return np.abs(np.stack(parts, axis=-2))
+        return np.abs(np.stack([q_a - self.middle, v_a, a_a, tau], axis=-2)) / self.all
 
 
 def limits(
@@ -72,10 +71,10 @@ def limits(
         * (1 - margin),
         machine.model.effortLimit[columns] * (1 - margin),
     )
-    for what, values in zip(QUANTITIES, list(vars(found).values())[1:], strict=True):
+    for what, values in zip(QUANTITIES, found.all, strict=True):
         for joint, value in zip(machine.active, values, strict=True):
             if not value > 0:
-                raise InputError(f"the {what} limit of '{joint}' is 0, give one in its URDF")
+                raise InputError(f"the {what} limit of '{joint}' is 0, give one above")
     return found
 
 

@@ -1,6 +1,7 @@
 """The search for a reference: random ones within the limits, and the way down from them."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -64,12 +65,12 @@ class Search:
         self._middle[0] = bounds.middle
         self._dense = np.linspace(0, 2 * period, 2 * DENSE * harmonics + 1)
         every = [
-            (what, joint, getattr(bounds, "half" if what == "stroke" else what)[i])
+            f"the {what} limit of '{joint}'"
             for what in QUANTITIES
-            for i, joint in enumerate(self._machine.active)
+            for joint in self._machine.active
         ]
-        self._limited = [np.isfinite(limit) for _, _, limit in every]
-        names = [f"the {what} limit of '{joint}'" for what, joint, x in every if np.isfinite(x)]
+        self._limited = np.isfinite(bounds.all).ravel()
+        names = [name for name, limited in zip(every, self._limited, strict=True) if limited]
         self._names = [*names, "the edge of the assembly branch"]
 
     def coefficients(self, x: Array) -> Array:
@@ -143,14 +144,14 @@ class Search:
             least, most = (least, share) if self._excess(scaled(share)) else (share, most)
         return scaled(least), ""
 
-    def descend(self, start: Array, progress: Progress | None) -> Array:
+    def descend(self, start: Array, progress: Progress) -> Array:
         """The best vector on the way of sequential quadratic programming, fitted.
 
         Derivatives are differences, all of them computed as one stack of motions.
         """
-        from scipy.optimize import minimize
+        from scipy.optimize import Bounds, minimize
 
-        size = len(start)
+        size, n = len(start), self._unit.shape[1]
         count = self.rate(start[None])[1].shape[1]
         kept: dict[str, tuple[bytes, Array, Array]] = {}
         best, least = start, float(self.rate(start[None])[0][0])
@@ -178,24 +179,29 @@ class Search:
             return (costs[1:] - costs[0]) / _SMALL, (inside[1:] - inside[0]).T / _SMALL
 
         steps = iter(range(1, _STEPS + 1))
-        minimize(
+
+        def report(_: Any) -> None:
+            progress(next(steps) / _STEPS)
+
+        within: Any = {
+            "type": "ineq",
+            "fun": lambda x: values(x, np.zeros((1, size)), "value")[1][0],
+            "jac": lambda x: slopes(x)[1],
+        }
+        # no harmonic of what keeps within 1 is larger than that of a square wave
+        most = np.vstack([np.ones((1, n)), np.full((len(self._unit) - 1, n), 4 / np.pi)]).ravel()
+        end = minimize(  # type: ignore[call-overload]
             cost,
             start,
             jac=lambda x: slopes(x)[0],
-            # no harmonic of what keeps within 1 is larger than that of a square wave
-            bounds=[(-1, 1)] * self._unit.shape[1]
-            + [(-4 / np.pi, 4 / np.pi)] * (size - self._unit.shape[1]),
-            constraints={
-                "type": "ineq",
-                "fun": lambda x: values(x, np.zeros((1, size)), "value")[1][0],
-                "jac": lambda x: slopes(x)[1],
-            },
+            bounds=Bounds(-most, most),
+            constraints=within,
             method="SLSQP",
             options={"maxiter": _STEPS, "ftol": _SETTLED},
-            callback=lambda _: progress(next(steps) / _STEPS) if progress else None,
+            callback=report,
         )
-        found, reason = self.fitted(best)
-        return start if reason else found
+        fitted = [x for x, reason in (self.fitted(best), self.fitted(end.x)) if not reason]
+        return min(fitted, key=lambda x: float(self.rate(x[None])[0][0]), default=start)
 
     def used(self, path: Fourier) -> Array:
         """Largest share of every limit over a whole path, (4, n) as in `QUANTITIES`."""

@@ -1,0 +1,290 @@
+"""References for identification: what they are, that they keep limits, and what they tell."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import crane
+from crane.errors import InputError
+from crane.identification.base import base_parameters, random_samples
+from crane.identification.excitation import excite
+from crane.identification.fourier import Fourier, bases
+from crane.identification.information import Information
+from crane.identification.limits import gear
+from crane.identification.model import Model
+
+pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+QUICK = {"harmonics": 3, "periods": 2, "starts": 1}
+
+
+@pytest.fixture(scope="module")
+def found(mini):
+    return excite(mini, **QUICK)
+
+
+# --- the series ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def series():
+    return Fourier(np.random.default_rng(3).normal(size=(9, 2)), 2.5, 3)
+
+
+def test_velocity_and_acceleration_are_derivatives(series):
+    """Of the ways from and to rest too; central differences err by step^2."""
+    time = np.linspace(0.01, series.duration - 0.01, 4001)
+    step = 1e-5
+    early, late = series(time - step), series(time + step)
+    _, v, a = series(time)
+    assert np.abs((late[0] - early[0]) / (2 * step) - v).max() < 1e-6
+    joints = [series.lead, series.duration - series.lead]  # where the jerk jumps
+    inside = np.abs(time[:, None] - joints).min(axis=1) > step
+    assert np.abs((late[1] - early[1]) / (2 * step) - a)[inside].max() < 1e-5
+
+
+def test_velocity_amplitudes_are_the_coefficients(series):
+    """v = sum a cos + b sin, so its Fourier transform gives a - i b back."""
+    time = series.lead + series.period * np.arange(64) / 64
+    spectrum = np.fft.rfft(series(time)[1], axis=0)[1:5] / 32
+    a, b = series.coefficients[1:5], series.coefficients[5:]
+    assert np.abs(spectrum - (a - 1j * b)).max() < 1e-12
+
+
+def test_it_is_periodic_between_rests(series):
+    time = series.lead + np.linspace(0, 2 * series.period, 301)
+    for now, later in zip(series(time), series(time + series.period), strict=True):
+        assert np.abs(later - now).max() < 1e-11
+    for rest in (0.0, series.duration, -1.0, series.duration + 1):
+        assert np.abs(series(rest)[1:]).max() < 1e-12
+    assert series.duration == 3 * 2.5 + 2 * series.lead
+    assert np.array_equal(series.position(time), series(time)[0])
+    assert series(0.3)[0].shape == (2,)
+
+
+def test_ways_from_and_to_rest_stay_on_the_curve(series):
+    """Points of a way lie on the periodic curve, nowhere faster than it."""
+    curve = bases(np.linspace(0, series.period, 200001), 4, series.period)[0] @ series.coefficients
+    top = np.abs(series(np.linspace(series.lead, series.lead + 2.5, 5000))[1]).max(axis=0)
+    for start in (0.0, series.duration - series.lead):
+        q, v, _ = series(start + np.linspace(0, series.lead, 50))
+        assert max(np.linalg.norm(curve - point, axis=1).min() for point in q) < 2e-4
+        assert (np.abs(v) <= top * (1 + 1e-9)).all()
+
+
+def test_a_machine_follows_it(mini, found):
+    control = crane.ComputedTorque(mini, found.path)
+    recording = crane.simulate(mini, control, duration=2.0)
+    assert np.abs(recording.q - found.path(recording.time)[0]).max() < 1e-6
+
+
+# --- limits ----------------------------------------------------------------------------------
+
+
+def keeps(excitation, machine):
+    """Largest shares of the machine's own limits at instants the search has not seen."""
+    path = excitation.path
+    q, v, a = path(np.sort(np.random.default_rng(1).uniform(0, path.duration, 20000)))
+    machine.check_limits(q)
+    tau = crane.Dynamics(machine, path="pinocchio").inverse(q[::20], v[::20], a[::20], True)
+    columns = machine.closure.active
+    return (
+        np.abs(v).max(axis=0) / machine.model.velocityLimit[columns],
+        np.abs(a).max(axis=0),
+        np.abs(tau).max(axis=0) / machine.model.effortLimit[columns],
+    )
+
+
+def test_limits_hold_between_samples(mini, found):
+    v, _, tau = keeps(found, mini)
+    assert (v <= 0.95).all() and (tau <= 0.95).all()
+    assert v.max() > 0.93  # and they are used
+    assert found.used.max() <= 1 and found.used.max() > 0.99
+
+
+def test_accelerations_can_be_limited(slider_crank):
+    free = excite(slider_crank, **QUICK, period=2.0)
+    joint = slider_crank.active[0]
+    most = 0.5 * float(keeps(free, slider_crank)[1][0])
+    tame = excite(slider_crank, **QUICK, period=2.0, acceleration={joint: most})
+    assert keeps(tame, slider_crank)[1][0] <= 0.95 * most
+    assert tame.after.logdet < free.after.logdet
+
+
+def test_forces_can_be_what_limits(edited):
+    """A crank whose drive is weak: a third of the force that the motion would take."""
+    machine = edited("slider_crank.yaml")
+    free = excite(machine, **QUICK, period=1.0)
+    needed = free.used[3, 0] * machine.model.effortLimit[machine.closure.active[0]] * 0.95
+    machine.model.effortLimit[machine.closure.active[0]] = needed / 2
+    weak = excite(machine, **QUICK, period=1.0)
+    assert keeps(weak, machine)[2][0] <= 0.95
+    assert weak.used[3, 0] > 0.9
+
+
+@pytest.mark.slow
+def test_the_edge_of_the_branch_is_kept(five_bar):
+    """Cranks that turn one radian either way leave the reach; the reference does not."""
+    result = excite(five_bar, **QUICK, period=4.0)
+    q, v, a = result.path(np.linspace(0, result.path.duration, 3001))
+    at = Model(five_bar).samples(q, v, a)  # every sample closes
+    assert five_bar.closure.residual(at.q).max() < 1e-12
+    assert gear(five_bar, at).max() <= 1
+    assert result.after.condition < result.before.condition / 5
+
+
+# --- what it tells ---------------------------------------------------------------------------
+
+
+def naive(excitation):
+    """One sine per joint, the k-th at the k-th harmonic, 95 % of its limits."""
+    K, n = excitation.path.harmonics, len(excitation.machine.active)
+    w = 2 * np.pi / excitation.path.period
+    table = np.zeros((1 + 2 * K, n))
+    table[0] = excitation.limits.middle
+    for i in range(n):
+        k = i % K + 1
+        table[k, i] = min(excitation.limits.velocity[i], k * w * excitation.limits.half[i])
+    return Fourier(table, excitation.path.period, excitation.path.periods)
+
+
+def information_of(excitation, path):
+    """ln det (1 + M) in parameters scaled like the excitation's, by eigenvalues."""
+    model = Model(excitation.machine)
+    time = path.lead + np.arange(0, path.period, excitation.step)
+    W = model.regressor(model.samples(*path(time)))[:, :, excitation.base.independent]
+    W = (W / excitation.noise[:, None]).reshape(-1, excitation.base.rank) * excitation.scale
+    values = np.linalg.eigvalsh(path.periods * W.T @ W)
+    return np.log1p(np.maximum(values, 0)).sum()
+
+
+def test_it_tells_more_than_random_and_naive_references(found):
+    """Per parameter, the volume of the ellipsoid shrinks at least by a factor of two."""
+    rank = found.base.rank
+    assert information_of(found, found.path) == pytest.approx(found.after.logdet, rel=1e-3)
+    assert found.after.logdet - found.before.logdet > 2 * np.log(2) * rank
+    assert found.after.logdet - information_of(found, naive(found)) > 2 * np.log(2) * rank
+    assert found.after.condition < found.before.condition / 10
+    assert found.after.smallest > 10 * found.before.smallest
+
+
+def test_condition_can_be_the_criterion(slider_crank):
+    one, other = (
+        excite(slider_crank, harmonics=3, period=4.0, criterion=name)
+        for name in ("condition", "logdet")
+    )
+    assert one.after.condition < one.before.condition / 2
+    assert one.after.condition < other.after.condition
+    assert one.after.logdet < other.after.logdet
+
+
+def test_same_seed_same_bits(slider_crank):
+    first, again, other = (excite(slider_crank, **QUICK, seed=seed) for seed in (4, 4, 5))
+    assert np.array_equal(first.path.coefficients, again.path.coefficients)
+    assert first.to_text() == again.to_text()
+    assert not np.array_equal(first.path.coefficients, other.path.coefficients)
+
+
+def test_predicted_deviations_are_those_of_least_squares(mini, found):
+    """600 recordings with white noise: a deviation comes out within 3 % (one sigma)."""
+    model, path, base = Model(mini), found.path, found.base
+    time = path.lead + found.step * np.arange(path.periods * round(path.period / found.step))
+    W = model.regressor(model.samples(*path(time)))[:, :, base.independent]
+    W = (W / found.noise[:, None]).reshape(-1, base.rank)
+    norms = np.linalg.norm(W, axis=0)
+    noise = np.random.default_rng(0).normal(size=(len(W), 600))
+    errors = np.linalg.lstsq(W / norms, noise, rcond=0)[0] / norms[:, None]
+    assert errors.std(axis=1) == pytest.approx(found.after.std, rel=0.15)
+
+
+def test_with_a_prior_deviations_are_those_after_it(slider_crank):
+    """Bayes: covariance (prior^-1 + W^T W / noise^2)^-1, computed without any scaling."""
+    model = Model(slider_crank)
+    base = base_parameters(model)
+    at = random_samples(model, 50)
+    prior = np.linspace(0.1, 2.0, len(model.names))
+    noise = np.array([0.3])
+    information = Information(model, base, noise, noise, at, prior)
+    W = model.regressor(at)[:, :, base.independent].reshape(-1, base.rank)
+    before = base.grouping @ np.diag(prior**2) @ base.grouping.T
+    after = np.linalg.inv(np.linalg.inv(before) + 4 * W.T @ W / noise**2)
+    quality = information.quality(at, 200)  # a recording of four times these samples
+    assert quality.std == pytest.approx(np.sqrt(np.diag(after)), rel=1e-6)
+    gain = np.linalg.slogdet(before)[1] - np.linalg.slogdet(after)[1]
+    assert quality.logdet == pytest.approx(gain, rel=1e-8)
+
+
+@pytest.mark.slow
+def test_an_open_arm():
+    arm = crane.load("ur5_robot")
+    result = excite(arm, period=10.0, harmonics=3, starts=1)
+    v, _, tau = keeps(result, arm)
+    assert (v <= 0.95).all() and (tau <= 0.95).all()
+    assert result.after.logdet > result.before.logdet + 20
+    assert result.base.rank == base_parameters(Model(arm)).rank
+
+
+# --- files and errors ------------------------------------------------------------------------
+
+
+def test_files(slider_crank, tmp_path):
+    result = excite(slider_crank, **QUICK)
+    result.to_csv(tmp_path / "reference.csv")
+    recording = crane.Recording.from_csv(tmp_path / "reference.csv")
+    q, v, a = result.path(recording.time)
+    assert np.array_equal(recording.q, q) and np.array_equal(recording.v, v)
+    joint = slider_crank.active[0]
+    assert np.array_equal(recording.channels[f"{joint}_acceleration"], a[:, 0])
+    assert recording.channel_units[f"{joint}_acceleration"] == "rad/s2"
+
+
+def test_errors(mini, slider_crank, edited):
+    for call, text in (
+        (lambda: Fourier(np.zeros((4, 2)), 1.0), r"shape \(4, 2\), give \(1 \+ 2 harmonics"),
+        (lambda: Fourier(np.zeros((3, 2)), 0.0), "period is 0.0 s, give a number above 0"),
+        (lambda: excite(mini, criterion="det"), "criterion 'det' is unknown, known: condition"),
+        (lambda: excite(mini, harmonics=0), "number of harmonics is 0, give an integer above 0"),
+        (lambda: excite(mini, seed=-1), "seed is -1, give an integer"),
+        (lambda: excite(mini, period=-1.0), "period is -1.0 s"),
+        (lambda: excite(mini, margin=1.0), "margin is 1, give a share"),
+        (lambda: excite(mini, noise={"X3": 1.0}), "noise of 'X3', which is not active, known"),
+        (lambda: excite(mini, noise={"X1": 0.0}), "noise of 'X1' is 0.0"),
+        (lambda: excite(mini, acceleration={"q2": 1.0}), "acceleration of 'q2', which is not"),
+        (lambda: excite(mini, step=1.0), "10 samples in a period of 10 s tell no 75 base"),
+        (lambda: excite(slider_crank, prior=np.zeros(3)), "the prior has the shape"),
+    ):
+        with pytest.raises(InputError, match=text):
+            call()
+    weak = edited("slider_crank.yaml")
+    weak.model.effortLimit[weak.closure.active[0]] = 1e-6
+    with pytest.raises(InputError, match="cannot even stand still .* for the force limit of"):
+        excite(weak, **QUICK)
+
+
+def run(*arguments):
+    return subprocess.run(
+        [sys.executable, "-c", "from crane.cli import main; main()", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+
+
+def test_command(tmp_path):
+    machine = crane.load(__file__.replace("test_excitation.py", "data/slider_crank.yaml"))
+    out = tmp_path / "found"
+    arguments = ("excite", machine.path, "--harmonics", 2, "--periods", 1, "--out", out)
+    result = run(*arguments)
+    assert result.returncode == 0, result.stderr
+    assert "random  optimised" in result.stdout and "share of limits used" in result.stdout
+    names = ["coefficients.yaml", "reference.csv", "reference.png"]
+    assert sorted(path.name for path in out.iterdir()) == names
+    for extra, text in (
+        ((), "is not empty, choose another folder or add --force"),
+        (("--force", "--noise", "5"), "--noise is '5', write JOINT=VALUE, as in X1=0.5"),
+        (("--force", "--criterion", "cond"), "criterion 'cond' is unknown, known: condition"),
+    ):
+        result = run(*arguments, *extra)
+        assert result.returncode == 2 and result.stdout == ""
+        assert len(result.stderr.splitlines()) == 1 and text in result.stderr
