@@ -7,9 +7,10 @@ As a file it is a CSV of SI units (see crane.timeseries):
     # task: loading
     time [s],q1 [rad],X1 [m],q1_velocity [rad/s],X1_velocity [m/s],q1_force [N m],X1_force [N],...
 
-A column X is an active joint if and only if X_velocity and X_force exist; two of the three without
-the third are an error. Every other column is a channel. The order of the columns is free, the
-joints come in the order of their displacements. The comment lines may be left out.
+A column X is an active joint if X_force exists; X_velocity may be missing and is the derivative of
+X then. X_velocity or X_force without the others is an error. Every other column is a channel. The
+order of the columns is free, the joints come in the order of their displacements. The comment
+lines may be left out. An npz file serves, too: one array per column, named like the columns of the CSV.
 """
 
 from collections.abc import Iterable, Sequence
@@ -172,12 +173,35 @@ class Recording:
             raise RecordingError(f"{path}: {error}") from None
 
     @classmethod
+    def read(cls, path: str | Path) -> "Recording":
+        """Read a recording from a CSV or npz file.
+
+        Raises:
+            RecordingError: As `from_csv`, or the suffix is another one.
+        """
+        path = Path(path)
+        if path.suffix.lower() == ".csv":
+            return cls.from_csv(path)
+        if path.suffix.lower() != ".npz":
+            raise RecordingError(f"{path}: a recording is a .csv or .npz file, name one")
+        try:
+            return cls._from_table(timeseries.read_npz(path))
+        except RecordingError as error:
+            text = str(error)
+            raise RecordingError(
+                text if text.startswith(str(path)) else f"{path}: {text}"
+            ) from None
+
+    @classmethod
     def _from_table(cls, table: Table) -> "Recording":
         units, column = table.units, dict(zip(table.units, table.values.T, strict=True))
         joints = _find_joints(list(units))
         for joint in joints:
             _check_unit(joint, unit := units[joint], VELOCITY_UNITS)
-            _check_unit(joint + _VELOCITY, units[joint + _VELOCITY], [VELOCITY_UNITS[unit]])
+            if joint + _VELOCITY in units:
+                _check_unit(joint + _VELOCITY, units[joint + _VELOCITY], [VELOCITY_UNITS[unit]])
+            else:
+                column[joint + _VELOCITY] = _derivative(column[joint], column[TIME])
             _check_unit(joint + _FORCE, units[joint + _FORCE], [FORCE_UNITS[unit]])
         q, v, tau = (
             np.column_stack([column[x + suffix] for x in joints])
@@ -197,6 +221,13 @@ class Recording:
             machine=table.notes.get("machine", ""),
             task=table.notes.get("task", ""),
         )
+
+
+def _derivative(x: Array, time: Array) -> Array:
+    """Central differences; zero where time does not tell (it is refused later)."""
+    if len(x) < 2 or not (np.diff(time) > 0).all():
+        return np.zeros_like(x)
+    return np.asarray(np.gradient(x, time))
 
 
 def _array(
@@ -226,7 +257,7 @@ def _find_joints(names: Sequence[str]) -> tuple[str, ...]:
     for stem in stems:
         parts = (stem, stem + _VELOCITY, stem + _FORCE)
         missing = [part for part in parts if part not in names]
-        if not missing:
+        if not missing or missing == [stem + _VELOCITY]:
             joints.append(stem)
         elif len(missing) == 1:
             there = _listed(part for part in parts if part in names)
@@ -237,7 +268,7 @@ def _find_joints(names: Sequence[str]) -> tuple[str, ...]:
     if not joints:
         raise RecordingError(
             f"no active joint among the columns {_listed(names)}, give for each joint "
-            f"its displacement, velocity and force, as in q1, q1{_VELOCITY}, q1{_FORCE}"
+            f"its displacement, force and perhaps velocity, as in q1, q1{_FORCE}, q1{_VELOCITY}"
         )
     return tuple(joints)
 

@@ -6,8 +6,10 @@ digits that give the same float64 again.
 """
 
 import csv
+import io
 import re
 import warnings
+import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,6 +90,36 @@ def read(path: str | Path) -> Table:
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise RecordingError(f"{path}: {reason}, give the path of a CSV file") from None
+
+
+def read_npz(path: Path) -> Table:
+    """Read a table from arrays (N,) of equal length, named like the columns of a CSV.
+
+    Raises:
+        RecordingError: The file does not exist or is not such a table.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            columns = {name: np.asarray(file[name]) for name in file.files}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        reason = getattr(error, "strerror", None) or "is no npz file of arrays"
+        raise RecordingError(f"{path}: {reason.lower()}, give one") from None
+    count = max((len(x) for x in columns.values() if x.ndim == 1), default=0)
+    for name, column in columns.items():
+        if column.shape != (count,) or column.dtype.kind not in "biuf":
+            raise RecordingError(
+                f"{path}: '{name}' has the shape {column.shape} of {column.dtype}, give "
+                f"({count},) numbers per column"
+            )
+    if not count:
+        raise RecordingError(f"{path}: holds no samples, give an array per column")
+    heading = io.StringIO()
+    csv.writer(heading).writerow(columns)
+    try:
+        units = _units(heading.getvalue().rstrip())
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
+    return Table(units, np.column_stack(list(columns.values())).astype(np.float64), {})
 
 
 def _head(path: Path) -> tuple[dict[str, str], str, int]:

@@ -237,10 +237,6 @@ def test_single_suffixed_columns_are_channels(tmp_path):
 
 
 BROKEN_FILES = {
-    "no velocity": (
-        "time [s],q1 [rad],q1_force [N m]\n0,1,2\n",
-        "column 'q1_velocity' is missing beside 'q1', 'q1_force', add it, or rename those",
-    ),
     "no force": (
         "time [s],q1 [rad],q1_velocity [rad/s]\n0,1,2\n",
         "column 'q1_force' is missing beside 'q1', 'q1_velocity'",
@@ -278,3 +274,58 @@ def test_broken_files(tmp_path, text, message):
     assert str(caught.value).startswith(f"{tmp_path / 'run.csv'}: ")
     assert str(caught.value).count("run.csv") == 1
     assert message in str(caught.value)
+
+
+def test_velocities_may_be_missing(tmp_path):
+    """They are the derivatives of the displacements then."""
+    time = np.linspace(0, 2, 401)
+    path = tmp_path / "strokes.csv"
+    rows = np.column_stack([time, np.sin(time), np.cos(3 * time)])
+    np.savetxt(path, rows, delimiter=",", header="time [s],X1 [m],X1_force [N]", comments="")
+    read = Recording.from_csv(path)
+    assert read.joints == ("X1",)
+    np.testing.assert_allclose(read.v[1:-1, 0], np.cos(time[1:-1]), atol=1e-5)
+
+
+def test_npz_holds_the_same_as_csv(tmp_path):
+    time = np.linspace(0, 1, 11)
+    columns = {
+        "time [s]": time, "X1 [m]": time**2, "X1_velocity [m/s]": 2 * time,
+        "X1_force [N]": 1 + time, "pressure [Pa]": 1e5 * time,
+    }  # fmt: skip
+    np.savez(tmp_path / "run.npz", **columns)
+    read = Recording.read(tmp_path / "run.npz")
+    read.to_csv(tmp_path / "run.csv")
+    again = Recording.read(tmp_path / "run.csv")
+    for one in (read, again):
+        assert one.joints == ("X1",) and one.channel_units == {"pressure": "Pa"}
+        np.testing.assert_array_equal(one.q[:, 0], time**2)
+        np.testing.assert_array_equal(one.tau[:, 0], 1 + time)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        (
+            {"time [s]": [0, 1], "X1 [m]": [0, 1, 2], "X1_force [N]": [0, 1, 2]},
+            "'time .s.' has the",
+        ),
+        ({"time [s]": ["a", "b"]}, "'time .s.' has the shape"),
+        ({}, "holds no samples"),
+        ({"time": [0, 1], "X1 [m]": [0, 1], "X1_force [N]": [0, 1]}, "column 'time' has no unit"),
+        ({"time [s]": [0, 1], "X1_force [N]": [0, 1]}, "no active joint among"),
+        ({"time [s]": [0, np.nan], "X1 [m]": [0, 1], "X1_force [N]": [0, 1]}, "'time' is nan"),
+    ],
+)
+def test_wrong_npz(tmp_path, columns, message):
+    np.savez(tmp_path / "run.npz", **{k: np.array(v) for k, v in columns.items()})
+    with pytest.raises(RecordingError, match=message):
+        Recording.read(tmp_path / "run.npz")
+    (tmp_path / "text.npz").write_text("no zip")
+    for name, text in (
+        ("text.npz", "is no npz file"),
+        ("no.npz", "no such file"),
+        ("a.txt", "csv or"),
+    ):
+        with pytest.raises(RecordingError, match=text):
+            Recording.read(tmp_path / name)
