@@ -32,7 +32,10 @@ _HOMES = {
     "crane.kinematics": ("Kinematics",),
     "crane.machine": ("Machine", "Payload", "load"),
     "crane.paths": ("Path", "point_to_point", "polynomial", "task_path", "tip_path"),
-    "crane.recording": ("Recording", "identify",),
+    "crane.recording": (
+        "Recording",
+        "identify",
+    ),
     "crane.batch": ("Batch", "simulate_batch"),
     "crane.simulation": ("simulate",),
     "crane.studies": ("Study", "study"),

@@ -1,4 +1,4 @@
-"""The command line: crane list, info, check, simulate, study, view, plot, demo."""
+"""The command line: crane list, info, check, simulate, study, identify, payload, view, ..."""
 
 import os
 import sys
@@ -47,6 +47,12 @@ Out = Annotated[
 OutFile = Annotated[
     Path | None,
     typer.Option("--out", metavar="FILE", parser=_place, help="The file to write."),
+]
+RecordingFile = Annotated[
+    Path, typer.Argument(metavar="RECORDING", help="A recording (CSV or npz), with forces.")
+]
+Method = Annotated[
+    str, typer.Option(help="wls (joints by their noise), ols, or huber (robust to outliers).")
 ]
 NoOpen = Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")]
 
@@ -106,7 +112,7 @@ def _options(
         ),
     ] = False,
 ) -> None:
-    """Machines with closed kinematic chains: simulate and show.
+    """Machines with closed kinematic chains: simulate, identify and show.
 
     Add --debug to any command to see where an error comes from.
     """
@@ -238,6 +244,128 @@ def study(
 
 
 @app.command()
+def excite(
+    machine: MachineName,
+    out: Out,
+    period: Annotated[float, typer.Option(help="In seconds.")] = 10.0,
+    harmonics: Annotated[int, typer.Option(help="Of the period.")] = 5,
+    periods: Annotated[int, typer.Option(help="How many steady ones.")] = 3,
+    criterion: Annotated[str, typer.Option(help="logdet or condition.")] = "logdet",
+    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
+    noise: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="JOINT=VALUE", help="Deviation of its force; 1 % of the limit if not given."
+        ),
+    ] = None,
+    acceleration: Annotated[
+        list[str] | None, typer.Option(metavar="JOINT=VALUE", help="A limit beside the URDF's.")
+    ] = None,
+    step: Annotated[float, typer.Option(help="Of the recording in seconds.")] = 0.01,
+    force: Force = False,
+) -> None:
+    """Find a periodic motion that tells most about a machine's parameters."""
+    # its matrices are small: threads would only wait for each other
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from crane.identification.excitation import excite as run
+    from crane.output import staging
+    from crane.runs import check_folder
+    from crane.view.excitation_plots import plot_excitation
+
+    check_folder(out, force)
+    loaded = _load(machine)
+    with _progress("optimising") as progress:
+        found = run(
+            loaded, period=period, harmonics=harmonics, periods=periods, criterion=criterion,
+            noise=_by_joint("--noise", noise), acceleration=_by_joint(
+                "--acceleration", acceleration
+            ), step=step, seed=seed, progress=progress,
+        )  # fmt: skip
+    with staging(out) as part:
+        found.to_csv(part / "reference.csv")
+        found.to_yaml(part / "coefficients.yaml")
+        plot_excitation(found, part / "reference.png")
+    print(f"{found.to_text()}\n\nwritten to {out}; see it with: crane view {out}/reference.csv")
+
+
+@app.command()
+def identify(
+    machine: MachineName,
+    recording: RecordingFile,
+    out: Out,
+    validation: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A recording to be judged by.")
+    ] = None,
+    method: Method = "wls",
+    prior: Annotated[
+        float | None,
+        typer.Option(help="Relative standard deviation of the described bodies, such as 0.3."),
+    ] = None,
+    feasible: Annotated[
+        bool, typer.Option("--feasible", help="Only bodies and friction that can exist.")
+    ] = False,
+    bandwidth: Annotated[
+        float | None,
+        typer.Option(metavar="HZ", help="Of the low-pass; by the motion if not given."),
+    ] = None,
+    slow: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="JOINT=VALUE",
+            help="Velocity below which its rows are left out [m/s], [rad/s].",
+        ),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Find a machine's parameters from a recording, and how well they predict."""
+    from crane.identification.identify import identify as run
+    from crane.recording import Recording
+    from crane.runs import check_folder, write_identification
+    from crane.samples import as_number
+
+    check_folder(out, force)
+    loaded, learned = _load(machine), Recording.read(recording)
+    if bandwidth is not None:
+        span = max(float(learned.time[-1] - learned.time[0]), 1e-3)
+        as_number(bandwidth, "the bandwidth", "Hz", above=5 / span)
+    judge = None if validation is None else Recording.read(validation)
+    with _status("identifying"):
+        result = run(
+            loaded,
+            learned,
+            judge,
+            method,
+            prior,
+            feasible,
+            bandwidth=bandwidth,
+            slow=_by_joint("--slow", slow),
+        )
+    with _status("writing the report"):
+        name = "" if validation is None else validation.name
+        write_identification(out, result, recording.name, name)
+    print(f"{result.to_text()}\nwritten to {out}; see {out}/report.html")
+
+
+@app.command()
+def payload(
+    machine: MachineName,
+    recording: RecordingFile,
+    frame: Annotated[
+        str | None, typer.Option(help="Link that carries the load; the tip if not given.")
+    ] = None,
+    method: Method = "wls",
+) -> None:
+    """Estimate mass and centre of mass of what a machine carries from a recording."""
+    from crane.identification.payload import estimate_payload
+    from crane.recording import Recording
+
+    loaded, carried = _load(machine), Recording.read(recording)
+    with _status("estimating"):
+        estimate = estimate_payload(loaded, carried, frame, method)
+    print(estimate.to_text(), end="")
+
+
+@app.command()
 def view(
     what: Annotated[
         str, typer.Argument(metavar="WHAT", help="A machine, a run's folder, or a recording.")
@@ -298,6 +426,20 @@ def demo(out: Out = Path("demo-output"), force: Force = False) -> None:
         text = run_demo(out, progress)
     print(text)
     print(f"figures:    {out}/*/{FIGURE}\nanimations: {out}/*/{PAGE} (open them in a browser)")
+
+
+def _by_joint(option: str, words: list[str] | None) -> dict[str, float]:
+    """Numbers by joint, from JOINT=VALUE."""
+    out = {}
+    for word in words or ():
+        joint, _, text = word.rpartition("=")
+        try:
+            out[joint] = float(text)
+        except ValueError:
+            joint = ""
+        if not joint:
+            raise InputError(f"{option} is '{word}', write JOINT=VALUE, as in X1=0.5")
+    return out
 
 
 def _load(name: str) -> "Machine":
@@ -395,6 +537,19 @@ def _progress(what: str) -> Iterator[Callable[[float], None]]:
             bar.update(job, description=what, completed=share)
 
         yield report
+
+
+@contextmanager
+def _status(what: str) -> Iterator[None]:
+    """Say what takes a while, where somebody watches."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(what):
+        yield
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:

@@ -10,7 +10,7 @@ As a file it is a CSV of SI units (see crane.timeseries):
 A column X is an active joint if X_force exists; X_velocity may be missing and is the derivative of
 X then. X_velocity or X_force without the others is an error. Every other column is a channel. The
 order of the columns is free, the joints come in the order of their displacements. The comment
-lines may be left out. An npz file serves, too: one array per column, named like the columns of the CSV.
+lines may be left out. An npz file serves, too: one array per column, named like those of the CSV.
 """
 
 from collections.abc import Iterable, Sequence
@@ -183,7 +183,8 @@ class Recording:
         if path.suffix.lower() == ".csv":
             return cls.from_csv(path)
         if path.suffix.lower() != ".npz":
-            raise RecordingError(f"{path}: a recording is a .csv or .npz file, name one")
+            missing = "" if path.exists() else "no such file, "
+            raise RecordingError(f"{path}: {missing}a recording is a .csv or .npz file, name one")
         try:
             return cls._from_table(timeseries.read_npz(path))
         except RecordingError as error:

@@ -1,14 +1,19 @@
 """Folders of results: one run is a recording with its summary, figure and page."""
 
+import warnings
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from crane import output
-from crane.errors import OutputError, RecordingError
+from crane.errors import CraneWarning, InputError, OutputError, RecordingError
 from crane.machine import Machine
 from crane.output import staging
 from crane.recording import Recording
 from crane.studies.table import Study
 from crane.summary import summarize
+
+if TYPE_CHECKING:
+    from crane.identification.result import Identification
 
 RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
 
@@ -84,6 +89,34 @@ def write_study(folder: Path, study: Study) -> None:
         plot_study(study, part / "study.png")
 
 
+def write_identification(
+    folder: Path, result: "Identification", recording: str = "", validation: str = ""
+) -> None:
+    """Write report and parameters into a folder, and the machine where all are known.
+
+    A machine about a prior that cannot be is left out with a warning.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+        InputError: A feasible estimate that is no machine.
+    """
+    from crane.identification.write import write_machine, write_parameters
+    from crane.view.identification_report import write_report
+
+    with staging(folder) as part:
+        write_report(result, part / "report.html", recording, validation)
+        write_parameters(result, part / "parameters.csv")
+        if result.parameters is None:
+            return
+        try:
+            write_machine(result, part / "machine")
+        except InputError as error:
+            if result.feasible:
+                raise
+            text = f"no machine files are written: {error} (on the command line --feasible)"
+            warnings.warn(text, CraneWarning, stacklevel=2)
+
+
 def read_run(path: Path) -> Recording:
     """The recording of a run's folder or of a CSV file.
 
@@ -94,4 +127,4 @@ def read_run(path: Path) -> Recording:
         if not (path / RECORDING).is_file():
             raise RecordingError(f"{path}: no {RECORDING} in this folder, give a run's folder")
         path = path / RECORDING
-    return Recording.from_csv(path)
+    return Recording.read(path)

@@ -16,13 +16,13 @@ import warnings
 import numpy as np
 
 import crane
-from crane.identification.excitation import excite
 from crane.identification.estimators import Prior
+from crane.identification.excitation import excite
 from crane.identification.identify import identify, prior_of_bodies
 from crane.identification.model import Inertial, Model, Term, friction
 from crane.rig import Rig, Tolerances, default_sensors
 
-SLOW = (0.03, 0.003, 0.003)  # three Stribeck velocities [rad/s], [m/s]: below, friction sticks
+SLOW = (0.05, 0.004, 0.004)  # beyond Stribeck velocities [rad/s], [m/s]: below, friction sticks
 BANDWIDTH = 5.0  # [Hz], five times the highest harmonic
 BODIES, FRICTION = 0.1, 0.3  # standard deviations of the prior of the model that predicts
 
@@ -59,7 +59,9 @@ def main() -> None:
     }
     learn, judge = (excite(machine, Model(machine, terms(machine)), seed=k) for k in (0, 1))
     print(learn.to_text())
-    print("rig  rank  covered  error [% of force: q1, X1, X2]  held out      ... of the noise floor")
+    print(
+        "rig  rank  covered  error [% of force: q1, X1, X2]  held out      ... of the noise floor"
+    )
     covered, floors = [], []
     for seed in range(1, options.rigs + 1):
         rig = Rig(machine, seed, Tolerances(pins=0.0), sensors)
@@ -69,7 +71,9 @@ def main() -> None:
         truth = result.base.values(Model(rig.plant, terms(rig.plant)).nominal)
         low, high = result.interval().T
         covered.append(float(np.mean((low <= truth) & (truth <= high))))
-        model = identify(machine, one, other, prior=prior(Model(machine, terms(machine))), **settings)
+        model = identify(
+            machine, one, other, prior=prior(Model(machine, terms(machine))), **settings
+        )
         # the floor: what the true parameters leave of the same recording
         exact = identify(rig.plant, other, terms=terms(rig.plant), prior=1e-6, slow=SLOW,
                          bandwidth=BANDWIDTH)  # fmt: skip

@@ -177,3 +177,26 @@ def test_what_cannot_be_identified(mini):
         with pytest.raises(kind) as caught:
             call()
         assert str(caught.value).startswith(message), str(caught.value)
+
+
+def test_a_constant_recording_is_refused(mini):
+    given = motion(mini, duration=2.0)
+    still = np.broadcast_to(given.q[0], given.q.shape)
+    recording = crane.Recording(
+        given.time, mini.active, still, 0 * still, given.tau,
+        {joint: mini.unit(joint) for joint in mini.active},
+    )  # fmt: skip
+    with pytest.raises(RecordingError, match="no joint moves, record a motion"):
+        identify(mini, recording)
+    with pytest.raises(InputError, match="a bandwidth of 0.1 Hz leaves nothing of 1.998 s"):
+        identify(mini, given, bandwidth=0.1)
+
+
+@pytest.mark.parametrize("level", [0.0, 1.0])
+def test_feasible_estimates_settle_on_exact_forces_too(mini, level):
+    path = crane.task_path(mini, "loading")
+    time = np.arange(0, 10, 2e-3)
+    q, v, a = path(time)
+    tau = crane.Dynamics(mini).inverse(q, v, a, friction=True)
+    result = identify(mini, noisy(Motion(time, q, v, a, tau), 1, level), feasible=True)
+    assert result.feasible and result.training.stacked < 0.02

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from crane.closure.structure import Indices
 from crane.errors import ClosureError, InputError
 from crane.identification.model import Model, Samples
 from crane.machine import Machine
@@ -41,7 +42,7 @@ class Base:
     """
 
     names: tuple[str, ...]
-    independent: Array
+    independent: Indices
     grouping: Array
     unobservable: tuple[str, ...]
 

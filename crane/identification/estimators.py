@@ -309,6 +309,7 @@ class _Rows:
         middle *= known / freedom / unclipped
         middle += Q[len(e) :].T @ Q[len(e) :]
         inverse = np.linalg.inv(A)
+        plain, scaled = conditions(self.W)
         inflated = math.sqrt(len(e) / max(len(e) - len(theta), 1))
         return Estimate(
             values=theta,
@@ -317,8 +318,8 @@ class _Rows:
             noise=inflated * np.array([_rms((clipped * s)[rows]) for rows in self.members]),
             effective=np.array([noise.effective for noise in noises]),
             freedom=freedom,
-            condition=_condition(self.W),
-            scaled_condition=_condition(self.W / np.maximum(_lengths(self.W), 1e-300)),
+            condition=plain,
+            scaled_condition=scaled,
         )
 
 
@@ -440,6 +441,11 @@ def _rms(e: Array) -> float:
 
 def _lengths(W: Array) -> Array:
     return np.linalg.norm(W, axis=0)
+
+
+def conditions(W: Array) -> tuple[float, float]:
+    """Condition numbers of W, and of W with columns of length one."""
+    return _condition(W), _condition(W / np.maximum(_lengths(W), 1e-300))
 
 
 def _condition(W: Array) -> float:

@@ -142,8 +142,10 @@ def feasible(
         cost += 2 * prior_weight * scale**2 * (cp.trace(x) - cp.log_det(x) - 4)
         constraints.append(x >> _MARGIN * np.eye(4))
     problem = cp.Problem(cp.Minimize(cp.sum_squares(scale * model) + cost), constraints)
-    with suppress(cp.SolverError):  # told below
-        problem.solve(solver=cp.CLARABEL, **_TOLERANCES)
+    for tolerances in (_TOLERANCES, {}):  # the solver's own where ours are out of reach
+        with suppress(cp.SolverError):  # told below
+            problem.solve(solver=cp.CLARABEL, **tolerances)
+            break
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
         raise CraneError(
             f"no feasible estimate (solver: {problem.status}), give a larger weight to the prior"

@@ -1,14 +1,14 @@
 """From a recording to parameters."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.errors import InputError, RecordingError, known
 from crane.identification.base import Base, base_parameters
-from crane.identification.estimators import Prior, huber, least_squares, weighted
+from crane.identification.estimators import Prior, conditions, huber, least_squares, weighted
 from crane.identification.feasible import feasible as feasible_estimate
 from crane.identification.feasible import pseudo_inertia
 from crane.identification.model import Model, Samples, Term
@@ -24,11 +24,13 @@ from crane.identification.signals import (
 )
 from crane.machine import Machine
 from crane.recording import Recording
-from crane.samples import Array
+from crane.samples import Array, as_number
 
 METHODS = {"ols": least_squares, "wls": weighted, "huber": huber}
 _SLOW = 0.02  # of a joint's largest velocity, below which its rows are left out
 _FAST = 40.0  # times the frequency below which 99 % of the accelerations are
+_FEWEST = 5.0  # periods of the filter's cutoff in a recording
+_EXACT = 1e-4  # of the forces, noise that a feasible estimate counts with at least
 _PRIOR = 0.3  # relative standard deviation of a body towards which a feasible estimate is drawn
 _THICKNESS = 0.05  # of a body's size, added to what is thinner in a prior
 
@@ -111,7 +113,7 @@ def identify(
     *,
     terms: Sequence[Term] | None = None,
     bandwidth: float | None = None,
-    slow: ArrayLike | None = None,
+    slow: Mapping[str, float] | ArrayLike | None = None,
 ) -> Identification:
     """Base parameters of a machine from recorded strokes and forces.
 
@@ -131,7 +133,8 @@ def identify(
         terms: Of the model; bodies and friction if not given, see `model.default_terms`.
         bandwidth: [Hz] of the low-pass; far above the frequencies of the motion if not given.
             Lower where the motion is measured badly, as by a coarse potentiometer.
-        slow: (n,) velocities below which rows are left out; a share of the largest if not given.
+        slow: Velocities below which rows are left out, (n,) or by joint; a share of a joint's
+            largest if not given. A few times that over which friction at rest fades.
 
     Returns:
         Parameters, their confidence, and how well they predict both recordings.
@@ -148,8 +151,8 @@ def identify(
     if bandwidth is None:
         bandwidth = _bandwidth(motion)
     fastest = np.abs(motion.v).max(axis=0)
-    slow = _SLOW * fastest if slow is None else np.broadcast_to(slow, fastest.shape)
-    rows = _equations(model, base, motion, bandwidth, slow)
+    limits = _slow(machine, slow, fastest)
+    rows = _equations(model, base, motion, bandwidth, limits)
     if model.bodies:
         check_forces(
             rows.time,
@@ -170,6 +173,8 @@ def identify(
         values, covariance = told.values(parameters), estimate.covariance
     elif prior is not None:
         estimate = METHODS[method](W[:, picked] @ told.grouping, y, groups, instants, prior)
+        plain, scaled = conditions(W[:, picked])
+        estimate = replace(estimate, condition=plain, scaled_condition=scaled)
         parameters = estimate.values
         values = told.values(parameters)
         covariance = told.grouping @ estimate.covariance @ told.grouping.T
@@ -184,7 +189,7 @@ def identify(
     judged = None
     if validation is not None:
         other = validation if isinstance(validation, Motion) else motion_of(machine, validation)
-        judged = compare(_equations(model, base, other, bandwidth, slow))
+        judged = compare(_equations(model, base, other, bandwidth, limits))
     return Identification(
         model, told, values, covariance, parameters, estimate, method, feasible,
         compare(rows), judged,
@@ -201,6 +206,12 @@ def _equations(
     W = model.regressor(at)[:, :, base.independent]
     offset = model.known(at)
     step = float(motion.time[1] - motion.time[0])
+    duration = float(motion.time[-1] - motion.time[0])
+    if bandwidth * duration < _FEWEST:
+        raise InputError(
+            f"a bandwidth of {bandwidth:g} Hz leaves nothing of {duration:g} s, give at least "
+            f"{_FEWEST / duration:.2g} Hz"
+        )
     thinning = max(1, int(0.25 / (step * bandwidth)))
     both = np.concatenate([W, offset[:, :, None]], axis=2)
     if bandwidth * step < 0.25:
@@ -214,6 +225,18 @@ def _equations(
     window = np.ones((2 * reach + 1, 1), dtype=bool)
     kept = ~binary_dilation(stuck, window)[::thinning]
     return _Rows(motion.time[::thinning], W, tau - offset, offset, kept)
+
+
+def _slow(machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastest: Array) -> Array:
+    """Velocities (n,) below which rows are left out."""
+    out = _SLOW * fastest
+    if isinstance(slow, Mapping):
+        for joint, value in slow.items():
+            if joint not in machine.active:
+                raise InputError(f"slow is for '{joint}', {known(machine.active, joint)}")
+            out[machine.active.index(joint)] = as_number(value, f"slow of '{joint}'", "")
+        return out
+    return out if slow is None else np.broadcast_to(np.asarray(slow, np.float64), out.shape)
 
 
 def _bandwidth(motion: Motion) -> float:
@@ -268,7 +291,8 @@ def _possible(
     if not model.bodies:
         raise InputError("the model has no bodies, so nothing has to be feasible")
     count = 10 * len(model.bodies)
-    mean, spread, weight = model.nominal.copy(), None, _PRIOR**-2
+    mean, weight = model.nominal.copy(), _PRIOR**-2
+    spread = np.full(len(mean) - count, np.inf)
     if prior is not None:
         mean = prior[0].copy()
         spread = prior[1][count:]
@@ -277,6 +301,12 @@ def _possible(
     for i in range(0, count, 10):
         mean[i : i + 10] = _thick(mean[i : i + 10])
     signs = [i for i, sign in enumerate(model.signs) if sign and i >= count]
+    size = np.sqrt(np.mean(y**2))
+    noise = np.maximum(noise, _EXACT * size)
+    # none of the others makes more than all of the force; without that, two that do the same in
+    # this motion may grow without end
+    alone = np.sqrt(np.mean((W @ base.grouping[:, count:]) ** 2, axis=0))
+    spread = np.minimum(spread, size / np.where(alone > 0, alone, size))
     found = feasible_estimate(
         W @ base.grouping, y, 1 / noise, model.bodies, mean, weight, spread, signs
     )

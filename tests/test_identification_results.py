@@ -1,0 +1,414 @@
+"""What an identification leaves behind: machine files, a report, parameters; and payloads."""
+
+import csv
+import dataclasses
+import re
+import sys
+import warnings
+
+import numpy as np
+import pytest
+from lxml import etree
+from scipy.interpolate import CubicSpline
+
+import crane
+from crane import cli
+from crane.errors import InputError, OutputError, RecordingError
+from crane.identification.identify import identify
+from crane.identification.model import Inertial, RotorInertia, default_terms, friction
+from crane.identification.payload import estimate_payload
+from crane.identification.signals import Motion
+from crane.identification.write import write_machine, write_parameters
+from crane.view.identification_report import write_report
+
+pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+NOISE = np.array([5e-3, 0.5, 0.3])  # [N m], [N], [N]
+
+
+@pytest.fixture(scope="module")
+def mini():
+    return crane.load("mini_forwarder")
+
+
+def motion(machine, seed=0, noise=1.0, duration=20.0, still=()):
+    """Five harmonics within the strokes, and the machine's forces with noise."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0, duration, 4e-3)
+    w = 2 * np.pi / 10.0 * np.arange(1, 6)
+    a, b = rng.normal(size=(2, 5, 3))
+    phase = time[:, None] * w
+    q = np.sin(phase) @ (a / w[:, None]) - np.cos(phase) @ (b / w[:, None])
+    v = np.cos(phase) @ a + np.sin(phase) @ b
+    acc = -np.sin(phase) @ (a * w[:, None]) + np.cos(phase) @ (b * w[:, None])
+    size = np.array([1.5, 0.013, 0.013]) / np.abs(q).max(axis=0)
+    size[list(still)] = 0.0
+    q, v, acc = np.array([0, 0.015, 0.015]) + q * size, v * size, acc * size
+    tau = crane.Dynamics(machine).inverse(q, v, acc, friction=True)
+    return Motion(time, q, v, acc, tau + noise * NOISE * rng.normal(size=tau.shape))
+
+
+def as_recording(machine, given):
+    units = {joint: machine.unit(joint) for joint in machine.active}
+    return crane.Recording(
+        given.time, machine.active, given.q, given.v, given.tau, units, machine="mini_forwarder"
+    )
+
+
+@pytest.fixture(scope="module")
+def found(mini):
+    return identify(mini, motion(mini), motion(mini, seed=3), feasible=True)
+
+
+# --- machine files ---------------------------------------------------------------------------
+
+
+def same_forces(result, machine, q, v, a):
+    """Mass matrix, bias and friction against the regressor and what it predicts."""
+    dynamics = crane.Dynamics(machine)
+    inertial = Inertial(result.machine)
+    bodies = result.parameters[: 10 * len(result.model.bodies)]
+
+    def forces(q, v, a):
+        at = result.model.samples(q, v, a)
+        return inertial.columns(at) @ bodies + result.model.known(at)
+
+    bias = forces(q, v, 0 * a)
+    M = np.stack([forces(q, v, np.eye(3)[i] + 0 * a) - bias for i in range(3)], axis=2)
+    wanted = result.predict(q, v, a)
+    lost = dynamics.inverse(q, v, a, friction=True) - dynamics.inverse(q, v, a)
+    for one, other in (
+        (dynamics.mass_matrix(q), M),
+        (dynamics.bias(q, v), bias),
+        (lost, wanted - forces(q, v, a)),
+        (dynamics.inverse(q, v, a, friction=True), wanted),
+    ):
+        assert np.abs(one - other).max() < 1e-10 * np.abs(other).max()
+
+
+def random_states(machine, count=40):
+    rng = np.random.default_rng(4)
+    q = rng.uniform(machine.lower + 1e-3, machine.upper - 1e-3, size=(count, 3))
+    v, a = rng.normal(size=(2, count, 3)) * [1.0, 0.02, 0.02]
+    return q, v, a
+
+
+def test_the_written_machine_is_the_identified_one(mini, found, tmp_path):
+    file = write_machine(found, tmp_path / "out")
+    assert file == tmp_path / "out" / "mini_forwarder.yaml"
+    assert len(list(file.parent.iterdir())) == 6
+    written = crane.load(file)
+    same_forces(found, written, *random_states(mini))
+    assert "identified by wls, feasible" in written.source
+    assert written.tasks == mini.tasks and written.end_stops == mini.end_stops
+    assert abs(written.model.inertias[1].mass - mini.model.inertias[1].mass) > 1e-6
+
+
+def test_only_inertials_change_in_a_urdf(mini, found, tmp_path):
+    write_machine(found, tmp_path)
+    for chain in mini.chains:
+        before, after = (
+            etree.parse(str(file)).getroot() for file in (chain.urdf, tmp_path / chain.urdf.name)
+        )
+        for robot in (before, after):
+            for inertial in list(robot.iter("inertial")):
+                inertial.getparent().remove(inertial)
+        comments = [c.text for c in after.iter(etree.Comment)]
+        assert comments[0] == " Inertials: identified by wls, feasible. "
+
+        def said(robot):
+            return [(e.tag, dict(e.attrib)) for e in robot.iter("*")]
+
+        assert said(before) == said(after)
+
+
+LOADED = """<robot name="arm">
+  <link name="base"><inertial><mass value="5"/>
+    <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="beam"/>
+  <link name="tool"><inertial><origin xyz="0.1 0 0.02" rpy="0.3 0 0"/><mass value="2"/>
+    <inertia ixx="0.01" iyy="0.02" izz="0.02" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><geometry><box size="1 1 1"/></geometry></visual></link>
+  <link name="rocker"><inertial><origin xyz="0.1 0 0"/><mass value="1"/>
+    <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="rod"><inertial><origin xyz="0.2 0 0"/><mass value="1"/>
+    <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="crank" type="revolute" independent="true"><parent link="base"/>
+    <child link="beam"/><axis xyz="0 1 0"/><dynamics damping="0.4" friction="0.2"/>
+    <limit lower="-0.6" upper="0.6" effort="9" velocity="9"/></joint>
+  <joint name="weld" type="fixed"><parent link="beam"/><child link="tool"/>
+    <origin xyz="0.05 0 0" rpy="0 0.2 0"/></joint>
+  <joint name="swing" type="revolute"><parent link="base"/><child link="rocker"/>
+    <origin xyz="0.5 0 0"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="9" velocity="9"/></joint>
+  <joint name="knee" type="revolute"><parent link="beam"/><child link="rod"/>
+    <origin xyz="0 0 0.3"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="9" velocity="9"/></joint>
+  <loop name="pin" type="revolute">
+    <predecessor link="rod"><origin xyz="0.5 0 0"/></predecessor>
+    <successor link="rocker"><origin xyz="0 0 0.3"/></successor><axis xyz="0 1 0"/></loop>
+</robot>"""
+
+
+def test_one_urdf_with_a_loop_becomes_a_machine_file(tmp_path):
+    """What is welded to a body is in it, the loop's frames are links, friction is written."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(LOADED)
+    arm = crane.load(path)
+    time = np.arange(0, 20, 0.01)[:, None]
+    q, v, a = 0.5 * np.sin(time), 0.5 * np.cos(time), -0.5 * np.sin(time)
+    tau = crane.Dynamics(arm).inverse(q, v, a, friction=True)
+    noise = np.random.default_rng(0).normal(size=tau.shape)
+    given = Motion(time[:, 0], q, v, a, 1.1 * tau + 0.1 * noise)
+    result = identify(arm, given, prior=0.3, feasible=True)
+    with pytest.raises(OutputError) as caught:
+        write_machine(result, tmp_path / "sub" / "..")
+    assert "is what 'arm' was read from" in str(caught.value)
+    written = crane.load(write_machine(result, tmp_path / "out"))
+    at = result.model.samples(q, v, a)
+    wanted = result.model.regressor(at) @ result.parameters
+    again = crane.Dynamics(written).inverse(q, v, a, friction=True)
+    assert np.abs(again - wanted).max() < 1e-10 * np.abs(wanted).max()
+    robot = etree.parse(str(tmp_path / "out" / "arm.urdf")).getroot()
+    having = {link.get("name") for link in robot.iter("link") if link.find("inertial") is not None}
+    assert having == {"base", "beam", "rocker", "rod"}
+    assert robot.find("link[@name='tool']/visual") is not None
+
+
+def test_what_cannot_be_written(mini, found, tmp_path):
+    plain = identify(mini, motion(mini))
+    parameters = found.parameters.copy()
+    parameters[found.model.names.index("X1.viscous")] = -1.0
+    rotor = [*default_terms(mini), RotorInertia(mini, "q1", 1e-3)]
+    bodies = found.parameters.copy()
+    bodies[4] = -1.0
+    changed = crane.load("mini_forwarder", {"link7.mass": 0.3})
+    for result, message in (
+        (plain, "forces determine base parameters only: give prior or feasible=True"),
+        (
+            dataclasses.replace(found, parameters=parameters),
+            "'X1': viscous of friction is -1, it must not be negative, give feasible=True",
+        ),
+        (dataclasses.replace(found, parameters=bodies), "the identified machine cannot be: "),
+        (identify(mini, motion(mini), feasible=True, terms=rotor), "the model has 'q1.rotor'"),
+        (
+            identify(
+                mini, motion(mini), feasible=True,
+                terms=[
+                    Inertial(mini), friction(mini, "q1"), friction(mini, "X2"),
+                    friction(mini, "X1", smoothing=0.01),
+                ],
+            ),
+            "the model has friction over other velocities than the machine's",
+        ),
+        (
+            identify(changed, motion(changed), prior=0.3),
+            "'mini_forwarder' was loaded with changed numbers or locked joints",
+        ),
+    ):  # fmt: skip
+        with pytest.raises(InputError) as caught:
+            write_machine(result, tmp_path / "out")
+        assert str(caught.value).startswith(message), str(caught.value)
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_the_parameters_as_a_table(found, tmp_path):
+    write_parameters(found, tmp_path / "p.csv")
+    with (tmp_path / "p.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["parameter"] for row in rows] == list(found.names)
+    np.testing.assert_array_equal([float(row["value"]) for row in rows], found.values)
+    np.testing.assert_array_equal([float(row["lower"]) for row in rows], found.interval()[:, 0])
+
+
+# --- report ----------------------------------------------------------------------------------
+
+
+def test_a_report_is_one_file_that_says_everything(mini, found, tmp_path):
+    path = write_report(found, tmp_path / "report.html", "train <1>.csv", "judge.csv")
+    text = path.read_text(encoding="utf-8")
+    assert len(text) < 3e6
+    bare = re.sub(r'src="data:image/png;base64,[^"]*"', "", text)
+    assert not re.search(r"https?:|src=|href=|url\(|<script|@import", bare)
+    assert "train &lt;1&gt;.csv" in bare and "judge.csv" in bare
+    tree = etree.HTML(text)
+    assert len(tree.findall(".//img")) == 3 * 3 + 1
+    tables = tree.findall(".//table")
+    counts = [len(table.findall(".//tr")) - 1 for table in tables]
+    assert counts[:3] == [3, found.base.rank, len(found.model.bodies)]
+    shown = {code.text for code in tables[1].iter("code")}
+    assert shown == set(found.names)
+    assert f"{100 * found.training.relative[1]:.3g} %" in bare
+    assert "essential" in bare and "zero in interval" in bare
+    unobservable = " ".join(tree.xpath("//h2[.='Not told']/following-sibling::p")[0].itertext())
+    assert all(name in unobservable for name in found.base.unobservable)
+    with pytest.raises(OutputError):
+        write_report(found, tmp_path / "report.pdf")
+
+
+# --- payload ---------------------------------------------------------------------------------
+
+LOAD = crane.Payload("link7_tip", 0.2, (0.01, -0.03, 0.005), np.diag([1e-4, 2e-4, 1.5e-4]))
+TRUTH = np.array([0.2, 0.01, -0.03, 0.005])
+
+
+def test_a_load_comes_back_from_exact_forces(mini):
+    estimate = estimate_payload(mini, motion(mini.with_payload(LOAD), noise=0.0))
+    np.testing.assert_allclose([estimate.mass, *estimate.com], TRUTH, rtol=1e-8)
+    # in another frame of the same body
+    frame = mini.model.frames[mini.frame("link7")].placement
+    tip = mini.model.frames[mini.frame("link7_tip")].placement
+    other = estimate_payload(mini, motion(mini.with_payload(LOAD), noise=0.0), "link7")
+    np.testing.assert_allclose(other.com, frame.actInv(tip.act(TRUTH[1:])), rtol=1e-7, atol=1e-9)
+
+
+def test_the_intervals_of_a_load_cover_it(mini):
+    loaded = mini.with_payload(LOAD)
+    covered = []
+    for seed in range(12):
+        low, high = estimate_payload(mini, motion(loaded, seed)).interval().T
+        covered.append((low <= TRUTH) & (high >= TRUTH))
+    assert np.mean(covered) > 0.88  # of 48
+    estimate = estimate_payload(mini, motion(loaded, 1))
+    assert abs(estimate.mass - 0.2) < 2e-3 and estimate.std_mass < 1e-3
+    assert re.search(r"^mass +0\.\d+ .* to 0\.\d+ kg$", estimate.to_text(), re.M)
+    bare = estimate_payload(mini, motion(mini, 2))
+    assert "the mass may be zero" in bare.to_text()
+
+
+def test_what_a_motion_does_not_tell_of_a_load(mini):
+    """Without slewing, nothing at right angles to the crane's plane."""
+    estimate = estimate_payload(mini, motion(mini.with_payload(LOAD), still=[0]))
+    np.testing.assert_allclose(estimate.com[:2], TRUTH[1:3], atol=3e-3)
+    assert np.isnan(estimate.com[2]) and np.isnan(estimate.std_com[2])
+    assert estimate.directions.shape == (2, 3) and np.abs(estimate.directions[:, 2]).max() < 1e-9
+    assert "com z              -   not told by this motion" in estimate.to_text()
+
+
+def test_no_load_can_be_told(mini):
+    given = motion(mini, duration=4.0)
+    slewing = motion(mini, duration=4.0, still=[1, 2])
+    for call, kind, message in (
+        (lambda: estimate_payload(mini, given, "base"), InputError, "frame 'base' does not move"),
+        (lambda: estimate_payload(mini, given, "tip"), InputError, "frame 'tip' is unknown"),
+        (
+            lambda: estimate_payload(mini, dataclasses.replace(given, tau=1e3 * given.tau)),
+            RecordingError,
+            "'q1_force' is 1",
+        ),
+        (lambda: estimate_payload(mini, slewing), RecordingError, "this motion does not tell"),
+    ):
+        with pytest.raises(kind) as caught:
+            call()
+        assert str(caught.value).startswith(message), str(caught.value)
+
+
+# --- command line ----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """The command line in this process: exit status, stdout, stderr without warnings."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["crane", *map(str, arguments)])
+        with warnings.catch_warnings(), pytest.raises(SystemExit) as ended:
+            cli.main()
+        out, err = capsys.readouterr()
+        lines = [line for line in err.splitlines() if not line.startswith("warning: ")]
+        return ended.value.code, out, lines
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def simulated(mini, tmp_path_factory):
+    """A machine that moves with a load, or without."""
+    folder = tmp_path_factory.mktemp("simulated")
+    given = motion(mini)
+    path = crane.Path(CubicSpline(given.time[::10], given.q[::10]))
+    for name, machine in (("empty", mini), ("loaded", mini.with_payload(LOAD))):
+        control = crane.ComputedTorque(machine, path)
+        run = crane.simulate(machine, control, path(0.0)[:2])
+        noise = NOISE * np.random.default_rng(0).normal(size=run.tau.shape)
+        dataclasses.replace(run, tau=run.tau + noise).to_csv(folder / f"{name}.csv")
+    return folder
+
+
+def test_from_a_simulated_file_to_a_folder(run, simulated, tmp_path):
+    file = simulated / "empty.csv"
+    command = ("identify", "mini_forwarder", file, "--validation", file, "--feasible")
+    status, out, errors = run(*command, "--out", "result")
+    assert (status, errors) == (0, [])
+    assert "mini_forwarder: " in out and "validation, moving rows" in out
+    assert out.endswith("\nwritten to result; see result/report.html\n")
+    written = {path.name for path in (tmp_path / "result").iterdir()}
+    assert written == {"report.html", "parameters.csv", "machine"}
+    assert crane.load(tmp_path / "result" / "machine" / "mini_forwarder.yaml").name
+    status, out, errors = run(*command, "--out", "result")
+    assert status == 2 and out == "" and "is not empty" in errors[0]
+
+
+def test_a_load_from_a_simulated_file(run, simulated):
+    status, out, errors = run("payload", "mini_forwarder", simulated / "loaded.csv")
+    assert (status, errors) == (0, [])
+    mass = float(re.search(r"^mass +(\S+)", out, re.M)[1])
+    assert abs(mass - 0.2) < 0.01 * 0.2
+
+
+def without(column, text):
+    """A file with a column cut out."""
+    lines = text.splitlines()
+    at = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+    index = [cell.split(" [")[0] for cell in lines[at].split(",")].index(column)
+    return "\n".join(
+        line if i < at else ",".join(c for k, c in enumerate(line.split(",")) if k != index)
+        for i, line in enumerate(lines)
+    )
+
+
+def test_wrong_recordings_and_arguments_are_one_line(run, mini, tmp_path):
+    good = as_recording(mini, motion(mini, duration=8.0))
+    good.to_csv(tmp_path / "good.csv")
+    text = (tmp_path / "good.csv").read_text()
+    n, scale = len(good.time), np.array([180 / np.pi, 1.0, 1.0])
+
+    def other(**changes):
+        return dataclasses.replace(good, **changes)
+
+    def few():
+        return other(**{k: getattr(good, k)[:20] for k in ("time", "q", "v", "tau")})
+
+    trembling = 1e-6 * np.random.default_rng(0).normal(size=(n, 3))
+    still = other(q=good.q[0] + trembling, v=0 * good.v)
+    broken = text.replace(",".join(text.splitlines()[40].split(",")[:2]), "nan,0", 1)
+    cases = [
+        (without("X1_force", text), "column 'X1_force' is missing"),
+        (broken, "column 'time': 'nan' is not a finite number"),
+        (other(q=good.q * scale), "'q1' goes from"),
+        (other(tau=1e3 * good.tau), "it looks 1000-fold, give SI units"),
+        (still, "no joint moves, record a motion"),
+        (few(), "20 samples are too few, record at least 50"),
+    ]
+    for case, message in cases:
+        if isinstance(case, str):
+            (tmp_path / "bad.csv").write_text(case)
+        else:
+            case.to_csv(tmp_path / "bad.csv")
+        status, out, errors = run("identify", "mini_forwarder", "bad.csv", "--out", "out")
+        assert (status, out, len(errors)) == (2, "", 1), errors
+        assert errors[0].startswith("error: ") and message in errors[0]
+        assert not (tmp_path / "out").exists()
+    for arguments, message in (
+        (["--method", "lsq"], "method 'lsq' is unknown"),
+        (["--prior", "-1"], "the prior's standard deviation is -1"),
+        (["--bandwidth", "0"], "the bandwidth is 0.0 Hz"),
+        (["--bandwidth", "1e-6"], "the bandwidth is 1e-06 Hz"),
+        (["--validation", "none.csv"], "none.csv: no such file"),
+    ):
+        status, out, errors = run(
+            "identify", "mini_forwarder", "good.csv", "--out", "out", *arguments
+        )
+        assert (status, out, len(errors)) == (2, "", 1), errors
+        assert message in errors[0]
+        assert not (tmp_path / "out").exists()
