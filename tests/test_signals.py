@@ -5,8 +5,9 @@ import pytest
 from scipy.linalg import block_diag
 
 from crane.errors import InputError, RecordingError
-from crane.identification import signals
-from crane.identification.signals import check, check_forces, differentiate
+from crane.identification import checks, signals, smoother
+from crane.identification.checks import check, check_forces
+from crane.identification.signals import differentiate
 
 JOINTS, UNITS = ("q1", "X1"), {"q1": "rad", "X1": "m"}
 
@@ -79,7 +80,7 @@ def fixed(monkeypatch):
             x = math.log(h)
 
         monkeypatch.setattr(scipy.optimize, "minimize_scalar", lambda *_, **__: Found)
-        return signals._smooth(y, step)
+        return smoother.smooth(y, step)
 
     return smooth
 
@@ -112,7 +113,7 @@ def test_likelihood_is_the_density_of_what_polynomials_leave():
     rng = np.random.default_rng(3)
     y, costs, exact = rng.standard_normal(40).cumsum(), [], []
     for h in (0.3, 0.7, 1.4):
-        costs.append(signals._likelihood(y, h)[0])
+        costs.append(smoother.likelihood(y, h)[0])
         F, Q = model(h)
         V, cross = np.zeros((40, 40)), np.zeros((4, 4))
         for k in range(40):
@@ -362,5 +363,5 @@ def test_forces_against_a_model():
 
 def test_delay_between_samples():
     time = np.arange(5000) * 4e-3
-    found = signals.delay(time, movement(time)[1][:, 0], movement(time - 0.0615)[1][:, 0])
+    found = checks.delay(time, movement(time)[1][:, 0], movement(time - 0.0615)[1][:, 0])
     assert abs(found - 0.0615) < 1e-3

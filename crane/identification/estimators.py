@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.errors import InputError
+from crane.identification.noise import Noise, between
 from crane.samples import Array
 
 Prior = tuple[Array, Array]
@@ -21,7 +22,6 @@ _CONVERGED = 1e-6  # standard deviations
 _ROUNDING = 1e-10  # of the forces
 _ROUNDS = 100
 _LEAST_SHARE = 0.2  # of the degrees of freedom, however many parameters take theirs
-_LONGEST_MEMORY = 60  # samples in the autoregressive model of the noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,21 +285,21 @@ class _Rows:
         in time. Rows that are missing are zero in Q.
 
         The spectral densities at low frequencies, where motions are, are known with some degrees
-        of freedom f (`_Noise.known`, m for white noise), of which the fit takes p: the
+        of freedom f (`Noise.known`, m for white noise), of which the fit takes p: the
         covariance is multiplied by f / (f - p), and f - p are those of the intervals.
         """
         clipped = np.clip(e, -turn * s, turn * s) / s
         unclipped = float(np.mean(np.abs(e) <= turn * s))
         Q, A = self._solve(s / math.sqrt(unclipped))[1:]
         inner = Q[: len(e)]
-        noises = [_Noise.of(clipped[rows], self.samples[rows]) for rows in self.members]
+        noises = [Noise.of(clipped[rows], self.samples[rows]) for rows in self.members]
         span = int(self.samples.min()), int(self.samples.max())
         memory = max(noise.memory for noise in noises)
         filtered = [
             noise.spread(inner[rows], self.samples[rows] - span[0], span[1] - span[0] + 1, memory)
             for noise, rows in zip(noises, self.members, strict=True)
         ]
-        S = _between(noises)
+        S = between(noises)
         middle = np.zeros((len(theta), len(theta)))
         for i, one in enumerate(filtered):
             other = sum(S[i, j] * filtered[j] for j in range(len(filtered)))
@@ -321,118 +321,6 @@ class _Rows:
             condition=plain,
             scaled_condition=scaled,
         )
-
-
-@dataclass(frozen=True, eq=False)
-class _Noise:
-    """Autoregressive noise a_0 e_k + a_1 e_k-1 + ... = u_k of one joint, a_0 = 1.
-
-    Attributes:
-        a: Coefficients.
-        innovations: u (T,) over all instants from the first to the last, nan where unknown.
-        first: Number of the first instant.
-        effective: See `Estimate`.
-        known: Degrees of freedom of the spectral density at zero: 2 over the variance of its
-            logarithm, which is 4 order / N for high orders (Berk 1974), and 4 / `effective` for
-            the first order.
-        memory: Samples until the noise has forgotten its past.
-    """
-
-    a: Array
-    innovations: Array
-    first: int
-    effective: float
-    known: float
-    memory: int
-
-    @classmethod
-    def of(cls, e: Array, samples: np.ndarray) -> "_Noise":
-        """Burg's estimate from all runs without missing rows, order by Schwarz's criterion.
-
-        Burg's needs no window, which would smear the steep spectrum of filtered noise, and is
-        stable always. Where filtered noise was not thinned (a pass band of a tenth of the band
-        that the samples can tell), some thousand rows are needed for intervals that hold.
-        """
-        from scipy.signal import lfilter
-
-        runs = np.split(e, np.flatnonzero(np.diff(samples) != 1) + 1)
-        a = _burg(runs)
-        series = np.full(int(samples[-1] - samples[0]) + 1, np.nan)
-        for run, start in zip(runs, _starts(samples), strict=True):
-            if len(run) >= len(a):
-                u = np.convolve(run, a, mode="valid")
-                series[start + len(a) - 1 : start + len(run)] = u
-        largest = np.abs(np.roots(a)).max() if len(a) > 1 else 0.0
-        memory = min(math.ceil(-20 / math.log(largest)) if largest > 1e-3 else 3, len(series))
-        answer = lfilter([1.0], a, np.eye(1, 4 * memory)[0])  # of e to an impulse in u
-        spectrum = np.abs(np.fft.rfft(answer, 16 * memory)) ** 2
-        spectrum = np.concatenate([spectrum, spectrum[-2:0:-1]])
-        mean = spectrum.mean()
-        effective = float(len(e) * mean / spectrum[0])
-        known = min(effective, len(e) / (len(a) - 1)) / 2 if len(a) > 1 else len(e)
-        return cls(a, series, int(samples[0]), effective, known, memory)
-
-    def spread(self, Q: Array, at: np.ndarray, count: int, memory: int) -> Array:
-        """a^-1 backwards in time on rows at these instants of `count`, and `memory` before."""
-        from scipy.signal import lfilter
-
-        dense = np.zeros((Q.shape[1], count + memory))
-        dense[:, count - 1 - at] = Q.T
-        return np.asarray(lfilter([1.0], self.a, dense)).T
-
-
-def _burg(runs: list[Array]) -> Array:
-    """Coefficients 1, a_1, ... of the order with the smallest Bayesian information criterion."""
-    count = sum(map(len, runs))
-    longest = min(_LONGEST_MEMORY, count // 10)
-    power = sum(run @ run for run in runs) / count
-    a = best = np.ones(1)
-    if power == 0:
-        return best
-    lowest = math.log(power)
-    forward, backward = list(runs), list(runs)
-    for order in range(1, longest + 1):
-        forward, backward = (
-            [f[1:] for f in forward if len(f) > 1],
-            [b[:-1] for b in backward if len(b) > 1],
-        )
-        cross = sum(f @ b for f, b in zip(forward, backward, strict=True))
-        energy = sum(f @ f + b @ b for f, b in zip(forward, backward, strict=True))
-        if not forward or energy <= 0:
-            break
-        k = -2 * cross / energy
-        a = np.append(a, 0) + k * np.append(0, a[::-1])
-        power *= 1 - k * k
-        forward, backward = (
-            [f + k * b for f, b in zip(forward, backward, strict=True)],
-            [b + k * f for f, b in zip(forward, backward, strict=True)],
-        )
-        if power <= 0:
-            break
-        criterion = math.log(power) + order * math.log(count) / count
-        if criterion < lowest:
-            lowest, best = criterion, a
-    return best
-
-
-def _between(noises: list[_Noise]) -> Array:
-    """Covariances (g, g) of innovations at the same instants."""
-    start = min(noise.first for noise in noises)
-    end = max(noise.first + len(noise.innovations) for noise in noises)
-    u = np.full((len(noises), end - start), np.nan)
-    for row, noise in zip(u, noises, strict=True):
-        row[noise.first - start :][: len(noise.innovations)] = noise.innovations
-    there = np.isfinite(u).astype(np.float64)
-    u = np.nan_to_num(u)
-    S = (u @ u.T) / np.maximum(there @ there.T, 1)
-    values, vectors = np.linalg.eigh(S)
-    return (vectors * np.maximum(values, 0)) @ vectors.T
-
-
-def _starts(samples: np.ndarray) -> np.ndarray:
-    """Where runs without missing rows start, counted from the first instant."""
-    breaks = np.flatnonzero(np.diff(samples) != 1) + 1
-    return samples[np.append(0, breaks)] - samples[0]
 
 
 def _rms(e: Array) -> float:

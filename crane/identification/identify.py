@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from crane.errors import InputError, RecordingError, known
 from crane.identification.base import Base, base_parameters
+from crane.identification.checks import check, check_forces
 from crane.identification.estimators import Prior, conditions, huber, least_squares, weighted
 from crane.identification.feasible import feasible as feasible_estimate
 from crane.identification.feasible import pseudo_inertia
@@ -15,8 +16,6 @@ from crane.identification.model import Model, Samples, Term
 from crane.identification.result import Comparison, Identification
 from crane.identification.signals import (
     Motion,
-    check,
-    check_forces,
     differentiate,
     filter_rows,
     moving,

@@ -7,11 +7,12 @@ import numpy as np
 from crane.dynamics import Dynamics
 from crane.errors import InputError, RecordingError
 from crane.identification.base import Base
+from crane.identification.checks import check_forces
 from crane.identification.feasible import body_parameters, pseudo_inertia
 from crane.identification.identify import identify, motion_of
 from crane.identification.model import PER_BODY, Samples
 from crane.identification.result import Comparison
-from crane.identification.signals import Motion, check_forces
+from crane.identification.signals import Motion
 from crane.machine import Machine
 from crane.recording import Recording
 from crane.samples import Array
