@@ -1,0 +1,86 @@
+"""The program: options of all commands, and what becomes of errors."""
+
+import os
+import sys
+import warnings
+from typing import Annotated
+
+import typer
+
+import crane
+from crane.cli import commands, design  # noqa: F401  register their commands
+from crane.cli.shared import app, say
+from crane.errors import CraneError, CraneWarning
+
+_INTERRUPTED = 130
+
+
+def main() -> None:
+    """Run the command line: errors are one line, exit status 2."""
+    arguments = [word for word in sys.argv[1:] if word != "--debug"]
+    debug = len(arguments) < len(sys.argv) - 1
+    warnings.showwarning = _show_warning
+    warnings.simplefilter("once", CraneWarning)
+    try:
+        status = app(args=arguments, standalone_mode=False, prog_name="crane")
+        if status == _INTERRUPTED:  # what the parser makes of KeyboardInterrupt
+            raise KeyboardInterrupt
+        if sys.stdout is not None:  # it is where the shell has closed it
+            sys.stdout.flush()
+    except CraneError as error:
+        if debug:
+            raise
+        say(f"error: {error}")
+        sys.exit(2)
+    except KeyboardInterrupt:
+        say("error: interrupted, nothing was written")
+        sys.exit(_INTERRUPTED)
+    except OSError as error:
+        if debug:
+            raise
+        _abandon_output()
+        if isinstance(error, BrokenPipeError):  # whoever read it has seen enough
+            sys.exit(1)
+        place = error.filename or "output"
+        say(f"error: {place}: {error.strerror or error}, check the place and try again")
+        sys.exit(2)
+    except Exception as error:
+        # the command line parser's own errors, whose class is not public
+        message = getattr(error, "format_message", None)
+        if debug or message is None:
+            raise
+        if text := message():
+            say(f"error: {' '.join(text.split())} (crane --help shows the commands)")
+        sys.exit(2)
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"crane {crane.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", is_eager=True, callback=_show_version, help="Show the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Machines with closed kinematic chains: simulate, identify and show.
+
+    Add --debug to any command to see where an error comes from.
+    """
+
+
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    say(f"warning: {message}")
+
+
+def _abandon_output() -> None:
+    """Let the interpreter end without a word on what could not be written."""
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,106 @@
+"""What all commands share: the program, its arguments, loading and progress."""
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from crane.errors import InputError, OutputError
+
+if TYPE_CHECKING:
+    from crane.machine import Machine
+
+# Commands import what they need when they run, so that `crane --help` answers at once.
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _place(text: str | Path) -> Path:
+    if not str(text):
+        raise OutputError("the name after --out is empty, give one")
+    return Path(text)
+
+
+MachineName = Annotated[
+    str,
+    typer.Argument(metavar="MACHINE", help="A bundled name, a machine file, or a URDF."),
+]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite what is there.")]
+Out = Annotated[
+    Path,
+    typer.Option("--out", metavar="FOLDER", parser=_place, help="Folder for the results."),
+]
+OutFile = Annotated[
+    Path | None,
+    typer.Option("--out", metavar="FILE", parser=_place, help="The file to write."),
+]
+RecordingFile = Annotated[
+    Path, typer.Argument(metavar="RECORDING", help="A recording (CSV or npz), with forces.")
+]
+Method = Annotated[
+    str, typer.Option(help="wls (joints by their noise), ols, or huber (robust to outliers).")
+]
+NoOpen = Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")]
+
+
+def by_joint(option: str, words: list[str] | None) -> dict[str, float]:
+    """Numbers by joint, from JOINT=VALUE."""
+    out = {}
+    for word in words or ():
+        joint, _, text = word.rpartition("=")
+        try:
+            out[joint] = float(text)
+        except ValueError:
+            joint = ""
+        if not joint:
+            raise InputError(f"{option} is '{word}', write JOINT=VALUE, as in X1=0.5")
+    return out
+
+
+def load(name: str) -> "Machine":
+    """The machine of that name or path."""
+    from crane.machine import load as load_machine
+
+    return load_machine(name)
+
+
+@contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[float], None]]:
+    """A bar on a terminal, and what takes the finished share, 0 to 1."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        job = bar.add_task("compiling the machine's formulas", total=1.0)
+
+        def report(share: float) -> None:
+            bar.update(job, description=what, completed=share)
+
+        yield report
+
+
+@contextmanager
+def status(what: str) -> Iterator[None]:
+    """Say what takes a while, where somebody watches."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(what):
+        yield
+
+
+def say(text: str) -> None:
+    """To whoever watches, beside the results."""
+    print(text, file=sys.stderr)
