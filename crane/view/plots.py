@@ -1,6 +1,7 @@
 """A recording as one figure: displacements, velocities and forces, and the path of the tip."""
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from string import ascii_lowercase
@@ -80,11 +81,16 @@ def plot_recording(recording: Recording, path: str | Path) -> None:
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
     """
+    write_figure(path, lambda: recording_figure(recording))
+
+
+def write_figure(path: str | Path, draw: Callable[[], Figure]) -> None:
+    """Draw a figure into a file whose suffix is a known format; see `plot_recording`."""
     path = Path(path)
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise OutputError(f"{path}: unknown kind of picture, end the name in .png, .svg or .pdf")
-    figure = recording_figure(recording)
+    figure = draw()
     with mpl.rc_context(STYLE), replacing(path) as part:
         figure.savefig(part, format=kind, dpi=200, metadata=FORMATS[kind])
 

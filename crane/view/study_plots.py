@@ -9,11 +9,9 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
-from crane.errors import OutputError
-from crane.output import replacing
 from crane.samples import Array
 from crane.studies import Study
-from crane.view.plots import DASHED, FORMATS, RECORDED, STYLE
+from crane.view.plots import DASHED, RECORDED, STYLE, write_figure
 
 _MOST_PANELS = 12  # measures of one picture
 _MOST_SCATTERED = 6
@@ -32,13 +30,7 @@ def plot_study(study: Study, path: str | Path) -> None:
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
     """
-    path = Path(path)
-    kind = path.suffix.lower().removeprefix(".")
-    if kind not in FORMATS:
-        raise OutputError(f"{path}: unknown kind of picture, end the name in .png, .svg or .pdf")
-    figure = study_figure(study)
-    with mpl.rc_context(STYLE), replacing(path) as part:
-        figure.savefig(part, format=kind, dpi=200, metadata=FORMATS[kind])
+    write_figure(path, lambda: study_figure(study))
 
 
 def study_figure(study: Study) -> Figure:
