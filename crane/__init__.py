@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from crane.batch import Batch, simulate_batch
     from crane.closure import Closure
-    from crane.control import PI, ComputedTorque
+    from crane.control import (
+        PI,
+        ComputedTorque,
+        Sampled,
+        Signals,
+        TipVelocity,
+        ValveDrive,
+        ValvePD,
+        joystick,
+    )
     from crane.description import EndStop, ForceElement, Friction, GasSpring, PIGains
     from crane.dynamics import Dynamics
     from crane.errors import CraneError, CraneWarning
@@ -14,8 +23,10 @@ if TYPE_CHECKING:
     from crane.identification.result import Identification
     from crane.kinematics import Kinematics
     from crane.machine import Machine, Payload, load
+    from crane.measured import read_measured
     from crane.paths import Path, point_to_point, polynomial, task_path, tip_path
     from crane.recording import Recording
+    from crane.replay import Comparison, replay
     from crane.simulation import simulate
     from crane.studies import Study, study
 
@@ -23,7 +34,16 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "crane.closure": ("Closure",),
-    "crane.control": ("PI", "ComputedTorque"),
+    "crane.control": (
+        "PI",
+        "ComputedTorque",
+        "Sampled",
+        "Signals",
+        "TipVelocity",
+        "ValveDrive",
+        "ValvePD",
+        "joystick",
+    ),
     "crane.description": ("EndStop", "ForceElement", "Friction", "GasSpring", "PIGains"),
     "crane.dynamics": ("Dynamics",),
     "crane.errors": ("CraneError", "CraneWarning"),
@@ -31,21 +51,22 @@ _HOMES = {
     "crane.identification.result": ("Identification",),
     "crane.kinematics": ("Kinematics",),
     "crane.machine": ("Machine", "Payload", "load"),
+    "crane.measured": ("read_measured",),
     "crane.paths": ("Path", "point_to_point", "polynomial", "task_path", "tip_path"),
-    "crane.recording": (
-        "Recording",
-        "identify",
-    ),
+    "crane.recording": ("Recording",),
     "crane.batch": ("Batch", "simulate_batch"),
+    "crane.replay": ("Comparison", "replay"),
     "crane.simulation": ("simulate",),
     "crane.studies": ("Study", "study"),
 }
 
 __all__ = [
-    "PI", "Batch", "Closure", "ComputedTorque", "CraneError", "CraneWarning", "Dynamics",
-    "EndStop", "ForceElement", "Friction", "GasSpring", "Identification", "Kinematics", "Machine",
-    "PIGains", "Path", "Payload", "Recording", "Study", "identify", "load", "point_to_point",
-    "polynomial", "simulate", "simulate_batch", "study", "task_path", "tip_path",
+    "PI", "Batch", "Closure", "Comparison", "ComputedTorque", "CraneError", "CraneWarning",
+    "Dynamics", "EndStop", "ForceElement", "Friction", "GasSpring", "Identification", "Kinematics",
+    "Machine", "PIGains", "Path", "Payload", "Recording", "Sampled", "Signals", "Study",
+    "TipVelocity", "ValveDrive", "ValvePD", "identify", "joystick", "load", "point_to_point",
+    "polynomial", "read_measured", "replay", "simulate", "simulate_batch", "study", "task_path",
+    "tip_path",
 ]  # fmt: skip
 
 

@@ -89,7 +89,7 @@ def simulate_batch(
         control = None if controller is None else controller(machine)
         time, states, seen = trajectory(Dynamics(machine), control, starts[i], duration, step)
         nq, n = machine.model.nq, len(active)
-        energy = np.column_stack([seen[:, 2 * n :], states[:, -2:]])
+        energy = np.column_stack([seen[:, 2 * n : 2 * n + 2], states[:, -2:]])
         q_a = states[:, :nq][:, machine.closure.active]
         return time, q_a, states[:, nq : nq + n], seen[:, :n], energy
 

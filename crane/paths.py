@@ -169,6 +169,8 @@ def task_path(machine: Machine, task: str) -> Path:
             f"machine '{machine.name}' has no task '{task}', {known(machine.tasks, task)}"
         )
     chosen = machine.tasks[task]
+    if chosen.space == "joystick":
+        raise InputError(f"task '{task}' moves levers, it has no path")
     if chosen.space == "tip":
         rows = [chosen.coefficients[axis] for axis in ("x", "y", "z")]
         return tip_path(machine, polynomial(rows, chosen.duration))

@@ -8,12 +8,15 @@ As a file it is a CSV of SI units (see crane.timeseries):
     time [s],q1 [rad],X1 [m],q1_velocity [rad/s],X1_velocity [m/s],q1_force [N m],X1_force [N],...
 
 A column X is an active joint if X_force exists; X_velocity may be missing and is the derivative of
-X then. X_velocity or X_force without the others is an error. Every other column is a channel. The
-order of the columns is free, the joints come in the order of their displacements. The comment
-lines may be left out. An npz file serves, too: one array per column, named like those of the CSV.
+X then. X_velocity and X_force without X is an error. Every other column is a channel, such as the
+angle q2 of a joint that is not active, with q2_velocity beside it or without. The order of the
+columns is free, the joints come in the order of their displacements. The comment lines may be left
+out. Other units are converted where crane.timeseries knows them. An npz file serves, too: one
+array per column, named like those of the CSV. What a crane's sensors tell instead of
+displacements and forces, crane.measured turns into them.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,12 +26,12 @@ from numpy.typing import ArrayLike
 from crane import timeseries
 from crane.errors import RecordingError, known
 from crane.samples import Array
-from crane.timeseries import TIME, Table
+from crane.timeseries import TIME, Table, check_unit
 
 VELOCITY_UNITS = {"rad": "rad/s", "m": "m/s"}
 FORCE_UNITS = {"rad": "N m", "m": "N"}
 
-_VELOCITY, _FORCE = "_velocity", "_force"
+VELOCITY, FORCE = "_velocity", "_force"
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +97,10 @@ class Recording:
         for name in names:
             if names.count(name) > 1:
                 raise RecordingError(f"column '{name}' is there twice, rename or remove one")
-        if _find_joints(names) != self.joints:
+        if _some_joints(names) != self.joints:
             raise RecordingError(
                 f"channels {_listed(self.channels)} hold an active joint, "
-                f"rename those that end in {_VELOCITY} and {_FORCE}"
+                f"rename those that end in {VELOCITY} and {FORCE}"
             )
         units = self._units()
         for name, unit in units.items():
@@ -110,12 +113,7 @@ class Recording:
     def _check_values(self) -> None:
         if not len(self.time):
             raise RecordingError("no samples, give at least one")
-        for name, values in zip(self._names(), self._values().T, strict=True):
-            if not np.isfinite(values).all():
-                sample = int(np.argmin(np.isfinite(values)))
-                raise RecordingError(
-                    f"'{name}' is {values[sample]} at sample {sample}, give finite numbers"
-                )
+        check_finite(self.columns())
         if (back := np.diff(self.time) <= 0).any():
             sample = int(np.argmax(back)) + 1
             before, now = self.time[sample - 1 : sample + 1]
@@ -126,7 +124,7 @@ class Recording:
 
     def _names(self) -> list[str]:
         """Names of all columns, in the order in which they are written."""
-        joints = [x + suffix for suffix in ("", _VELOCITY, _FORCE) for x in self.joints]
+        joints = [x + suffix for suffix in ("", VELOCITY, FORCE) for x in self.joints]
         return [TIME, *joints, *self.channels]
 
     def _units(self) -> dict[str, str]:
@@ -136,14 +134,18 @@ class Recording:
             RecordingError: A joint has a unit other than rad or m.
         """
         for joint, unit in self.units.items():
-            _check_unit(joint, unit, VELOCITY_UNITS)
+            check_unit(joint, unit, VELOCITY_UNITS)
         return (
             {TIME: "s"}
             | self.units
-            | {x + _VELOCITY: VELOCITY_UNITS[unit] for x, unit in self.units.items()}
-            | {x + _FORCE: FORCE_UNITS[unit] for x, unit in self.units.items()}
+            | {x + VELOCITY: VELOCITY_UNITS[unit] for x, unit in self.units.items()}
+            | {x + FORCE: FORCE_UNITS[unit] for x, unit in self.units.items()}
             | self.channel_units
         )
+
+    def columns(self) -> dict[str, Array]:
+        """All columns (N,) by name, as they are written."""
+        return dict(zip(self._names(), self._values().T, strict=True))
 
     def _values(self) -> Array:
         """All columns (N, 1 + 3 n + channels)."""
@@ -166,11 +168,7 @@ class Recording:
             RecordingError: The file does not exist or is not such a CSV; the message names the
                 file, the line or column, and what to change.
         """
-        table = timeseries.read(path)
-        try:
-            return cls._from_table(table)
-        except RecordingError as error:
-            raise RecordingError(f"{path}: {error}") from None
+        return cls.from_table(timeseries.read_csv(path), path)
 
     @classmethod
     def read(cls, path: str | Path) -> "Recording":
@@ -179,36 +177,36 @@ class Recording:
         Raises:
             RecordingError: As `from_csv`, or the suffix is another one.
         """
-        path = Path(path)
-        if path.suffix.lower() == ".csv":
-            return cls.from_csv(path)
-        if path.suffix.lower() != ".npz":
-            missing = "" if path.exists() else "no such file, "
-            raise RecordingError(f"{path}: {missing}a recording is a .csv or .npz file, name one")
+        return cls.from_table(timeseries.read(path), path)
+
+    @classmethod
+    def from_table(cls, table: Table, path: str | Path) -> "Recording":
+        """The recording in a table that was read from a path.
+
+        Raises:
+            RecordingError: A column is missing, in a wrong unit, or not a recording's.
+        """
         try:
-            return cls._from_table(timeseries.read_npz(path))
+            return cls._from_table(table)
         except RecordingError as error:
-            text = str(error)
-            raise RecordingError(
-                text if text.startswith(str(path)) else f"{path}: {text}"
-            ) from None
+            raise RecordingError(f"{path}: {error}") from None
 
     @classmethod
     def _from_table(cls, table: Table) -> "Recording":
         units, column = table.units, dict(zip(table.units, table.values.T, strict=True))
-        joints = _find_joints(list(units))
+        joints = _some_joints(list(units))
         for joint in joints:
-            _check_unit(joint, unit := units[joint], VELOCITY_UNITS)
-            if joint + _VELOCITY in units:
-                _check_unit(joint + _VELOCITY, units[joint + _VELOCITY], [VELOCITY_UNITS[unit]])
+            check_unit(joint, unit := units[joint], VELOCITY_UNITS)
+            if joint + VELOCITY in units:
+                check_unit(joint + VELOCITY, units[joint + VELOCITY], [VELOCITY_UNITS[unit]])
             else:
-                column[joint + _VELOCITY] = _derivative(column[joint], column[TIME])
-            _check_unit(joint + _FORCE, units[joint + _FORCE], [FORCE_UNITS[unit]])
+                column[joint + VELOCITY] = derivative(column[joint], column[TIME])
+            check_unit(joint + FORCE, units[joint + FORCE], [FORCE_UNITS[unit]])
         q, v, tau = (
             np.column_stack([column[x + suffix] for x in joints])
-            for suffix in ("", _VELOCITY, _FORCE)
+            for suffix in ("", VELOCITY, FORCE)
         )
-        used = {TIME} | {x + suffix for x in joints for suffix in ("", _VELOCITY, _FORCE)}
+        used = {TIME} | {x + suffix for x in joints for suffix in ("", VELOCITY, FORCE)}
         channels = {x: values for x, values in column.items() if x not in used}
         return cls(
             time=column[TIME],
@@ -224,11 +222,25 @@ class Recording:
         )
 
 
-def _derivative(x: Array, time: Array) -> Array:
-    """Central differences; zero where time does not tell (it is refused later)."""
+def derivative(x: Array, time: Array) -> Array:
+    """Central differences (N,) of x (N,); zero where time does not tell (it is refused later)."""
     if len(x) < 2 or not (np.diff(time) > 0).all():
         return np.zeros_like(x)
     return np.asarray(np.gradient(x, time))
+
+
+def check_finite(columns: Mapping[str, Array]) -> None:
+    """See that columns (N,) hold finite numbers.
+
+    Raises:
+        RecordingError: One does not.
+    """
+    for name, values in columns.items():
+        if not np.isfinite(values).all():
+            sample = int(np.argmin(np.isfinite(values)))
+            raise RecordingError(
+                f"'{name}' is {values[sample]} at sample {sample}, give finite numbers"
+            )
 
 
 def _array(
@@ -249,33 +261,27 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join(f"'{name}'" for name in names) or "none"
 
 
-def _find_joints(names: Sequence[str]) -> tuple[str, ...]:
-    """The active joints among the columns, by the rule in the module's docstring."""
-    stems = dict.fromkeys(names)
-    for suffix in (_VELOCITY, _FORCE):
-        stems |= dict.fromkeys(x.removesuffix(suffix) for x in names if x.endswith(suffix))
-    joints = []
-    for stem in stems:
-        parts = (stem, stem + _VELOCITY, stem + _FORCE)
-        missing = [part for part in parts if part not in names]
-        if not missing or missing == [stem + _VELOCITY]:
-            joints.append(stem)
-        elif len(missing) == 1:
-            there = _listed(part for part in parts if part in names)
+def find_joints(names: Sequence[str]) -> tuple[str, ...]:
+    """The active joints among columns, by the rule in the module's docstring.
+
+    Raises:
+        RecordingError: There are velocity and force of a joint without its displacement.
+    """
+    there = set(names)
+    for stem in (x.removesuffix(FORCE) for x in names if x.endswith(FORCE)):
+        if stem not in there and stem + VELOCITY in there:
             raise RecordingError(
-                f"column '{missing[0]}' is missing beside {there}, "
+                f"column '{stem}' is missing beside '{stem}{VELOCITY}', '{stem}{FORCE}', "
                 f"add it, or rename those if '{stem}' is not an active joint"
             )
+    return tuple(x for x in names if x + FORCE in there)
+
+
+def _some_joints(names: Sequence[str]) -> tuple[str, ...]:
+    joints = find_joints(names)
     if not joints:
         raise RecordingError(
             f"no active joint among the columns {_listed(names)}, give for each joint "
-            f"its displacement, force and perhaps velocity, as in q1, q1{_FORCE}, q1{_VELOCITY}"
+            f"its displacement, force and perhaps velocity, as in q1, q1{FORCE}, q1{VELOCITY}"
         )
-    return tuple(joints)
-
-
-def _check_unit(column: str, unit: str, allowed: Iterable[str]) -> None:
-    if unit not in allowed:
-        found = f"is in [{unit}]" if unit else "has no unit"
-        wanted = " or ".join(f"'{column} [{x}]'" for x in allowed)
-        raise RecordingError(f"column '{column}' {found}, give {wanted}")
+    return joints

@@ -4,11 +4,14 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from crane import output
-from crane.errors import CraneWarning, InputError, OutputError, RecordingError
-from crane.machine import Machine
+from crane import output, timeseries
+from crane.description.sources import find
+from crane.errors import CraneWarning, DescriptionError, InputError, OutputError, RecordingError
+from crane.machine import Machine, recalled
+from crane.measured import is_measured, read_measured
 from crane.output import staging
 from crane.recording import Recording
+from crane.replay import Comparison
 from crane.studies.table import Study
 from crane.summary import summarize
 
@@ -16,6 +19,7 @@ if TYPE_CHECKING:
     from crane.identification.result import Identification
 
 RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
+COMPARISON = "comparison.md"
 
 
 def check_folder(folder: Path, force: bool) -> None:
@@ -64,6 +68,28 @@ def write_run(folder: Path, recording: Recording, title: str) -> str:
         (part / SUMMARY).write_text(text, encoding="utf-8")
         for name in (FIGURE, PAGE):
             (folder / name).unlink(missing_ok=True)
+    return text
+
+
+def write_comparison(
+    folder: Path, recording: Recording, comparison: Comparison, title: str
+) -> str:
+    """Write a replay into a folder: its recording, and how it compares with what was measured.
+
+    Returns:
+        The comparison, Markdown.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.comparison_plots import plot_comparison
+
+    write_run(folder, recording, title)
+    text = f"# {title}\n\n{comparison.to_markdown()}"
+    with staging(folder) as part:
+        (part / COMPARISON).write_text(text, encoding="utf-8")
+        if comparison.channels:
+            plot_comparison(comparison, part / "comparison.png")
     return text
 
 
@@ -117,14 +143,48 @@ def write_identification(
             warnings.warn(text, CraneWarning, stacklevel=2)
 
 
-def read_run(path: Path) -> Recording:
-    """The recording of a run's folder or of a CSV file.
+def read_run(path: Path, machine: Machine | None = None) -> Recording:
+    """The recording of a run's folder or of a CSV or npz file.
+
+    Args:
+        path: Folder or file.
+        machine: What was recorded. Coordinates and forces that the file does not have are
+            computed with it, see `crane.measured`; where no machine is given, with the one that
+            the file names, if it has pressures or angles instead of forces.
 
     Raises:
-        RecordingError: There is none, or it is malformed.
+        RecordingError: There is none, it is malformed, or it does not tell enough.
+        DescriptionError: The machine that the file names is not found.
     """
     if path.is_dir():
         if not (path / RECORDING).is_file():
             raise RecordingError(f"{path}: no {RECORDING} in this folder, give a run's folder")
         path = path / RECORDING
-    return Recording.read(path)
+    if machine is not None:
+        return read_measured(machine, path)
+    table = timeseries.read(path)
+    named = table.notes.get("machine", "")
+    if named and is_measured(table):
+        return read_measured(machine_of(path, named), path)
+    return Recording.from_table(table, path)
+
+
+def machine_of(path: str | Path, named: str) -> Machine:
+    """The machine that a recording names.
+
+    Raises:
+        InputError: It names none.
+        DescriptionError: It is not found, or cannot be read.
+    """
+    if not named:
+        raise InputError(
+            f"{path}: does not name its machine, add --machine, or write '# machine: NAME' above "
+            "its header row"
+        )
+    try:
+        find(named.split(" --")[0])
+    except DescriptionError as error:
+        raise DescriptionError(
+            f"{path}: its machine is not found ({error}); add --machine to say where it is"
+        ) from None
+    return recalled(named)

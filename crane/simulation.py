@@ -6,10 +6,26 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.control import Controller, Feedback, Free, TracedController
+from crane.control import (
+    Command,
+    Controller,
+    Feedback,
+    Free,
+    Signals,
+    StiffController,
+    TracedController,
+    ValveDrive,
+)
 from crane.dynamics import Dynamics
-from crane.errors import CraneWarning, InputError, known
-from crane.integration import ADAPTIVE, CompiledStepper, PythonStepper, integrate_adaptively
+from crane.errors import ClosureError, CraneWarning, InputError, SimulationError, known
+from crane.hydraulics.circuit import BALANCES
+from crane.integration import (
+    ADAPTIVE,
+    CompiledStepper,
+    PythonStepper,
+    StiffStepper,
+    integrate_adaptively,
+)
 from crane.kinematics import Kinematics
 from crane.machine import Machine
 from crane.paths import Path
@@ -29,14 +45,14 @@ Progress = Callable[[float], None]
 
 def simulate(
     machine: Machine,
-    controller: Controller | Force | None = None,
+    controller: Controller | Command | Force | None = None,
     initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
     duration: float | None = None,
     step: float = 1e-3,
     *,
     task: str = "",
     path: str = "compiled",
-    method: str = "rk4",
+    method: str | None = None,
     formulation: str = "exact",
     progress: Progress | None = None,
 ) -> Recording:
@@ -50,15 +66,19 @@ def simulate(
 
     Args:
         machine: The machine.
-        controller: A controller, a function (t, q_a, v_a) -> tau_a, or None for no force.
+        controller: A controller, a function (t, q_a, v_a) -> tau_a, or what commands the valves
+            of a hydraulic machine (`ValvePD`, `joystick`, `Signals`, `Sampled`). None is no
+            force, and valves at their neutral signal where the machine has any.
         initial: Active coordinates (n,) to start at rest from, or a pair (q_a, v_a); the start of
             the controller's path, at rest, or else the home posture.
         duration: [s]; that of the controller's path if not given.
         step: [s].
         task: Name to put into the recording.
         path: "compiled" or "pinocchio", see `Dynamics`.
-        method: "rk4", or one of scipy's adaptive methods ("DOP853", "Radau", "LSODA", ...) with
-            relative tolerance 1e-9, whose dense output is recorded every `step`.
+        method: "rk4"; "rosenbrock" for hydraulic machines, see `StiffStepper`; or one of scipy's
+            adaptive methods ("DOP853", "Radau", "LSODA", ...) with relative tolerance 1e-9, whose
+            dense output is recorded every `step`. If not given, the one that the controller asks
+            for.
         formulation: "exact" or "decoupled", see `Dynamics`.
         progress: Called with the finished share, 0 to 1.
 
@@ -79,19 +99,20 @@ def simulate(
     dynamics = Dynamics(machine, formulation, path)
     _, states, seen = trajectory(dynamics, control, initial, duration, step, method, progress)
     # the energies are integrated with the motion, so they tell when the step is too long
-    text = imbalance(states[:, -2], seen[:, -2:], states[:, -1], step)
+    n = len(machine.active)
+    text = imbalance(states[:, -2], seen[:, 2 * n : 2 * n + 2], states[:, -1], step)
     if text and formulation == "exact":
         warnings.warn(text, CraneWarning, stacklevel=2)
-    return _recording(machine, control.path, step, states, seen, task)
+    return _recording(machine, control, step, states, seen, task)
 
 
 def trajectory(
     dynamics: Dynamics,
-    controller: Controller | Force | None,
+    controller: Controller | Command | Force | None,
     initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None,
     duration: float | None,
     step: float,
-    method: str = "rk4",
+    method: str | None = None,
     progress: Progress | None = None,
 ) -> tuple[Array, Array, Array]:
     """What `simulate` computes, without channels; see there for arguments and errors.
@@ -111,7 +132,11 @@ def trajectory(
     state = np.concatenate(
         [machine.closure.solve(q_a), v_a, control.start(q_a), np.zeros(_ENERGIES)]
     )
-    if method == "rk4":
+    if method is None:
+        method = "rosenbrock" if isinstance(control, StiffController) else "rk4"
+    if method == "rosenbrock" and isinstance(control, StiffController):
+        rows = _integrate_stiff(dynamics, control, state, steps, step, progress)
+    elif method == "rk4":
         rows = _integrate(dynamics, control, state, steps, step, progress)
     elif method in ADAPTIVE:
         rows = integrate_adaptively(dynamics, control, state, steps, step, method, progress)
@@ -132,10 +157,15 @@ def _integrate(
     """States and observations [tau, friction, kinetic, potential] at all instants."""
     n = len(dynamics.machine.active)
     size, times = len(state), step * np.arange(steps + 1, dtype=np.float64)
-    rows = np.empty((steps + 1, size + 2 * n + _ENERGIES))
+    width = 2 * n + _ENERGIES + len(getattr(control, "channels", ()))
+    rows = np.empty((steps + 1, size + width))
     slow = PythonStepper(dynamics, control)
     fast = None
-    if dynamics.path == "compiled" and isinstance(control, TracedController):
+    if (
+        dynamics.path == "compiled"
+        and isinstance(control, TracedController)
+        and not isinstance(control, StiffController)
+    ):
         try:
             own = size - dynamics.machine.model.nq - n - _ENERGIES
             fast = CompiledStepper(dynamics, control, own)
@@ -163,11 +193,75 @@ def _integrate(
     return rows
 
 
-def _as_controller(controller: Controller | Force | None, machine: Machine) -> Controller:
+def _integrate_stiff(
+    dynamics: Dynamics,
+    control: StiffController,
+    state: Array,
+    steps: int,
+    step: float,
+    progress: Progress | None,
+) -> Array:
+    """As `_integrate`, for a controller whose own states are stiff."""
+    period = round(control.period / step) if control.period else 0
+    if control.period and abs(period * step - control.period) > 1e-9 * control.period:
+        raise InputError(
+            f"the period {control.period:g} s of the valves' program is no whole number of steps "
+            f"of {step:g} s, change one"
+        )
+    if dynamics.path != "compiled":
+        if period:
+            raise InputError("a program with a period runs on the compiled path alone")
+        return integrate_adaptively(dynamics, control, state, steps, step, "BDF", progress)
+    fast = StiffStepper(dynamics, control)
+    times = step * np.arange(steps + 1, dtype=np.float64)
+    rows = np.empty((steps + 1, len(state) + fast.seen))
+    nq, n = dynamics.machine.model.nq, len(dynamics.machine.active)
+    done = 0
+    while done < steps:
+        if period:
+            control.update(times[done], state[:nq], state[nq : nq + n], state[nq + n : -2])
+        chunk = times[done : min(done + (period or _CHUNK), steps)]
+        count = fast.run(chunk, state, step, rows[done:])
+        if count < len(chunk):
+            raise _stopped(dynamics, times[done + count], state)
+        done += count
+        if progress is not None:
+            progress(done / (steps + 1))
+    slow = PythonStepper(dynamics, control)
+    rows[steps] = [*state, *slow.observe(times[steps], state)[1]]
+    if progress is not None:
+        progress(1.0)
+    return rows
+
+
+def _stopped(dynamics: Dynamics, time: float, state: Array) -> SimulationError:
+    """Why the machine cannot go on from a state."""
+    machine = dynamics.machine
+    nq, n = machine.model.nq, len(machine.active)
+    speed = np.abs(state[nq : nq + n]).max()
+    # as far as it would have come
+    q = state[:nq][machine.closure.active] + 1e-3 * state[nq : nq + n]
+    try:
+        machine.closure.solve(q, guess=state[:nq])
+    except ClosureError as error:
+        return SimulationError(f"at t = {time:.6g} s: {error}")
+    return SimulationError(
+        f"at t = {time:.6g} s the motion cannot be followed, the fastest joint moves at "
+        f"{speed:.3g} m/s or rad/s: give its end stops damping, or smooth the friction more"
+    )
+
+
+def _as_controller(
+    controller: Controller | Command | Force | None, machine: Machine
+) -> Controller:
     if not isinstance(machine, Machine):
         raise InputError(f"{machine!r} is not a machine, load it with crane.load")
     if controller is None:
+        if machine.hydraulics is not None:
+            return ValveDrive(machine, Signals(machine, [0.0], {}))
         return Free(machine)
+    if isinstance(controller, Command):
+        return ValveDrive(machine, controller)
     if hasattr(controller, "start"):
         return controller  # type: ignore[return-value]
     if not callable(controller) or isinstance(controller, type):
@@ -216,14 +310,15 @@ def _start(
 
 def _recording(
     machine: Machine,
-    path: Path | None,
+    control: Controller,
     step: float,
     states: Array,
     seen: Array,
     task: str,
 ) -> Recording:
-    n = len(machine.active)
-    forces, friction, energies = seen[:, :n], seen[:, n : 2 * n], seen[:, 2 * n :]
+    n, path = len(machine.active), control.path
+    forces, friction = seen[:, :n], seen[:, n : 2 * n]
+    energies, more = seen[:, 2 * n : 2 * n + _ENERGIES], seen[:, 2 * n + _ENERGIES :]
     time = step * np.arange(len(states), dtype=np.float64)
     nq = machine.model.nq
     postures, v_a = states[:, :nq], states[:, nq : nq + len(machine.active)]
@@ -258,6 +353,12 @@ def _recording(
     add("potential", energies[:, 1], "J")
     add("work", states[:, -2], "J")
     add("dissipated", states[:, -1], "J")
+    if isinstance(control, StiffController):
+        for (name, unit), values in zip(control.channels, more.T, strict=True):
+            add(name, values, unit)
+        integrals = states[:, -_ENERGIES - len(BALANCES) : -_ENERGIES]
+        for (name, unit), values in zip(BALANCES.items(), integrals.T, strict=True):
+            add(name, values, unit)
     return Recording(
         time=time,
         joints=machine.active,
@@ -267,7 +368,7 @@ def _recording(
         units={joint: machine.unit(joint) for joint in machine.active},
         channels=channels,
         channel_units=units,
-        machine=machine.reference,
+        machine=machine.call,
         task=task,
     )
 
@@ -297,7 +398,8 @@ def imbalance(work: Array, energies: Array, dissipated: Array, step: float) -> s
     change = (energies - energies[0]).sum(axis=1)
     gap = float(np.abs(work - change - dissipated).max())
     throughput = float(max(np.ptp(part) for part in (work, dissipated, *energies.T)))
-    if gap <= _IMBALANCE * throughput:
+    rounding = 1e-12 * float(np.abs(energies).max())
+    if gap <= _IMBALANCE * throughput + rounding:
         return ""
     return (
         f"work, energy and dissipation differ by {gap:.2g} J of {throughput:.2g} J, so the "

@@ -1,16 +1,18 @@
 """Time series as a CSV: a table of columns with names and units, the first of them time.
 
 Comment lines `# key: value`, then one header row `time [s],name [unit],...`, then one row per
-sample. A unit may be left out, for all columns but time. Numbers are written with the fewest
-digits that give the same float64 again.
+sample. A unit may be left out, for all columns but time. What is read is in SI units: columns in
+bar, deg, mm and others of `_TO_SI` are converted, those in units that are not there stay as they
+are. Numbers are written with the fewest digits that give the same float64 again.
 """
 
 import csv
 import io
+import math
 import re
 import warnings
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +27,24 @@ _WORD = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
 _HEADING = re.compile(r"\s*([^\[\]]*?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*")
 _ROWS_AT_ONCE = 4096
 
+# unit: (SI unit, a, b) with x a / b in SI units; two factors, so that 12.3 mm is 0.0123 m exactly
+_TO_SI = {
+    "ms": ("s", 1.0, 1e3),
+    "deg": ("rad", math.pi, 180.0),
+    "deg/s": ("rad/s", math.pi, 180.0),
+    "mm": ("m", 1.0, 1e3),
+    "cm": ("m", 1.0, 1e2),
+    "mm/s": ("m/s", 1.0, 1e3),
+    "cm/s": ("m/s", 1.0, 1e2),
+    "kN": ("N", 1e3, 1.0),
+    "kN m": ("N m", 1e3, 1.0),
+    "kPa": ("Pa", 1e3, 1.0),
+    "MPa": ("Pa", 1e6, 1.0),
+    "bar": ("Pa", 1e5, 1.0),
+    "l/min": ("m3/s", 1.0, 6e4),
+    "mV": ("V", 1.0, 1e3),
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Table:
@@ -32,6 +52,7 @@ class Table:
 
     Attributes:
         units: Unit of each column by its name, in the order of the columns; "" where not given.
+            SI units in a table that was read, unless a unit is none of those that are converted.
         values: Samples (N, columns).
         notes: Comment lines by their key.
     """
@@ -56,6 +77,11 @@ def check_column(name: str, unit: str) -> None:
             )
 
 
+def spellings(unit: str) -> list[str]:
+    """An SI unit and the units of a file that are converted to it."""
+    return [unit, *(other for other, (si, _, _) in _TO_SI.items() if si == unit)]
+
+
 def write(path: str | Path, table: Table) -> None:
     """Write a table, whole or not at all.
 
@@ -72,6 +98,21 @@ def write(path: str | Path, table: Table) -> None:
 
 
 def read(path: str | Path) -> Table:
+    """Read a table from a CSV or npz file, by its suffix.
+
+    Raises:
+        RecordingError: As `read_csv` and `read_npz`, or the suffix is another one.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".csv":
+        return read_csv(path)
+    if path.suffix.lower() != ".npz":
+        missing = "" if path.exists() else "no such file, "
+        raise RecordingError(f"{path}: {missing}a recording is a .csv or .npz file, name one")
+    return read_npz(path)
+
+
+def read_csv(path: str | Path) -> Table:
     """Read a table: columns named once, finite numbers, time strictly increasing.
 
     Raises:
@@ -82,7 +123,7 @@ def read(path: str | Path) -> Table:
     try:
         notes, heading, line = _head(path)
         units = _units(heading)
-        return Table(units, _values(path, line, list(units)), notes)
+        return _in_si(Table(units, _values(path, line, units), notes))
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
     except UnicodeDecodeError:
@@ -119,7 +160,17 @@ def read_npz(path: Path) -> Table:
         units = _units(heading.getvalue().rstrip())
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
-    return Table(units, np.column_stack(list(columns.values())).astype(np.float64), {})
+    return _in_si(Table(units, np.column_stack(list(columns.values())).astype(np.float64), {}))
+
+
+def _in_si(table: Table) -> Table:
+    units, values = dict(table.units), table.values
+    for i, (name, unit) in enumerate(table.units.items()):
+        if unit in _TO_SI:
+            units[name], a, b = _TO_SI[unit]
+            with np.errstate(over="ignore"):  # infinite values are refused with their name
+                values[:, i] = values[:, i] * a / b
+    return Table(units, values, table.notes)
 
 
 def _head(path: Path) -> tuple[dict[str, str], str, int]:
@@ -159,13 +210,23 @@ def _units(heading: str) -> dict[str, str]:
         units[name] = unit
     if TIME not in units:
         raise RecordingError(f"no column '{TIME}' in the header, add '{TIME} [s]'")
-    if units[TIME] != "s":
-        found = f"is in [{units[TIME]}]" if units[TIME] else "has no unit"
-        raise RecordingError(f"column '{TIME}' {found}, give '{TIME} [s]'")
+    check_unit(TIME, units[TIME], spellings("s"))
     return units
 
 
-def _values(path: Path, header: int, names: Sequence[str]) -> Array:
+def check_unit(column: str, unit: str, allowed: Iterable[str]) -> None:
+    """See that a column is in one of some units.
+
+    Raises:
+        RecordingError: It is not.
+    """
+    if unit not in allowed:
+        found = f"is in [{unit}]" if unit else "has no unit"
+        wanted = " or ".join(f"'{column} [{x}]'" for x in allowed)
+        raise RecordingError(f"column '{column}' {found}, give {wanted}")
+
+
+def _values(path: Path, header: int, units: Mapping[str, str]) -> Array:
     """Numbers (N, columns) below the header row, which is line `header`."""
     try:
         with warnings.catch_warnings():
@@ -174,16 +235,16 @@ def _values(path: Path, header: int, names: Sequence[str]) -> Array:
                 path, delimiter=",", comments=None, skiprows=header, ndmin=2, encoding="utf-8"
             )
     except ValueError as error:
-        _find_fault(path, header, names)
+        _find_fault(path, header, units)
         raise RecordingError(f"{error}, correct the file") from None
     if not values.size:
         raise RecordingError("has a header and no samples, write one row per sample")
     if (
-        values.shape[1] != len(names)
+        values.shape[1] != len(units)
         or not np.isfinite(values).all()
-        or (np.diff(values[:, names.index(TIME)]) <= 0).any()
+        or (np.diff(values[:, list(units).index(TIME)]) <= 0).any()
     ):
-        _find_fault(path, header, names)
+        _find_fault(path, header, units)
     return values
 
 
@@ -194,9 +255,9 @@ def _number(cell: str) -> float | None:
         return None
 
 
-def _find_fault(path: Path, header: int, names: Sequence[str]) -> None:
+def _find_fault(path: Path, header: int, units: Mapping[str, str]) -> None:
     """Raise an error about the first line that is wrong."""
-    last = -np.inf
+    names, last = list(units), -np.inf
     with path.open(encoding="utf-8-sig") as file:
         for line, text in enumerate(file, start=1):
             if line <= header or not text.strip():
@@ -216,7 +277,7 @@ def _find_fault(path: Path, header: int, names: Sequence[str]) -> None:
             now = float(cells[names.index(TIME)])
             if now <= last:
                 raise RecordingError(
-                    f"line {line}: time goes from {last} to {now} s, "
+                    f"line {line}: time goes from {last} to {now} {units[TIME]}, "
                     f"give strictly increasing times"
                 )
             last = now

@@ -3,6 +3,7 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from broken import DATA
 
 import crane
 from crane.description import parameters, read
@@ -37,6 +38,28 @@ def test_a_payload_is_that_of_the_machine(mini):
     v_a, a_a = np.array([0.3, 0.01, 0.02]), np.array([1.0, 0.1, 0.1])
     one, two = (crane.Dynamics(m).inverse(POSE, v_a, a_a) for m in (loaded, wanted))
     assert np.abs(one - two).max() < 1e-13 * np.abs(two).max()
+
+
+def test_a_load_of_the_machine_file_is_scaled_to_the_mass(edited):
+    """Two bodies of 1 and 3 kg as one of 2 kg: half of both, by Huygens and Steiner."""
+    line = "tip: coupler_pin"
+    bare = edited("four_bar.yaml", line, f"{line}\npayload: {{urdf: {DATA}/four_bar/load.urdf}}")
+    nothing = crane.load(bare.path, {"payload.mass": 0.0})
+    loaded = crane.load(bare.path, {"payload.mass": 2.0})
+    assert [c.name for c in loaded.chains] == ["crank", "rocker", "payload"]
+    assert [c.name for c in nothing.chains] == ["crank", "rocker"] and loaded.tip == bare.tip
+    one, two = np.array([0.01, 0, 0]), np.array([0.0, -0.1 + 0.02, 0])
+    com = (0.5 * one + 1.5 * two) / 2
+    tensor = np.diag([0.5e-3 + 2e-3, 1e-3 + 1.5e-3, 1e-3 + 2.5e-3])  # the box turned by 90 deg
+    for mass, at in ((0.5, one), (1.5, two)):
+        d = at - com
+        tensor += mass * (d @ d * np.eye(3) - np.outer(d, d))
+    wanted = bare.with_payload(crane.Payload("coupler_pin", 2.0, tuple(com), tensor))
+    q = np.array([[1.2], [1.3], [1.0]])
+    found, other = (crane.Dynamics(m).inverse(q, 1 + q, 2 * q) for m in (loaded, wanted))
+    assert np.abs(found - other).max() < 1e-12 * np.abs(other).max()
+    same, empty = (crane.Dynamics(m).mass_matrix(q) for m in (bare, nothing))
+    assert np.array_equal(same, empty)
 
 
 def test_a_mass_changes_the_weight_by_its_own(mini):

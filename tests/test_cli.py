@@ -215,7 +215,10 @@ def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
     ("arguments", "text"),
     [
         (["fly"], "No such command 'fly'"),
-        (["info", "zzzzzz"], "known: kr300, mini_forwarder, tx40; crane list shows all names"),
+        (
+            ["info", "zzzzzz"],
+            "known: kr300, mini_forwarder, patu655, tx40; crane list shows all names",
+        ),
         (["demo", "--out", ""], "the name after --out is empty"),
         (["demo", "--out", "/dev/null"], "/dev/null: is a file"),
         (["view", "ur5_robot", "--no-open", "--out", "page.png"], "end the name in .html"),

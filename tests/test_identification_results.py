@@ -8,6 +8,7 @@ import warnings
 
 import numpy as np
 import pytest
+from broken import DATA
 from lxml import etree
 from scipy.interpolate import CubicSpline
 
@@ -172,6 +173,22 @@ def test_one_urdf_with_a_loop_becomes_a_machine_file(tmp_path):
     having = {link.get("name") for link in robot.iter("link") if link.find("inertial") is not None}
     assert having == {"base", "beam", "rocker", "rod"}
     assert robot.find("link[@name='tool']/visual") is not None
+
+
+def test_the_load_that_a_machine_names_comes_along(edited, tmp_path):
+    line = "tip: coupler_pin"
+    load = DATA / "four_bar" / "load.urdf"
+    machine = edited("four_bar.yaml", line, f"{line}\npayload: {{urdf: {load}}}")
+    time = np.arange(0, 20, 0.01)[:, None]
+    q, v, a = 1.2 + 0.3 * np.sin(time), 0.3 * np.cos(time), -0.3 * np.sin(time)
+    tau = crane.Dynamics(machine).inverse(q, v, a, friction=True)
+    given = Motion(time[:, 0], q, v, a, tau + 0.1 * np.random.default_rng(0).normal(size=q.shape))
+    result = identify(machine, given, prior=0.3, feasible=True)
+    file = write_machine(result, tmp_path / "out")
+    assert (file.parent / "load.urdf").read_bytes() == load.read_bytes()
+    written, loaded = (crane.load(file, {"payload.mass": mass}) for mass in (0.0, 3.0))
+    total = [sum(inertia.mass for inertia in m.model.inertias[1:]) for m in (written, loaded)]
+    assert total[1] - total[0] == pytest.approx(3.0, rel=1e-12)
 
 
 def test_what_cannot_be_written(mini, found, tmp_path):

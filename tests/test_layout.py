@@ -8,8 +8,9 @@ PACKAGE = Path(__file__).parents[1] / "crane"
 # A module may import those before it. Within a room, modules may not form a circle either.
 ORDER = [
     "errors", "samples", "output", "timeseries", "straight", "description", "closure", "machine",
-    "dynamics", "kinematics", "paths", "control", "integration", "recording", "summary",
-    "simulation", "batch", "studies", "rig", "identification", "view", "runs", "demo", "cli",
+    "dynamics", "kinematics", "hydraulics", "paths", "control", "integration", "recording",
+    "measured", "summary", "simulation", "replay", "batch", "studies", "rig",
+    "identification", "view", "runs", "demo", "cli",
 ]  # fmt: skip
 
 

@@ -5,9 +5,20 @@ import dataclasses
 import numpy as np
 import pinocchio as pin
 import pytest
+from broken import MINI, copy_machine, swap
+from oracles import (
+    D_IN_2,
+    B,
+    C,
+    by_stroke,
+    mini_forwarder,
+    mini_forwarder_gamma,
+    mini_forwarder_potential,
+    turned,
+)
 
 import crane
-from crane.errors import InputError, LimitError
+from crane.errors import InputError, LimitError, MechanismError
 
 ELEVEN = {"q1", "q2", "q3", "q4", "X1", "q6", "q7", "q9", "q10", "X2", "q11"}
 
@@ -152,3 +163,119 @@ def test_endless_joints_have_infinite_limits(mini):
         column = mini.column(joint)
         limits = mini.model.lowerPositionLimit[column], mini.model.upperPositionLimit[column]
         assert np.isfinite(limits).all() == (joint in mini.active), joint
+
+
+class TestDrivenBy:
+    """The mini forwarder driven at its booms' angles instead of its strokes."""
+
+    @pytest.fixture
+    def strokes(self):
+        random = np.random.default_rng(5)
+        return random.uniform([-3.0, 0.001, 0.001], [3.0, 0.029, 0.029], (100, 3))
+
+    def test_postures_are_the_same(self, mini, strokes):
+        """Strokes from the angles that the closed form has at them."""
+        driven = mini.driven_by(["q1", "q2", "q3"])
+        assert driven.active == ("q1", "q2", "q3")
+        assert driven.joints == mini.joints and driven.reference == mini.reference
+        assert np.abs(driven.home - mini.home).max() < 1e-14
+        joints, _ = mini_forwarder(*strokes.T[1:])
+        q = driven.closure.solve(np.column_stack([strokes[:, 0], joints["q2"], joints["q3"]]))
+        columns = [mini.column(joint) for joint in mini.active]
+        assert np.abs(q[:, columns] - strokes).max() < 1e-13
+        assert np.array_equal(driven.lower, [-np.pi, -np.inf, -np.inf])
+        assert not driven.upper.flags.writeable
+
+    def test_rows_of_the_strokes_are_dx_dq(self, mini, strokes):
+        driven = mini.driven_by(["q1", "q2", "q3"])
+        gamma = driven.closure.gamma(mini.closure.solve(strokes))
+        slopes = mini_forwarder_gamma(*strokes.T[1:])  # dq/dx
+        expected = np.linalg.inv(np.stack([slopes["q2"], slopes["q3"]], axis=1))
+        rows = gamma[:, [mini.column("X1"), mini.column("X2")]]
+        assert np.abs(rows[:, :, 1:] - expected).max() < 1e-12 * np.abs(expected).max()
+        assert np.abs(rows[:, :, 0]).max() < 1e-14  # slewing moves no cylinder
+
+    def test_lever_of_a_cylinder_in_a_triangle(self, mini):
+        """B, C and the rod eye D, which turns with q9 about C: dX1/dq9 is the arm of D about C."""
+        driven = mini.driven_by(["q1", "q9", "q3"])
+        angle = driven.home[driven.column("q9")] + np.linspace(-0.4, 0.4, 41)
+        q3 = np.full_like(angle, driven.home[driven.column("q3")])
+        q = driven.closure.solve(np.column_stack([0 * angle, angle, q3]))
+        arm = turned(angle, D_IN_2)
+        way = C + arm - B
+        length = np.hypot(*way)
+        lever = (way[1] * arm[0] - way[0] * arm[1]) / length
+        assert np.abs(q[:, driven.column("X1")] - (length - 0.0825)).max() < 1e-14
+        assert np.abs(driven.closure.gamma(q)[:, driven.column("X1"), 1] - lever).max() < 1e-14
+
+    def test_torques_are_the_forces_times_dx_dq(self, mini, strokes):
+        """Equations (18), (19), in any motion; at rest also the slope of the potential."""
+        driven = mini.driven_by(["q1", "q2", "q3"])
+        random = np.random.default_rng(6)
+        v_a, a_a = random.uniform(-0.05, 0.05, (2, *strokes.shape))
+        q = mini.closure.solve(strokes)
+        to_b = mini.closure.gamma(q)
+        v = np.einsum("nij,nj->ni", to_b, v_a)
+        a = np.einsum("nij,nj->ni", to_b, a_a) + mini.closure.drift(q, v)
+        b = driven.closure.active
+        forces = crane.Dynamics(mini).inverse(strokes, v_a, a_a)
+        torques = crane.Dynamics(driven).inverse(q[:, b], v[:, b], a[:, b])
+        lever = driven.closure.gamma(q)[:, mini.closure.active]
+        expected = np.einsum("nij,ni->nj", lever, forces)
+        assert np.abs(torques - expected).max() < 1e-12 * np.abs(expected).max()
+        slope = by_stroke(mini_forwarder_potential, *strokes.T[1:])
+        at_rest = np.einsum("nij,in->nj", lever[:, 1:, 1:], slope)
+        held = crane.Dynamics(driven).gravity(q[:, b])
+        assert np.abs(held[:, 1:] - at_rest).max() < 1e-12 * np.abs(at_rest).max()
+
+    def test_what_belongs_to_the_old_joints_is_dropped(self, mini):
+        driven = mini.driven_by(("q1", "q2", "q3"))
+        assert driven.control == {} and set(driven.tasks) == set(mini.tasks)  # all of the tip
+        assert driven.friction == mini.friction and driven.end_stops == mini.end_stops
+        turned_round = mini.driven_by(["X2", "q1", "X1"])
+        assert turned_round.control == mini.control
+        assert np.array_equal(turned_round.lower, mini.lower[[2, 0, 1]])
+
+    def test_tasks_of_active_joints_are_dropped(self, edited):
+        machine = edited("four_bar.yaml")
+        assert set(machine.tasks) == {"swing", "reach"}
+        assert set(machine.driven_by(["crank"]).tasks) == {"swing", "reach"}
+        assert set(machine.driven_by(["rocker"]).tasks) == {"reach"}
+
+    def test_circuit_keeps_the_cylinders_that_still_drive(self, tmp_path):
+        path = copy_machine(MINI, tmp_path)
+        valve = "{type: compensated, flow: 1.0e-4, margin: 7.0e+5}"
+        cylinder = "{area_a: 3.0e-4, area_b: 2.0e-4, hose_a: 1.0e-5, hose_b: 1.0e-5}"
+        parts = ["cylinders", cylinder, "valves", valve]
+        swap(
+            "tip: link7_tip\n",
+            "tip: link7_tip\nhydraulics:\n  supply: {pressure: 2.0e+6}\n"
+            + "".join(
+                f"  {kind}: {{X1: {part}, X2: {part}}}\n"
+                for kind, part in zip(parts[::2], parts[1::2], strict=True)
+            ),
+            MINI,
+        ).apply(tmp_path)
+        with pytest.warns(crane.CraneWarning):
+            machine = crane.load(path)
+        assert machine.driven_by(["q1", "q2", "q3"]).hydraulics is None
+        assert machine.driven_by(["q1", "X2", "q2"]).hydraulics.joints == ("X2",)
+        circuit = machine.driven_by(["X2", "X1", "q1"]).hydraulics
+        assert list(circuit.cylinders) == list(circuit.valves) == ["X2", "X1"]
+        assert circuit.supply == machine.hydraulics.supply
+
+    @pytest.mark.parametrize(
+        ("names", "error", "text"),
+        [
+            (["q1", "q2", "q8"], InputError, "joint 'q8' is unknown, known: X1, X2, q1"),
+            (["q1", "q2", "q2"], InputError, "joint 'q2' is named twice"),
+            (["q1", "q2"], MechanismError, "2 active joints .q1, q2. for 3 degrees of freedom"),
+            (["q1", "q2", "q3", "X1"], MechanismError, "name only 3 of them"),
+            # q4 and q9 both follow from X1 alone
+            (["q1", "q4", "q9"], MechanismError, "the active joints q1, q4, q9 cannot drive"),
+            (["q2", "q3", "q9"], MechanismError, "cannot drive q1: choose others"),
+        ],
+    )
+    def test_joints_that_cannot_drive(self, mini, names, error, text):
+        with pytest.raises(error, match=text):
+            mini.driven_by(names)

@@ -3,6 +3,18 @@
 import pytest
 from broken import ROCKER, assert_refused, case, swap, whole
 
+LOAD = """<robot name="load"><link name="load"><inertial><mass value="2"/>
+  <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>
+"""
+
+LOOPED_LOAD = LOAD.replace(
+    "</robot>",
+    """<joint name="j" type="fixed"><parent link="load"/><child link="hook"/></joint>
+  <link name="hook"/>
+  <loop name="l" type="revolute"><predecessor link="load"/><successor link="hook"/>
+  </loop></robot>""",
+)
+
 # What is not YAML, or not the YAML of a machine.
 TEXT = [
     case("empty file", "four_bar.yaml: the file is empty, write a machine in it", whole("")),
@@ -129,8 +141,8 @@ TEXT = [
     case(
         "control characters in a key",
         "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, known: "
-        "active, chains, control, end_stops, forces, friction, gas_springs, home, loops, name, "
-        "source, tasks, tip",
+        "active, chains, control, end_stops, forces, friction, gas_springs, home, hydraulics, "
+        "loops, name, payload, source, tasks, tip",
         swap("tip: coupler_pin", '"tip\\n\\e[31m": coupler_pin'),
     ),
     case(
@@ -150,8 +162,8 @@ KEYS = [
     case(
         "unknown key far from all",
         "four_bar.yaml:29: unknown key 'gravity' in the machine file, known: "
-        "active, chains, control, end_stops, forces, friction, gas_springs, home, loops, name, "
-        "source, tasks, tip",
+        "active, chains, control, end_stops, forces, friction, gas_springs, home, hydraulics, "
+        "loops, name, payload, source, tasks, tip",
         swap("tip: coupler_pin", "gravity: 9.81"),
     ),
     case(
@@ -263,12 +275,13 @@ KEYS = [
     ),
     case(
         "task without motion",
-        "four_bar.yaml:37: task 'reach' has neither 'tip' nor 'active', give one",
+        "four_bar.yaml:37: task 'reach' has none of 'tip', 'active', 'joystick', give one",
         swap("    tip: {x: [0.4], y: [0.3, 0.01], z: [0]}\n", ""),
     ),
     case(
         "task with two motions",
-        "four_bar.yaml:37: task 'reach' has both 'tip' and 'active', keep one",
+        "four_bar.yaml:37: task 'reach' has more than one of 'tip', 'active', "
+        "'joystick', give one",
         swap(
             "    tip: {x: [0.4], y: [0.3, 0.01], z: [0]}\n",
             "    tip: {x: [0.4], y: [0.3, 0.01], z: [0]}\n    active: {crank: [1]}\n",
@@ -630,6 +643,45 @@ NAMES = [
         "tip fixed to the world",
         "four_bar.yaml:29: the tip frame 'rocker_base' does not move, choose another",
         swap("tip: coupler_pin", "tip: rocker_base"),
+    ),
+    case(
+        "payload without a tip",
+        "four_bar.yaml:29: a payload hangs on the tip, name its frame under 'tip:'",
+        swap("tip: coupler_pin", "payload: {urdf: load.urdf}"),
+        whole(LOAD, "load.urdf"),
+    ),
+    case(
+        "payload with a moving joint",
+        "rocker.urdf:3: joint 'rocker' moves, a payload is rigid: make it fixed",
+        swap("tip: coupler_pin", "tip: coupler_pin\npayload: {urdf: four_bar/rocker.urdf}"),
+    ),
+    case(
+        "payload without mass",
+        "four_bar.yaml:30: no link of load.urdf has a mass, give one an <inertial>",
+        swap("tip: coupler_pin", "tip: coupler_pin\npayload: {urdf: load.urdf}"),
+        whole('<robot name="load"><link name="load"/></robot>', "load.urdf"),
+    ),
+    case(
+        "payload with a name of the machine",
+        "load.urdf:1: link 'ground' is also in ground.urdf:2, rename one",
+        swap("tip: coupler_pin", "tip: coupler_pin\npayload: {urdf: load.urdf}"),
+        whole(LOAD.replace('link name="load"', 'link name="ground"'), "load.urdf"),
+    ),
+    case(
+        "payload without a file",
+        "four_bar.yaml:30: 'payload': there is no file 'lod.urdf', give its path from this folder",
+        swap("tip: coupler_pin", "tip: coupler_pin\npayload: {urdf: lod.urdf}"),
+    ),
+    case(
+        "payload with another key",
+        "four_bar.yaml:30: unknown key 'mass' in 'payload', known: urdf",
+        swap("tip: coupler_pin", "tip: coupler_pin\npayload: {urdf: lod.urdf, mass: 2}"),
+    ),
+    case(
+        "payload with a loop",
+        "load.urdf:4: a payload has no <loop>, remove it",
+        swap("tip: coupler_pin", "tip: coupler_pin\npayload: {urdf: load.urdf}"),
+        whole(LOOPED_LOAD, "load.urdf"),
     ),
     case(
         "control of a passive joint",

@@ -172,8 +172,8 @@ BROKEN = {
         "channels 'q2', 'q2_velocity', 'q2_force' hold an active joint, rename those",
     ),
     "channels like part of a joint": (
-        {"channels": dict.fromkeys(("q2", "q2_velocity"), [0, 1, 2]), "channel_units": {}},
-        "column 'q2_force' is missing beside 'q2', 'q2_velocity', add it, or rename",
+        {"channels": dict.fromkeys(("q2_force", "q2_velocity"), [0, 1, 2]), "channel_units": {}},
+        "column 'q2' is missing beside 'q2_velocity', 'q2_force', add it, or rename",
     ),
     "comma in a name": (
         {"channels": {"a,b": [0, 1, 2]}, "channel_units": {}},
@@ -230,6 +230,27 @@ def test_order_of_columns_is_free(tmp_path):
     assert (recording.machine, recording.task) == ("", "")
 
 
+def test_joints_that_are_not_active_are_channels(tmp_path):
+    """With their rates beside them, and written and read again as such."""
+    recording = from_text(tmp_path, f"{HEAD},q2 [rad],q2_velocity [rad/s]\n0,1,2,3,4,5\n")
+    assert recording.joints == ("q1",)
+    assert recording.channel_units == {"q2": "rad", "q2_velocity": "rad/s"}
+    recording.to_csv(tmp_path / "again.csv")
+    assert_equal(Recording.from_csv(tmp_path / "again.csv"), recording)
+
+
+def test_units_are_converted(tmp_path):
+    recording = from_text(
+        tmp_path,
+        "time [ms],q1 [deg],q1_velocity [deg/s],q1_force [kN m],pressure_q1_a [bar]\n"
+        "250,180,-90,2,66\n",
+    )
+    assert (recording.time, recording.q, recording.v) == (0.25, np.pi, -np.pi / 2)
+    assert recording.tau == 2000.0 and recording.units == {"q1": "rad"}
+    assert recording.channels["pressure_q1_a"] == 66e5
+    assert recording.channel_units == {"pressure_q1_a": "Pa"}
+
+
 def test_single_suffixed_columns_are_channels(tmp_path):
     recording = from_text(tmp_path, f"{HEAD},wind_force [N],flow_velocity [m/s]\n0,1,2,3,4,5\n")
     assert recording.joints == ("q1",)
@@ -239,16 +260,16 @@ def test_single_suffixed_columns_are_channels(tmp_path):
 BROKEN_FILES = {
     "no force": (
         "time [s],q1 [rad],q1_velocity [rad/s]\n0,1,2\n",
-        "column 'q1_force' is missing beside 'q1', 'q1_velocity'",
+        "no active joint among the columns 'time', 'q1', 'q1_velocity', give for each joint",
     ),
     "no displacement": (
         "time [s],q1_velocity [rad/s],q1_force [N m]\n0,1,2\n",
         "column 'q1' is missing beside 'q1_velocity', 'q1_force'",
     ),
     "no joint": ("time [s],q1 [rad]\n0,1\n", "no active joint among the columns 'time', 'q1'"),
-    "degrees": (
-        f"{HEAD}\n0,1,2,3\n".replace("[rad]", "[deg]"),
-        "column 'q1' is in [deg], give 'q1 [rad]' or 'q1 [m]'",
+    "gradians": (
+        f"{HEAD}\n0,1,2,3\n".replace("[rad]", "[gon]"),
+        "column 'q1' is in [gon], give 'q1 [rad]' or 'q1 [m]'",
     ),
     "no unit": (
         f"{HEAD}\n0,1,2,3\n".replace(" [rad]", ""),

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from crane.errors import RecordingError
-from crane.timeseries import Table, read, write
+from crane.timeseries import Table, read, read_csv, read_npz, spellings, write
 
 GOOD = "time [s],a [m],b\n0,1,2\n0.5,3,4\n"
 
@@ -57,8 +57,9 @@ BROKEN = {
     "no time": ("t [s],a [m]\n0,1\n", "no column 'time' in the header, add 'time [s]'"),
     "semicolons": ("time [s];a [m]\n0;1\n", "separates columns by ';', use commas"),
     "tabs": ("time [s]\ta [m]\n0\t1\n", r"separates columns by '\t', use commas"),
-    "time without unit": ("time,a\n0,1\n", "column 'time' has no unit, give 'time [s]'"),
-    "milliseconds": ("time [ms],a\n0,1\n", "column 'time' is in [ms], give 'time [s]'"),
+    "time without unit": ("time,a\n0,1\n", "column 'time' has no unit, give 'time [s]' or"),
+    "hours": ("time [h],a\n0,1\n", "column 'time' is in [h], give 'time [s]' or 'time [ms]'"),
+    "milliseconds stand": ("time [ms],a\n5,1\n5,1\n", "time goes from 5.0 to 5.0 ms, give"),
     "twice": ("time [s],a [m],a [m]\n0,1,1\n", "column 'a' is there twice, rename or remove one"),
     "nameless": ("time [s],,b\n0,1,2\n", "column 2 is headed '', write 'name [unit]'"),
     "brackets": ("time [s],a [m\n0,1\n", "column 2 is headed 'a [m', write 'name [unit]'"),
@@ -90,11 +91,13 @@ def test_broken_files(tmp_path, text, message):
 def test_missing_file(tmp_path):
     with pytest.raises(RecordingError, match="no such file or directory, give the path of a CSV"):
         read(tmp_path / "none.csv")
+    with pytest.raises(RecordingError, match="no such file, a recording is a .csv or .npz file"):
+        read(tmp_path / "none.txt")
 
 
 def test_folder(tmp_path):
     with pytest.raises(RecordingError, match="is a directory, give the path of a CSV file"):
-        read(tmp_path)
+        read_csv(tmp_path)
 
 
 @pytest.mark.parametrize("rows", [b"", b"time [s],a\n0,1\n"], ids=["at once", "below the header"])
@@ -128,3 +131,36 @@ def test_long_tables_are_written_whole(tmp_path):
     table = read(tmp_path / "table.csv")
     np.testing.assert_array_equal(table.values, values)
     assert table.notes == {"task": "count"}
+
+
+# what a file may declare, the SI unit, and a number with what it is in SI units
+CONVERTED = [
+    ("bar", "Pa", 123.4, 123.4e5), ("kPa", "Pa", 101.325, 101325.0), ("MPa", "Pa", 0.7, 0.7e6),
+    ("deg", "rad", 30.0, math.pi / 6), ("deg/s", "rad/s", -180.0, -math.pi),
+    ("mm", "m", 12.3, 0.0123), ("cm", "m", 4.1, 0.041), ("mm/s", "m/s", 14.1, 0.0141),
+    ("cm/s", "m/s", 1.41, 0.0141), ("kN", "N", 31.7, 31700.0), ("kN m", "N m", 8.5, 8500.0),
+    ("l/min", "m3/s", 60.0, 1e-3), ("mV", "V", 5800.0, 5.8), ("ms", "s", 40.0, 0.04),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("unit", "si", "number", "converted"), CONVERTED)
+def test_declared_units_become_si(tmp_path, unit, si, number, converted):
+    csv = read_text(tmp_path, f"time [s],a [{unit}],b\n0,{number},{number}\n")
+    np.savez(tmp_path / "table.npz", **{"time [s]": [0.0], f"a [{unit}]": [number], "b": [number]})
+    for table in (csv, read_npz(tmp_path / "table.npz")):
+        assert table.units == {"time": "s", "a": si, "b": ""}
+        assert table.values[0, 1] == pytest.approx(converted, rel=3e-16, abs=0)
+        assert table.values[0, 2] == number
+    assert unit in spellings(si)
+
+
+def test_other_units_stay(tmp_path):
+    table = read_text(tmp_path, "time [s],a [degC],b [Pa],c [Bar],d [1/s]\n0,20,1,2,3\n")
+    assert table.units == {"time": "s", "a": "degC", "b": "Pa", "c": "Bar", "d": "1/s"}
+    np.testing.assert_array_equal(table.values, [[0, 20, 1, 2, 3]])
+
+
+def test_time_in_milliseconds(tmp_path):
+    table = read_text(tmp_path, "a,time [ms]\n1,10\n2,30\n")
+    assert table.units == {"a": "", "time": "s"}
+    np.testing.assert_array_equal(table.values[:, 1], [0.01, 0.03])

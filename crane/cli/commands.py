@@ -18,11 +18,14 @@ from crane.cli.shared import (
     progress_bar,
     say,
 )
-from crane.errors import CraneWarning, DescriptionError, InputError
+from crane.errors import CraneWarning, InputError
 
 if TYPE_CHECKING:
     from crane.machine import Machine
-    from crane.recording import Recording
+
+RunMachine = Annotated[
+    str | None, typer.Option(metavar="MACHINE", help="The machine of a run, if not as recorded.")
+]
 
 
 @app.command("list")
@@ -67,71 +70,32 @@ def check(file: MachineName) -> None:
 
 
 @app.command()
-def simulate(
-    machine: MachineName,
-    out: Out,
-    task: Annotated[str | None, typer.Option(help="A task of the machine.")] = None,
-    controller: Annotated[
-        str | None, typer.Option(help="pi or computed-torque; pi if the machine has gains.")
-    ] = None,
-    duration: Annotated[
-        float | None, typer.Option(help="In seconds; that of the task if not given.")
-    ] = None,
-    step: Annotated[float, typer.Option(help="Step of the integration in seconds.")] = 1e-3,
-    force: Force = False,
-) -> None:
-    """Simulate a task, or without one the free motion from the home posture."""
-    from crane.control import controller as make_controller
-    from crane.paths import task_path
-    from crane.runs import check_folder, write_run
-    from crane.simulation import simulate as run
-
-    check_folder(out, force)
-    loaded = load(machine)
-    control = None
-    if task is not None:
-        name = controller or ("pi" if loaded.control else "computed-torque")
-        control = make_controller(name, loaded, task_path(loaded, task))
-    elif controller is not None:
-        raise InputError(f"controller '{controller}' has nothing to follow, name a --task")
-    elif duration is None:
-        tasks = ", ".join(loaded.tasks) or "none"
-        raise InputError(f"no task: name a --task ({tasks}), or a --duration to let it go")
-    with progress_bar("simulating") as progress:
-        recording = run(
-            loaded, control, duration=duration, step=step, task=task or "", progress=progress
-        )
-    title = f"{loaded.name}: {task or 'free motion'}"
-    print(write_run(out, recording, title), end="")
-    print(f"\nwritten to {out}; see it with: crane view {out}")
-
-
-@app.command()
 def view(
     what: Annotated[
         str, typer.Argument(metavar="WHAT", help="A machine, a run's folder, or a recording.")
     ],
-    machine: Annotated[
-        str | None,
-        typer.Option(metavar="MACHINE", help="The machine of a run, if not as recorded."),
-    ] = None,
+    machine: RunMachine = None,
     out: OutFile = None,
     no_open: NoOpen = False,
     force: Force = False,
 ) -> None:
     """Write a page that shows a machine or plays a run, and open it."""
     from crane.output import file_name
-    from crane.runs import PAGE, check_free
+    from crane.runs import PAGE, check_free, machine_of, read_run
     from crane.view.page import open_in_browser, write_page
 
-    folder, recording = _run_of(what)
-    if recording is not None:
-        loaded = _machine_of(recording, what, machine)
+    recording = None
+    if _is_run(what):
+        path = Path(what)
+        given = None if machine is None else load(machine)
+        recording = read_run(path, given)
+        loaded = given or machine_of(what, recording.machine)
+        page = out or (path if path.is_dir() else path.parent) / PAGE
     elif machine is None:
         loaded = load(what)
+        page = out or Path(file_name(loaded.name) + ".html")
     else:
         raise InputError(f"--machine is for runs, and '{what}' is none, leave it out")
-    page = out or (folder / PAGE if folder else Path(file_name(loaded.name) + ".html"))
     check_free(page, force)
     write_page(loaded, page, recording)
     print(f"written to {page}")
@@ -142,6 +106,7 @@ def view(
 @app.command()
 def plot(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder or a recording.")],
+    machine: RunMachine = None,
     out: OutFile = None,
     force: Force = False,
 ) -> None:
@@ -149,7 +114,7 @@ def plot(
     from crane.runs import FIGURE, check_free, read_run
     from crane.view.plots import plot_recording
 
-    recording = read_run(run)
+    recording = read_run(run, None if machine is None else load(machine))
     figure = out or (run if run.is_dir() else run.parent) / FIGURE
     check_free(figure, force)
     plot_recording(recording, figure)
@@ -169,35 +134,9 @@ def demo(out: Out = Path("demo-output"), force: Force = False) -> None:
     print(f"figures:    {out}/*/{FIGURE}\nanimations: {out}/*/{PAGE} (open them in a browser)")
 
 
-def _run_of(what: str) -> tuple[Path | None, "Recording | None"]:
-    """Folder and recording where a run is meant; nothing where a machine is."""
-    from crane.runs import read_run
-
-    path = Path(what)
-    if path.is_dir():
-        return path, read_run(path)
-    if path.suffix.lower() == ".csv":
-        return path.parent, read_run(path)
-    return None, None
-
-
-def _machine_of(recording: "Recording", what: str, given: str | None) -> "Machine":
-    from crane.description.sources import find
-
-    if given is not None:
-        return load(given)
-    if not recording.machine:
-        raise InputError(
-            f"{what}: does not name its machine, add --machine, or write '# machine: NAME' above "
-            "its header row"
-        )
-    try:
-        find(recording.machine)
-    except DescriptionError as error:
-        raise DescriptionError(
-            f"{what}: its machine is not found ({error}); add --machine to say where it is"
-        ) from None
-    return load(recording.machine)
+def _is_run(what: str) -> bool:
+    """Whether a run is meant and no machine."""
+    return Path(what).is_dir() or Path(what).suffix.lower() in (".csv", ".npz")
 
 
 def _describe(machine: "Machine") -> Iterator[str]:

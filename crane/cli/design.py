@@ -8,6 +8,7 @@ import typer
 
 from crane.cli.shared import (
     Force,
+    Lock,
     MachineName,
     Method,
     Out,
@@ -136,20 +137,21 @@ def identify(
             help="Velocity below which its rows are left out [m/s], [rad/s].",
         ),
     ] = None,
+    lock: Lock = None,
     force: Force = False,
 ) -> None:
     """Find a machine's parameters from a recording, and how well they predict."""
     from crane.identification.identify import identify as run
-    from crane.recording import Recording
-    from crane.runs import check_folder, write_identification
+    from crane.runs import check_folder, read_run, write_identification
     from crane.samples import as_number
 
     check_folder(out, force)
-    loaded, learned = load(machine), Recording.read(recording)
+    loaded = load(machine, lock)
+    learned = read_run(recording, loaded)
     if bandwidth is not None:
         span = max(float(learned.time[-1] - learned.time[0]), 1e-3)
         as_number(bandwidth, "the bandwidth", "Hz", above=5 / span)
-    judge = None if validation is None else Recording.read(validation)
+    judge = None if validation is None else read_run(validation, loaded)
     with status("identifying"):
         result = run(
             loaded,
@@ -175,12 +177,14 @@ def payload(
         str | None, typer.Option(help="Link that carries the load; the tip if not given.")
     ] = None,
     method: Method = "wls",
+    lock: Lock = None,
 ) -> None:
     """Estimate mass and centre of mass of what a machine carries from a recording."""
     from crane.identification.payload import estimate_payload
-    from crane.recording import Recording
+    from crane.runs import read_run
 
-    loaded, carried = load(machine), Recording.read(recording)
+    loaded = load(machine, lock)
+    carried = read_run(recording, loaded)
     with status("estimating"):
         estimate = estimate_payload(loaded, carried, frame, method)
     print(estimate.to_text(), end="")

@@ -43,15 +43,28 @@ OutFile = Annotated[
     typer.Option("--out", metavar="FILE", parser=_place, help="The file to write."),
 ]
 RecordingFile = Annotated[
-    Path, typer.Argument(metavar="RECORDING", help="A recording (CSV or npz), with forces.")
+    Path,
+    typer.Argument(metavar="RECORDING", help="A recording (CSV or npz) with forces or pressures."),
 ]
 Method = Annotated[
     str, typer.Option(help="wls (joints by their noise), ols, or huber (robust to outliers).")
 ]
+Change = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="NAME=VALUE", help="Another value of a parameter, as payload.mass=200."
+    ),
+]
+Lock = Annotated[
+    list[str] | None,
+    typer.Option(metavar="JOINT=VALUE", help="A joint that is held, and where [m], [rad]."),
+]
 NoOpen = Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")]
 
 
-def by_joint(option: str, words: list[str] | None) -> dict[str, float]:
+def by_joint(
+    option: str, words: list[str] | None, form: str = "JOINT=VALUE, as in X1=0.5"
+) -> dict[str, float]:
     """Numbers by joint, from JOINT=VALUE."""
     out = {}
     for word in words or ():
@@ -61,15 +74,16 @@ def by_joint(option: str, words: list[str] | None) -> dict[str, float]:
         except ValueError:
             joint = ""
         if not joint:
-            raise InputError(f"{option} is '{word}', write JOINT=VALUE, as in X1=0.5")
+            raise InputError(f"{option} is '{word}', write {form}")
     return out
 
 
-def load(name: str) -> "Machine":
-    """The machine of that name or path."""
+def load(name: str, lock: list[str] | None = None, change: list[str] | None = None) -> "Machine":
+    """The machine of that name or path, some joints locked, some numbers changed."""
     from crane.machine import load as load_machine
 
-    return load_machine(name)
+    changes = by_joint("--set", change, "NAME=VALUE, as in payload.mass=200")
+    return load_machine(name, changes, by_joint("--lock", lock))
 
 
 @contextmanager

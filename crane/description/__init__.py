@@ -1,6 +1,15 @@
 """Reading and checking what the user wrote: machine files and URDFs."""
 
 from crane.description.changes import changed, locked, parameters
+from crane.description.hydraulics import (
+    Counterbalance,
+    Cylinder,
+    Hydraulics,
+    Oil,
+    PDGains,
+    Supply,
+    Valve,
+)
 from crane.description.inertia import inertia_problem
 from crane.description.machine_file import read
 from crane.description.sources import bundled, examples
@@ -18,7 +27,8 @@ from crane.description.spec import (
 )
 
 __all__ = [
-    "LOOP_TYPES", "Chain", "EndStop", "ForceElement", "Friction", "GasSpring", "LoopSpec",
-    "MachineSpec", "PIGains", "Task", "bundled", "changed", "examples", "inertia_problem",
-    "locked", "parameters", "read",
+    "LOOP_TYPES", "Chain", "Counterbalance", "Cylinder", "EndStop", "ForceElement", "Friction",
+    "GasSpring", "Hydraulics", "LoopSpec", "MachineSpec", "Oil", "PDGains", "PIGains", "Supply",
+    "Task", "Valve", "bundled", "changed", "examples", "inertia_problem", "locked", "parameters",
+    "read",
 ]  # fmt: skip

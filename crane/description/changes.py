@@ -4,11 +4,15 @@ import copy
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from lxml import etree
 
-from crane.description.spec import Friction, MachineSpec
+from crane.description.circuit_section import numbers_of
+from crane.description.hydraulics import Hydraulics
+from crane.description.spec import Chain, Friction, MachineSpec
+from crane.description.urdf import read_urdf
 from crane.errors import InputError, known
 from crane.samples import as_number
 
@@ -63,7 +67,9 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
 
     `LINK.mass`, `LINK.com.x`, `LINK.inertia.xx` (about the centre of mass), `LINK.x`, `LINK.roll`
     (where its joint places it on its parent; frames such as pins are links, too), `JOINT.lower`,
-    `friction.JOINT.coulomb`, `control.JOINT.kp`, and `payload.mass`, a point mass at the tip.
+    `friction.JOINT.coulomb`, `control.JOINT.kp`, of a circuit `supply.pressure`,
+    `oil.bulk_modulus`, `cylinder.JOINT.area_a`, `valve.JOINT.c1`, and `payload.mass`, a point
+    mass at the tip, or the load that the machine file names, scaled to that mass.
     """
     found = {name: number.get() for name, number in _numbers(spec.tree)}
     joints = [j.get("name") for j in spec.tree.iterfind("joint") if j.get("type") != "fixed"]
@@ -74,6 +80,9 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
     for joint, gains in spec.control.items():
         for field in dataclasses.fields(gains):
             found[f"control.{joint}.{field.name}"] = getattr(gains, field.name)
+    if spec.hydraulics is not None:
+        for head, part in _parts(spec.hydraulics).items():
+            found |= {f"{head}.{name}": getattr(part, name) for name in numbers_of(type(part))}
     if spec.tip is not None:
         found[PAYLOAD] = 0.0
     return found
@@ -92,7 +101,9 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
     names = parameters(spec)
     tree = copy.deepcopy(spec.tree)
     numbers = dict(_numbers(tree))
+    chains = spec.chains
     friction, control = dict(spec.friction), dict(spec.control)
+    circuit = _parts(spec.hydraulics) if spec.hydraulics else {}
     for name, given in changes.items():
         if name not in names:
             raise InputError(f"parameter '{name}' is unknown, {known(names, name)}")
@@ -101,20 +112,43 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
         if name.endswith(".mass") and value < 0:
             raise InputError(f"parameter '{name}' is {value:g} kg, it must not be negative")
         if name == PAYLOAD:
-            _load(tree, str(spec.tip), value)
+            chains = _load(spec, tree, value)
         elif head == "friction":
             _set(friction, rest, value, Friction)
+        elif (part := name.rpartition(".")[0]) in circuit:
+            circuit[part] = dataclasses.replace(circuit[part], **{name.rpartition(".")[2]: value})
         elif head == "control":
             _set(control, rest, value, None)
         else:
             numbers[name].set(value)
     return dataclasses.replace(
         spec,
+        chains=chains,
         tree=tree,
         friction=MappingProxyType(friction),
         control=MappingProxyType(control),
+        hydraulics=_circuit(circuit) if circuit else None,
         where={**spec.where, "link payload": PAYLOAD},
     )
+
+
+def _parts(hydraulics: Hydraulics) -> dict[str, Any]:
+    """The parts of a circuit by the names that their numbers begin with."""
+    return (
+        {"supply": hydraulics.supply, "oil": hydraulics.oil}
+        | {f"cylinder.{joint}": part for joint, part in hydraulics.cylinders.items()}
+        | {f"valve.{joint}": part for joint, part in hydraulics.valves.items()}
+        | {f"valve_control.{joint}": part for joint, part in hydraulics.control.items()}
+    )
+
+
+def _circuit(parts: Mapping[str, Any]) -> Hydraulics:
+    """The circuit of these parts."""
+    cylinders, valves, control = (
+        {name.removeprefix(kind): part for name, part in parts.items() if name.startswith(kind)}
+        for kind in ("cylinder.", "valve.", "valve_control.")
+    )
+    return Hydraulics(parts["supply"], parts["oil"], cylinders, valves, control)
 
 
 def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
@@ -152,12 +186,15 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
         friction={joint: value for joint, value in spec.friction.items() if joint not in lock},
         control={joint: value for joint, value in spec.control.items() if joint not in lock},
         forces=tuple(item for item in spec.forces if item.joint not in lock),
+        hydraulics=spec.hydraulics and spec.hydraulics.without(lock),
         gas_springs=tuple(item for item in spec.gas_springs if item.joint not in lock),
         end_stops=tuple(item for item in spec.end_stops if item.joint not in lock),
         tasks={
-            name: task
+            name: dataclasses.replace(
+                task, levers={x: lever for x, lever in task.levers.items() if x not in lock}
+            )
             for name, task in spec.tasks.items()
-            if task.space == "tip" or not task.coefficients.keys() & lock.keys()
+            if not (task.space == "active" and task.coefficients.keys() & lock.keys())
         },
         mimics=tuple(name for name in spec.mimics if name not in lock),
     )
@@ -192,17 +229,37 @@ def _set(by_joint: dict, name: str, value: float, default: Callable | None) -> N
     by_joint[joint] = dataclasses.replace(before, **{field: value})
 
 
-def _load(tree: etree._Element, tip: str, mass: float) -> None:
-    """Fix a point mass to the tip."""
+def _load(spec: MachineSpec, tree: etree._Element, mass: float) -> tuple[Chain, ...]:
+    """Fix a payload to the tip: the machine's own, scaled to the mass, or else a point mass.
+
+    Masses and inertias are scaled, places are not: a load of another density.
+
+    Returns:
+        The chains that the tree is made of now.
+    """
     if mass == 0:
-        return
-    link = etree.SubElement(tree, "link", name="payload")
-    inertial = etree.SubElement(link, "inertial")
-    etree.SubElement(inertial, "origin", xyz="0 0 0", rpy="0 0 0")
-    etree.SubElement(inertial, "mass", value=repr(mass))
-    etree.SubElement(
-        inertial, "inertia", dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
-    )
-    joint = etree.SubElement(tree, "joint", name="payload_fixed", type="fixed")
-    etree.SubElement(joint, "parent", link=tip)
-    etree.SubElement(joint, "child", link="payload")
+        return spec.chains
+    if spec.payload is None:
+        link = etree.SubElement(tree, "link", name="payload")
+        inertial = etree.SubElement(link, "inertial")
+        etree.SubElement(inertial, "origin", xyz="0 0 0", rpy="0 0 0")
+        etree.SubElement(inertial, "mass", value=repr(mass))
+        etree.SubElement(
+            inertial, "inertia", dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
+        )
+        _attach(tree, "payload_fixed", spec.tip, "payload")
+        return spec.chains
+    load = read_urdf(spec.payload.urdf)
+    scale = mass / sum(float(element.get("value")) for element in load.robot.iter("mass"))
+    for element in load.robot.iter("mass", "inertia"):
+        for key, value in element.items():
+            element.set(key, repr(scale * float(value)))
+    _attach(tree, f"{spec.payload.name}_attachment", spec.tip, load.root)
+    tree.extend(load.robot)
+    return (*spec.chains, spec.payload)
+
+
+def _attach(tree: etree._Element, name: str, parent: str | None, child: str) -> None:
+    joint = etree.SubElement(tree, "joint", name=name, type="fixed")
+    etree.SubElement(joint, "parent", link=str(parent))
+    etree.SubElement(joint, "child", link=child)

@@ -1,8 +1,10 @@
 """Machine files and single URDFs, read and checked into a `MachineSpec`."""
 
+import copy
 import warnings
 from pathlib import Path
 
+from crane.description.circuit_section import read_hydraulics
 from crane.description.section import Section
 from crane.description.sources import find
 from crane.description.spec import (
@@ -25,7 +27,7 @@ from crane.errors import CraneWarning, DescriptionError, known
 _KEYS = (
     "name", "source", "chains", "loops", "active", "home", "friction", "forces",
     "gas_springs", "end_stops",
-    "tip", "tasks", "control",
+    "tip", "payload", "tasks", "control", "hydraulics",
 )  # fmt: skip
 
 
@@ -95,11 +97,13 @@ def _read_machine(path: Path) -> MachineSpec:
         raise top.fail("tip", f"the tip frame '{tip}' is unknown, {known(tree.links, tip)}")
     if tip is not None and not tree.moves(tip):
         raise top.fail("tip", f"the tip frame '{tip}' does not move, choose another")
-    tasks = _tasks(top, active, tip)
+    payload = _payload(top, tree, tip)
+    hydraulics = read_hydraulics(top, tree, active)
+    tasks = _tasks(top, active, tip, hydraulics.joints if hydraulics else ())
     control = _control(top, active)
     return MachineSpec(
         name, source, path, chains, tree.robot, loops, active, home, friction, forces,
-        gas_springs, end_stops, tip, tasks, control, mimics, where,
+        gas_springs, end_stops, tip, tasks, control, hydraulics, mimics, where, payload,
     )  # fmt: skip
 
 
@@ -260,30 +264,81 @@ def _end_stops(top: Section, tree: Tree) -> tuple[EndStop, ...]:
     return tuple(stops)
 
 
-def _tasks(top: Section, active: tuple[str, ...], tip: str | None) -> dict[str, Task]:
+def _payload(top: Section, tree: Tree, tip: str | None) -> Chain | None:
+    """The load that payload.mass hangs on the tip, as a chain without moving joints."""
+    section = top.section("payload", "'payload'")
+    if section is None:
+        return None
+    section.only("urdf")
+    if tip is None:
+        raise section.fail(None, "a payload hangs on the tip, name its frame under 'tip:'")
+    urdf = read_urdf(section.file("urdf"))
+    for joint in urdf.moving:
+        raise DescriptionError(
+            f"{urdf.lines['joint', joint]}: joint '{joint}' moves, a payload is rigid: "
+            "make it fixed"
+        )
+    for loop in urdf.loops:
+        raise DescriptionError(f"{loop.where}: a payload has no <loop>, remove it")
+    if not sum(float(mass.get("value")) for mass in urdf.robot.iter("mass")):
+        raise section.fail(
+            "urdf", f"no link of {urdf.file.name} has a mass, give one an <inertial>"
+        )
+    chain = Chain("payload", urdf.file, tip, section.where("urdf"), ())
+    copy.deepcopy(tree).add(chain, urdf)  # checks that its names are not taken
+    return chain
+
+
+def _tasks(
+    top: Section, active: tuple[str, ...], tip: str | None, valves: tuple[str, ...]
+) -> dict[str, Task]:
     tasks = {}
-    keys = ("description", "duration", "tip", "active")
+    keys = ("description", "duration", "tip", "active", "joystick")
     for name, item in top.mappings("tasks", "task", *keys):
         duration = item.number("duration", minimum=0.0)
         if duration == 0:
             raise item.fail("duration", f"task '{name}' takes no time, give a duration")
-        spaces = {"tip": ("x", "y", "z"), "active": active}
+        spaces = {"tip": ("x", "y", "z"), "active": active, "joystick": valves}
         given = [
             (space, section)
             for space in spaces
             if (section := item.section(space, f"'{space}' of task '{name}'")) is not None
         ]
         if len(given) != 1:
-            what = "both 'tip' and 'active', keep" if given else "neither 'tip' nor 'active', give"
-            raise item.fail(None, f"task '{name}' has {what} one")
+            count = "more than one" if given else "none"
+            raise item.fail(
+                None, f"task '{name}' has {count} of 'tip', 'active', 'joystick', give one"
+            )
         space, polynomials = given[0]
         if space == "tip" and tip is None:
             raise item.fail("tip", f"task '{name}' moves the tip, name its frame under 'tip:'")
         polynomials.only(*spaces[space])
-        coefficients = {key: polynomials.numbers(key) for key in spaces[space]}
         description = item.text("description", "")
+        if space == "joystick":
+            levers = {joint: _lever(polynomials, joint, duration) for joint in polynomials}
+            tasks[name] = Task(name, description, duration, space, {}, levers)
+            continue
+        coefficients = {key: polynomials.numbers(key) for key in spaces[space]}
         tasks[name] = Task(name, description, duration, space, coefficients)
     return tasks
+
+
+def _lever(section: Section, joint: str, duration: float) -> tuple[tuple[float, float], ...]:
+    """A polygon [time, lever, time, lever, ...]."""
+    numbers = section.numbers(joint)
+    times, levers = numbers[::2], numbers[1::2]
+    if len(times) != len(levers):
+        raise section.fail(
+            joint, f"'{joint}' has {len(numbers)} numbers, give time, lever, time .."
+        )
+    rising = all(a < b for a, b in zip(times, times[1:], strict=False))
+    if not rising or times[0] < 0 or times[-1] > duration:
+        raise section.fail(joint, f"times of '{joint}' do not increase within 0 to {duration:g} s")
+    if max(map(abs, levers)) > 1:
+        raise section.fail(
+            joint, f"a lever of '{joint}' is beyond -1 to 1, the valve's whole flow"
+        )
+    return tuple(zip(times, levers, strict=True))
 
 
 def _control(top: Section, active: tuple[str, ...]) -> dict[str, PIGains]:

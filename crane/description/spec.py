@@ -7,6 +7,7 @@ from pathlib import Path
 
 from lxml import etree
 
+from crane.description.hydraulics import Hydraulics
 from crane.errors import InputError
 from crane.samples import as_number
 
@@ -208,14 +209,16 @@ class PIGains:
 
 @dataclass(frozen=True)
 class Task:
-    """A named reference motion: polynomials in time of the tip or of active joints.
+    """A named motion: polynomials in time of the tip or of active joints, or levers.
 
     Attributes:
         name: The task's name.
         description: One line on what it is.
         duration: [s].
-        space: "tip" (coordinates x, y, z of the world) or "active" (the active joints).
+        space: "tip" (coordinates x, y, z of the world), "active" (the active joints), or
+            "joystick" (levers of valves).
         coefficients: Per coordinate the polynomial in time [s], lowest power first [m], [rad].
+        levers: Per joint a polygon of time [s] and lever, -1 to 1.
     """
 
     name: str
@@ -223,6 +226,7 @@ class Task:
     duration: float
     space: str
     coefficients: Mapping[str, tuple[float, ...]]
+    levers: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -244,5 +248,7 @@ class MachineSpec:
     tip: str | None = None
     tasks: Mapping[str, Task] = field(default_factory=dict)
     control: Mapping[str, PIGains] = field(default_factory=dict)
+    hydraulics: Hydraulics | None = None
     mimics: tuple[str, ...] = ()  # joints that mimic another, which have to be locked
     where: Mapping[str, str] = field(default_factory=dict)  # section -> "file:line"
+    payload: Chain | None = None  # what payload.mass hangs on the tip; None: a point mass

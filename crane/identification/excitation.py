@@ -92,7 +92,7 @@ class Excitation:
                 }[suffix]
         notes = {
             "crane reference": "",
-            "machine": self.machine.reference,
+            "machine": self.machine.call,
             "task": f"excitation, steady from {self.path.lead:g} s, period {self.path.period:g} s",
         }
         timeseries.write(path, Table(units, np.column_stack(self.motion()), notes))
@@ -106,7 +106,7 @@ class Excitation:
         K = self.path.harmonics
         numbers = self.path.coefficients.T.tolist()
         text = {
-            "machine": self.machine.reference,
+            "machine": self.machine.call,
             "criterion": self.criterion,
             "seed": self.seed,
             "period": self.path.period,

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import shutil
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from lxml import etree
 
-from crane.description import Friction, MachineSpec, read
+from crane.description import Chain, Friction, MachineSpec, read
 from crane.dynamics import Dynamics
 from crane.errors import CraneError, CraneWarning, InputError, OutputError
 from crane.identification.base import random_samples
@@ -82,7 +83,7 @@ def write_machine(result: Identification, folder: str | Path) -> Path:
     }
     names = _names(spec)
     file = f"{machine.path.stem}.yaml"
-    originals = {machine.path, *(chain.urdf for chain in spec.chains)}
+    originals = {machine.path, *(chain.urdf for chain in _files(spec))}
     for name in (file, *names.values()):
         if (place := (Path(folder) / name).resolve()) in originals:
             raise OutputError(
@@ -95,6 +96,8 @@ def write_machine(result: Identification, folder: str | Path) -> Path:
             tree = changed_urdf(chain.urdf, bodies, _carried(spec), how)
             text = etree.tostring(tree, encoding="utf-8", xml_declaration=True)
             (part / names[chain.name]).write_bytes(text.rstrip() + b"\n")
+        if spec.payload is not None:
+            shutil.copyfile(spec.payload.urdf, part / names[spec.payload.name])
         (part / file).write_text(content, encoding="utf-8")
         _check(result, part / file)
     return Path(folder) / file
@@ -103,10 +106,15 @@ def write_machine(result: Identification, folder: str | Path) -> Path:
 def _names(spec: MachineSpec) -> dict[str, str]:
     """File of each chain: the name it has, with a number where two are alike."""
     taken: dict[str, str] = {}
-    for number, chain in enumerate(spec.chains):
+    for number, chain in enumerate(_files(spec)):
         name = chain.urdf.name
         taken[chain.name] = f"{number}_{name}" if name in taken.values() else name
     return taken
+
+
+def _files(spec: MachineSpec) -> tuple[Chain, ...]:
+    """The chains, and the payload that the machine file names."""
+    return spec.chains if spec.payload is None else (*spec.chains, spec.payload)
 
 
 def _carried(spec: MachineSpec) -> set[str]:
@@ -145,6 +153,8 @@ def _content(result: Identification, spec: MachineSpec, names: Mapping[str, str]
     data["source"] = f"{how}; else {machine.source or machine.path.name}"
     for chain in data["chains"]:
         chain["urdf"] = names[chain["name"]]
+    if spec.payload is not None:
+        data["payload"] = {"urdf": names[spec.payload.name]}
     data["friction"], scales = _identified(result, spec)
     data["forces"] = [_numbers(item) for item in machine.forces]
     data["gas_springs"] = {

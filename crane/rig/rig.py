@@ -181,7 +181,7 @@ class Rig:
             units={joint: machine.unit(joint) for joint in machine.active},
             channels=channels,
             channel_units=units,
-            machine=machine.reference,
+            machine=machine.call,
             task=": ".join(filter(None, (f"virtual rig, seed {self.seed}", task))),
         )
 

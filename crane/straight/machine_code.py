@@ -12,13 +12,18 @@ from crane.straight.scalar import Expression, Number
 _FAST = "nsz arcp contract"
 _CALLS = {
     "sqrt": "@llvm.sqrt.f64", "abs": "@llvm.fabs.f64", "maximum": "@larger",
-    "copysign": "@llvm.copysign.f64",
+    "copysign": "@llvm.copysign.f64", "positive": "@chosen",
 }  # fmt: skip
 _DECLARATIONS = """
 declare double @llvm.sqrt.f64(double)
 declare double @llvm.fabs.f64(double)
 declare double @llvm.copysign.f64(double, double)
 declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
+define internal double @chosen(double %x, double %yes, double %no) alwaysinline {
+  %positive = fcmp ogt double %x, 0.0
+  %out = select i1 %positive, double %yes, double %no
+  ret double %out
+}
 define internal double @larger(double %a, double %b) alwaysinline {
   %more = fcmp oge double %a, %b
   %out = select i1 %more, double %a, double %b

@@ -114,6 +114,19 @@ def maximum(a: Number, b: Number) -> Number:
     return math.nan if a != a or b != b else max(a, b)
 
 
+def minimum(a: Number, b: Number) -> Number:
+    """The smaller of two; NaN wins."""
+    return -maximum(-a, -b)
+
+
+def where_positive(x: Number, yes: Number, no: Number) -> Number:
+    """One number where x > 0, another elsewhere."""
+    if not isinstance(x, Expression):
+        return yes if x > 0 else no
+    words = (y.index if isinstance(y, Expression) else float(y) for y in (yes, no))
+    return x.tape.add("positive", x.index, *words)
+
+
 def largest(values: Iterable[Number]) -> Number:
     """The largest absolute value, 0 of none."""
     out: Number = 0.0
@@ -122,8 +135,10 @@ def largest(values: Iterable[Number]) -> Number:
     return out
 
 
-def with_sign_of(magnitude: Number, sign: Expression) -> Number:
+def with_sign_of(magnitude: Number, sign: Number) -> Number:
     """|magnitude| with another's sign."""
+    if not isinstance(sign, Expression):
+        return math.copysign(1.0, sign) * apply("abs", magnitude)
     first = magnitude.index if isinstance(magnitude, Expression) else float(magnitude)
     return sign.tape.add("copysign", first, sign.index)
 

@@ -1,16 +1,13 @@
-"""Motion in time: the classical Runge-Kutta method, in machine code or Python, and scipy's."""
+"""Steps of the classical Runge-Kutta method in machine code."""
 
-from collections.abc import Callable
 from ctypes import c_int64, c_void_p
-from typing import Any
 
 import numpy as np
 
 from crane.closure.traced import Constants, folded
-from crane.control import Controller, Traced, TracedController
+from crane.control import Traced, TracedController
 from crane.dynamics import Dynamics
 from crane.dynamics.traced import Sweep
-from crane.errors import ClosureError, SimulationError
 from crane.samples import Array
 from crane.straight import Program, Tape, largest
 from crane.straight.scalar import add, dot, scale
@@ -69,66 +66,6 @@ done:
   ret i64 %i
 }}
 """
-
-
-ADAPTIVE = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
-_OR = ", or shorten the step"
-
-
-class PythonStepper:
-    """One step at a time, for any controller and on any path of `Dynamics`.
-
-    Args:
-        dynamics: The machine.
-        control: Its controller.
-    """
-
-    def __init__(self, dynamics: Dynamics, control: Controller):
-        self._dynamics, self._control = dynamics, control
-        machine = dynamics.machine
-        self._nq, self._active = machine.model.nq, machine.closure.active
-        self._speeds = slice(self._nq, self._nq + len(machine.active))
-
-    def observe(self, time: float, state: Array) -> tuple[Array, Array]:
-        """Rate of the state, and [tau, friction, kinetic, potential]."""
-        rate, tau = self._rate(time, state)
-        q, v_a = state[: self._nq], state[self._speeds]
-        seen = self._dynamics.at("observation", q, v_a, tau)
-        return rate, np.concatenate([tau, seen])
-
-    def advance(self, time: float, state: Array, first: Array, step: float) -> Array:
-        """The state one step later, its rate at the start given.
-
-        Raises:
-            SimulationError: The motion explodes, or the loops cannot be closed any more.
-        """
-        total = rate = first
-        for share, weight in ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
-            if not np.abs(rate[: self._nq]).max() * step < 1:  # also NaN
-                raise SimulationError(
-                    f"at t = {time:.6g} s the motion explodes (over 1 m or rad in a step of "
-                    f"{step:g} s): shorten the step, or smooth the friction more"
-                )
-            rate, _ = self._rate(time + share * step, state + share * step * rate)
-            total = total + weight * rate
-        after = state + step / 6 * total
-        q = after[: self._nq]
-        try:
-            closed = self._dynamics.machine.closure.solve(q[self._active], guess=q)
-        except ClosureError as error:
-            raise SimulationError(f"at t = {time + step:.6g} s: {error}{_OR}") from None
-        after[: self._nq] = closed
-        return after
-
-    def _rate(self, time: float, state: Array) -> tuple[Array, Array]:
-        q, v_a = state[: self._nq], state[self._speeds]
-        own = state[self._speeds.stop : -2]
-        tau, own_rate = self._control(time, q[self._active], v_a, own)
-        try:
-            rates = self._dynamics.at("rates", q, v_a, tau)
-        except ClosureError as error:
-            raise SimulationError(f"at t = {time:.6g} s: {error}{_OR}") from None
-        return np.concatenate([rates[:-1], own_rate, [tau @ v_a, rates[-1]]]), tau
 
 
 class CompiledStepper:
@@ -235,58 +172,3 @@ class CompiledStepper:
         # the largest of all changes, so that NaN and infinity anywhere show
         move = h * largest([*k1[:nq], *k2[:nq], *k3[:nq], *scale(1e-9, mean)])
         program.add("finish", 6, [*after, move])
-
-
-def integrate_adaptively(
-    dynamics: Dynamics,
-    control: Controller,
-    state: Array,
-    steps: int,
-    step: float,
-    method: str,
-    progress: Callable[[float], None] | None = None,
-) -> Array:
-    """States and observations every `step` by an adaptive method with dense output.
-
-    The loops are closed to rounding at the recorded instants.
-
-    Args:
-        dynamics: The machine.
-        control: Its controller.
-        state: At the start.
-        steps: Number of recorded intervals.
-        step: [s].
-        method: One of `ADAPTIVE`.
-        progress: Called with the finished share, 0 to 1.
-
-    Returns:
-        (steps + 1, .) rows as `CompiledStepper.run` writes them.
-
-    Raises:
-        SimulationError: The method gives up, or the loops cannot be closed any more.
-    """
-    from scipy.integrate import solve_ivp
-
-    stepper = PythonStepper(dynamics, control)
-    times = step * np.arange(steps + 1, dtype=np.float64)
-
-    def rate(time: float, state: Array) -> Array:
-        if progress is not None:
-            progress(min(time / times[-1], 1.0))
-        return stepper.observe(time, state)[0]
-
-    chosen: Any = method
-    result = solve_ivp(
-        rate, (0.0, times[-1]), state, method=chosen, t_eval=times, rtol=1e-9, atol=1e-11
-    )
-    if not result.success:
-        raise SimulationError(
-            f"at t = {result.t[-1] if len(result.t) else 0.0:.6g} s {method} gives up: "
-            f"{result.message.rstrip('.').lower()}, try another method"
-        )
-    closure, nq = dynamics.machine.closure, dynamics.machine.model.nq
-    rows = []
-    for time, sample in zip(times, result.y.T, strict=True):
-        sample[:nq] = closure.solve(sample[:nq][closure.active], guess=sample[:nq])
-        rows.append(np.concatenate([sample, stepper.observe(time, sample)[1]]))
-    return np.array(rows)

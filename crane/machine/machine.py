@@ -1,15 +1,14 @@
 """Machine: the assembled, immutable result of reading and closing a description."""
 
-import copy
 import dataclasses
-from collections.abc import Mapping
+import shlex
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 import pinocchio as pin
-from lxml import etree
 from numpy.typing import ArrayLike
 
 from crane.closure import Closure, frame_id
@@ -19,17 +18,14 @@ from crane.description import (
     ForceElement,
     Friction,
     GasSpring,
-    MachineSpec,
+    Hydraulics,
     PIGains,
     Task,
     bundled,
-    changed,
     examples,
     inertia_problem,
-    locked,
-    read,
 )
-from crane.errors import DescriptionError, InputError, LimitError, MechanismError, known
+from crane.errors import InputError, LimitError, known
 from crane.samples import Array, as_number, as_sample, as_samples
 
 _NO_LIMIT = 1e9  # stands for infinity in the text handed to Pinocchio
@@ -75,7 +71,9 @@ class Machine:
         tip: Name of the tip's frame.
         tasks: Named reference motions.
         control: PI gains by active joint.
+        hydraulics: The circuit that drives it, None for a machine without.
         changes: Numbers that are not those of its files, by name.
+        locks: Where joints are held that its files let move, by name [m], [rad].
     """
 
     name: str
@@ -94,7 +92,9 @@ class Machine:
     tip: str | None
     tasks: Mapping[str, Task]
     control: Mapping[str, PIGains]
+    hydraulics: Hydraulics | None
     changes: Mapping[str, float]
+    locks: Mapping[str, float]
 
     @property
     def home(self) -> Array:
@@ -107,6 +107,19 @@ class Machine:
         known_as = self.path.stem
         named = bundled() | examples()
         return known_as if named.get(known_as) == self.path else str(self.path)
+
+    @property
+    def call(self) -> str:
+        """What `recalled` takes to load it again, changes and locks included.
+
+        It reads like the command line: "patu655 --set payload.mass=200.0 --lock slew=0.0".
+        """
+        words = [self.reference]
+        words += [
+            word for x, value in self.changes.items() for word in ("--set", f"{x}={value!r}")
+        ]
+        words += [word for x, value in self.locks.items() for word in ("--lock", f"{x}={value!r}")]
+        return shlex.join(words) if len(words) > 1 else words[0]
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -167,11 +180,13 @@ class Machine:
         forces: tuple[ForceElement, ...] | None = None,
         gas_springs: tuple[GasSpring, ...] | None = None,
         end_stops: tuple[EndStop, ...] | None = None,
+        hydraulics: Hydraulics | None = None,
     ) -> "Machine":
-        """The same machine with other friction, passive forces, gas springs or end stops.
+        """The same machine with other friction, forces, gas springs, end stops or hydraulics.
 
         Raises:
-            InputError: A joint is unknown, has two gas springs, or an end stop but no limits.
+            InputError: A joint is unknown, has two gas springs, an end stop but no limits, or a
+                cylinder without being active.
         """
         for joint in friction or {}:
             self.column(joint)
@@ -186,12 +201,62 @@ class Machine:
             limits = self.model.lowerPositionLimit[column], self.model.upperPositionLimit[column]
             if not np.isfinite(limits).all():
                 raise InputError(f"joint '{stop.joint}' has no limits to stop at, give it some")
+        for joint in hydraulics.joints if hydraulics else ():
+            if joint not in self.active:
+                raise InputError(
+                    f"'{joint}' has a cylinder and is not active, {known(self.active, joint)}"
+                )
         return dataclasses.replace(
             self,
             friction=self.friction if friction is None else MappingProxyType(dict(friction)),
             forces=self.forces if forces is None else tuple(forces),
             gas_springs=self.gas_springs if gas_springs is None else tuple(gas_springs),
             end_stops=self.end_stops if end_stops is None else tuple(end_stops),
+            hydraulics=self.hydraulics if hydraulics is None else hydraulics,
+        )
+
+    def driven_by(self, names: Sequence[str]) -> "Machine":
+        """The same machine with other active joints: the angles of its booms, say.
+
+        Home posture and assembly branch stay. With q_B the new active coordinates and q_A those
+        of this machine, gamma_A the rows of gamma = dq/dq_B that belong to q_A,
+
+            v_A = gamma_A v_B,    tau_B = gamma_A^T tau_A,
+
+        which are equations (18), (19) of the electro-hydraulic forwarder paper,
+        tau_i = F_i dx_i/dq_i, for any choice of joints.
+
+        The circuit keeps the cylinders whose joints are still active. Gains and tasks of active
+        joints are dropped unless they belong to the same joints. `reference` and `changes` stay:
+        what loads the machine again gives it with the active joints of its file.
+
+        Args:
+            names: As many joints as there are degrees of freedom, in the order of q_B.
+
+        Raises:
+            InputError: A joint is unknown or named twice.
+            MechanismError: Too few or too many joints, or they do not determine the others.
+        """
+        names = tuple(names)
+        for name in names:
+            self.column(name)
+            if names.count(name) > 1:
+                raise InputError(
+                    f"joint '{name}' is named twice among the active ones, once will do"
+                )
+        closure = Closure(self.model, self.closure.equations.loops, names, self.home)
+        same = set(names) == set(self.active)
+        return dataclasses.replace(
+            self,
+            closure=closure,
+            active=names,
+            lower=fixed(self.model.lowerPositionLimit[closure.active]),
+            upper=fixed(self.model.upperPositionLimit[closure.active]),
+            tasks=MappingProxyType(
+                {key: task for key, task in self.tasks.items() if same or task.space == "tip"}
+            ),
+            control=self.control if same else MappingProxyType({}),
+            hydraulics=_driving(self.hydraulics, names),
         )
 
     def with_payload(self, payload: Payload) -> "Machine":
@@ -216,125 +281,20 @@ class Machine:
         return dataclasses.replace(self, model=model)
 
 
-def load(
-    name: str | Path,
-    changes: Mapping[str, float] | None = None,
-    lock: Mapping[str, float] | None = None,
-) -> Machine:
-    """Load a machine, perhaps with some of its numbers changed, or joints locked.
-
-    Args:
-        name: A bundled machine's name, a robot of example-robot-data by its file's name, or the
-            path of a machine file (.yaml) or URDF (.urdf, with `<loop>` elements if it has loops).
-        changes: New values by the names of `crane.description.parameters`, such as
-            {"link3_G.x": 0.1, "link7.mass": 0.25, "payload.mass": 0.1}; SI units.
-        lock: Coordinates [m], [rad] of joints to be fixed, by name.
-
-    Returns:
-        The machine, its home posture closed.
-
-    Raises:
-        DescriptionError: A file is wrong; the message has file and line.
-        MechanismError: The parts do not make a machine that can be driven.
-        InputError: A change of a parameter that is not there, or to what cannot be.
-    """
-    spec = read(name)
-    if changes:
-        spec = changed(spec, changes)
-    if lock:
-        spec = locked(spec, lock)
-    for joint in spec.mimics:
-        raise DescriptionError(
-            f"{spec.where[f'joint {joint}']}: joint '{joint}' mimics another, which is not "
-            "supported: make it fixed, or lock it"
-        )
-    model = _assemble(spec)
-    active = tuple(model.names)[1:] if spec.active is None else spec.active
-    try:
-        closure = Closure(model, spec.loops, active, _home_guess(spec, model, active))
-    except MechanismError as error:
-        where = spec.where.get(error.about, spec.path.name)
-        raise MechanismError(f"{where}: {error}", error.about) from None
-    lower, upper = model.lowerPositionLimit, model.upperPositionLimit
-    return Machine(
-        name=spec.name,
-        source=spec.source,
-        path=spec.path,
-        chains=spec.chains,
-        model=model,
-        closure=closure,
-        active=active,
-        lower=_fixed(lower[closure.active]),
-        upper=_fixed(upper[closure.active]),
-        friction=MappingProxyType(dict(spec.friction)),
-        forces=spec.forces,
-        gas_springs=spec.gas_springs,
-        end_stops=spec.end_stops,
-        tip=spec.tip,
-        tasks=MappingProxyType(dict(spec.tasks)),
-        control=MappingProxyType(dict(spec.control)),
-        changes=MappingProxyType(dict(changes or {})),
-    )
-
-
-def _home_guess(spec: MachineSpec, model: pin.Model, active: tuple[str, ...]) -> Array:
-    """(nq,) coordinates under `home`, of other joints zero or the limit nearest to it."""
-    lower, upper = model.lowerPositionLimit, model.upperPositionLimit
-    guess = np.clip(np.zeros(model.nq), lower, upper)
-    for joint, value in spec.home.items():
-        column = model.joints[model.getJointId(joint)].idx_q
-        if joint in active and not lower[column] <= value <= upper[column]:
-            raise DescriptionError(
-                f"{spec.where[f'home {joint}']}: home of '{joint}' is {value:g}, outside of its "
-                f"limits {lower[column]:g} to {upper[column]:g}, choose one within them"
-            )
-        guess[column] = value
-    return guess
-
-
-def _fixed(array: Array) -> Array:
+def fixed(array: Array) -> Array:
     """A copy that cannot be changed."""
     out = array.copy()
     out.flags.writeable = False
     return out
 
 
-def _assemble(spec: MachineSpec) -> pin.Model:
-    """Pinocchio's model of the merged chains.
-
-    One text for all chains, because Pinocchio then adds the joints depth-first: joints appended
-    chain by chain make its crba wrong without a word.
-    """
-    robot = copy.deepcopy(spec.tree)
-    for joint in robot.iter("joint"):
-        if joint.get("type") == "continuous":
-            joint.set("type", "revolute")  # Pinocchio's continuous joint has two coordinates
-        if joint.get("type") != "fixed":
-            limit = joint.find("limit")
-            if limit is None:
-                limit = etree.SubElement(joint, "limit")
-            for key, sign in (("lower", "-"), ("upper", ""), ("effort", ""), ("velocity", "")):
-                limit.set(key, limit.get(key, f"{sign}{_NO_LIMIT}"))
-    model = pin.buildModelFromXML(etree.tostring(robot).decode())
-    for limits in (
-        model.lowerPositionLimit, model.upperPositionLimit, model.effortLimit, model.velocityLimit,
-    ):  # fmt: skip
-        endless = np.abs(limits) >= _NO_LIMIT
-        limits[endless] = np.copysign(np.inf, limits[endless])
-    model.name = spec.name
-    moved = {joint.get("name"): joint.find("child").get("link") for joint in robot.iter("joint")}
-    for index in range(1, model.njoints):
-        name = model.names[index]
-        inertia = model.inertias[index]
-        link = moved[name]
-        where = spec.where[f"link {link}"]
-        if not inertia.mass > 0:
-            raise DescriptionError(
-                f"{where}: joint '{name}' moves link '{link}', which has no mass, give it an "
-                "<inertial>"
-            )
-        if problem := inertia_problem(inertia.mass, inertia.inertia):
-            raise DescriptionError(
-                f"{where}: link '{link}' with what is fixed to it has {problem}"
-            )
-    return model
+def _driving(circuit: Hydraulics | None, names: Sequence[str]) -> Hydraulics | None:
+    """The part of a circuit that drives some joints, in their order."""
+    kept = [name for name in names if circuit and name in circuit.cylinders]
+    if circuit is None or not kept:
+        return None
+    return dataclasses.replace(
+        circuit,
+        cylinders={name: circuit.cylinders[name] for name in kept},
+        valves={name: circuit.valves[name] for name in kept},
+    )

@@ -1,0 +1,100 @@
+"""The command that simulates a machine."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from crane.cli.shared import Change, Force, Lock, MachineName, Out, app, load, progress_bar
+from crane.errors import InputError, known
+
+if TYPE_CHECKING:
+    from crane.control import Command, Controller
+    from crane.machine import Machine
+
+
+@app.command()
+def simulate(
+    machine: MachineName,
+    out: Out,
+    task: Annotated[str | None, typer.Option(help="A task of the machine.")] = None,
+    controller: Annotated[
+        str | None,
+        typer.Option(
+            help="pi, computed-torque, valve-pd, tip-velocity; if not given, the one that the "
+            "machine has gains for."
+        ),
+    ] = None,
+    inputs: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Measured valve signals to replay, and to compare with what else was measured.",
+        ),
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option(help="In seconds; that of the task if not given.")
+    ] = None,
+    step: Annotated[float, typer.Option(help="Step of the integration in seconds.")] = 1e-3,
+    change: Change = None,
+    lock: Lock = None,
+    force: Force = False,
+) -> None:
+    """Simulate a task, measured inputs, or the motion from the home posture on its own."""
+    from crane.runs import check_folder, write_run
+    from crane.simulation import simulate as run
+
+    check_folder(out, force)
+    loaded = load(machine, lock, change)
+    if inputs is not None:
+        for option, given in (("--task", task), ("--controller", controller)):
+            if given is not None:
+                raise InputError(f"{option} does not go with --inputs, leave one out")
+        if duration is not None:
+            raise InputError("--duration does not go with --inputs, the file ends by itself")
+        _replay(loaded, inputs, out, step)
+        return
+    control = _control(loaded, task, controller)
+    if task is None and duration is None:
+        tasks = ", ".join(loaded.tasks) or "none"
+        raise InputError(f"no task: name a --task ({tasks}), or a --duration to let it go")
+    if duration is None and task is not None:
+        duration = loaded.tasks[task].duration
+    with progress_bar("simulating") as progress:
+        recording = run(
+            loaded, control, duration=duration, step=step, task=task or "", progress=progress
+        )
+    title = f"{loaded.name}: {task or 'free motion'}"
+    print(write_run(out, recording, title), end="")
+    print(f"\nwritten to {out}; see it with: crane view {out}")
+
+
+def _control(
+    machine: "Machine", task: str | None, name: str | None
+) -> "Controller | Command | None":
+    from crane.control import controller, joystick, usual
+    from crane.paths import task_path
+
+    if task is None:
+        if name is not None:
+            raise InputError(f"controller '{name}' has nothing to follow, name a --task")
+        return None
+    if task not in machine.tasks:
+        raise InputError(
+            f"machine '{machine.name}' has no task '{task}', {known(machine.tasks, task)}"
+        )
+    if machine.tasks[task].space == "joystick":
+        if name is not None:
+            raise InputError(f"task '{task}' moves levers, leave --controller out")
+        return joystick(machine, task)
+    return controller(name or usual(machine), machine, task_path(machine, task))
+
+
+def _replay(machine: "Machine", inputs: Path, out: Path, step: float) -> None:
+    from crane.replay import replay
+    from crane.runs import write_comparison
+
+    with progress_bar("simulating") as progress:
+        recording, comparison = replay(machine, inputs, step, progress)
+    print(write_comparison(out, recording, comparison, f"{machine.name}: {inputs.stem}"), end="")
+    print(f"\nwritten to {out}; see it with: crane view {out}")

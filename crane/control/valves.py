@@ -1,0 +1,306 @@
+"""Signals of valves: from a controller, a joystick, or a recording."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.description import Hydraulics, PDGains
+from crane.errors import InputError, known
+from crane.machine import Machine
+from crane.paths import Path
+from crane.samples import Array, as_number, as_sample
+from crane.straight import Number
+from crane.straight.scalar import apply
+
+_JUMP = 0.01  # of the spool's stroke, over which the feedforward jumps the dead band
+
+
+@runtime_checkable
+class Command(Protocol):
+    """Where the signals of m valves come from.
+
+    Attributes:
+        path: The reference motion, or None.
+        measured: Whether the last two references are the pressures of supply and tank.
+        settings: (s,) its numbers.
+        columns: Length c of a row of references.
+        period: Time between calls of `update` [s]; 0 if it wants none.
+    """
+
+    path: Path | None
+    measured: bool
+    settings: Array
+    columns: int
+    period: float
+
+    def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
+        """Think about the next period, given (nq,), (n,), (m, 2) [Pa]."""
+
+    def references(self, times: Array) -> Array:
+        """What it follows, (N, c) at times (N,) [s]."""
+
+    def signals(
+        self,
+        q_a: Sequence[Number],
+        v_a: Sequence[Number],
+        settings: Sequence[Number],
+        reference: Sequence[Number],
+    ) -> list[Number]:
+        """Signals (m,) [V], from floats or as formulas."""
+
+
+def circuit_of(machine: Machine) -> Hydraulics:
+    """The circuit of a machine.
+
+    Raises:
+        InputError: It has none.
+    """
+    if machine.hydraulics is None:
+        raise InputError(
+            f"machine '{machine.name}' has no valves, describe its circuit under 'hydraulics' of "
+            "the machine file"
+        )
+    return machine.hydraulics
+
+
+class Signals:
+    """Signals given in time, straight between the instants and constant beyond them.
+
+    Args:
+        machine: The machine.
+        time: Instants (N,) [s], increasing.
+        signals: [V] (N,) by joint; valves that are not named stay neutral.
+        supply: Measured pressure of the supply (N,) [Pa], if it is to be used.
+        tank: Measured pressure of the tank (N,) [Pa]; that of the machine file if not given.
+
+    Raises:
+        InputError: Unknown joints, wrong lengths, or times that do not increase.
+    """
+
+    path: Path | None = None
+    settings = np.zeros(0)
+    period = 0.0
+
+    def __init__(
+        self,
+        machine: Machine,
+        time: ArrayLike,
+        signals: Mapping[str, ArrayLike],
+        supply: ArrayLike | None = None,
+        tank: ArrayLike | None = None,
+    ):
+        circuit = circuit_of(machine)
+        self._time = np.array(time, dtype=np.float64)
+        if self._time.ndim != 1 or not len(self._time):
+            raise InputError(f"time has the shape {self._time.shape}, give (N,) instants")
+        if not (np.diff(self._time) > 0).all() or not np.isfinite(self._time).all():
+            raise InputError("time of the signals does not increase, sort it")
+        for joint in signals:
+            if joint not in circuit.joints:
+                raise InputError(f"no valve for '{joint}', {known(circuit.joints, joint)}")
+        columns = [
+            self._column(signals[joint], f"signal of '{joint}'")
+            if joint in signals
+            else np.full(len(self._time), circuit.valves[joint].neutral)
+            for joint in circuit.joints
+        ]
+        self.measured = supply is not None or tank is not None
+        if self.measured:
+            for given, usual, what in (
+                (supply, circuit.supply.pressure, "supply"),
+                (tank, circuit.supply.tank, "tank"),
+            ):
+                full = np.full(len(self._time), usual) if given is None else given
+                columns.append(self._column(full, f"pressure of the {what}"))
+        self._values = np.column_stack(columns)
+        self._count = len(circuit.joints)
+        self.columns = len(columns)
+
+    def _column(self, values: ArrayLike, what: str) -> Array:
+        return as_sample(values, len(self._time), what)
+
+    @property
+    def duration(self) -> float:
+        """From zero to the last instant [s]."""
+        return float(self._time[-1])
+
+    def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
+        """See `Command`."""
+
+    def references(self, times: Array) -> Array:
+        """See `Command`."""
+        return np.column_stack([np.interp(times, self._time, x) for x in self._values.T])
+
+    def signals(
+        self,
+        q_a: Sequence[Number],
+        v_a: Sequence[Number],
+        settings: Sequence[Number],
+        reference: Sequence[Number],
+    ) -> list[Number]:
+        """See `Command`."""
+        return list(reference[: self._count])
+
+
+def joystick(
+    machine: Machine, points: Mapping[str, Sequence[tuple[float, float]]] | str
+) -> Signals:
+    """Signals of levers: per joint a polygon of (time [s], lever from -1 to 1), or a task's name.
+
+    The lever asks for a share of the valve's flow: beyond zero it jumps over the dead band, as the
+    electronics of such machines do.
+
+    Raises:
+        InputError: Unknown joints or task, levers beyond -1 to 1, or times that do not increase.
+    """
+    circuit = circuit_of(machine)
+    last = 0.0
+    if isinstance(points, str):
+        task = machine.tasks.get(points)
+        if task is None or task.space != "joystick":
+            names = [name for name, task in machine.tasks.items() if task.space == "joystick"]
+            raise InputError(f"'{points}' is no task of levers, {known(names, points)}")
+        points, last = task.levers, task.duration
+    corners: dict[str, tuple[Array, Array]] = {}
+    for joint, polygon in points.items():
+        if joint not in circuit.joints:
+            raise InputError(f"no valve for '{joint}', {known(circuit.joints, joint)}")
+        table = np.array(polygon, dtype=np.float64).reshape(len(polygon), -1)
+        if table.shape[1:] != (2,) or not len(table):
+            raise InputError(f"lever of '{joint}': give pairs of time and position")
+        if not (np.diff(table[:, 0]) > 0).all() or not (np.abs(table[:, 1]) <= 1).all():
+            raise InputError(
+                f"lever of '{joint}': give increasing times and positions from -1 to 1"
+            )
+        corners[joint] = table[:, 0], table[:, 1]
+    # between corners the dead band is jumped where a lever passes zero: fine steps, not corners
+    last = max([last, *(times[-1] for times, _ in corners.values())])
+    fine = np.linspace(0.0, last, max(2, round(last / 1e-3) + 1))
+    signals = {}
+    for joint, (times, levers) in corners.items():
+        valve = circuit.valves[joint]
+        lever = np.interp(fine, times, levers)
+        u = lever * (1.0 - valve.dead_band) + valve.dead_band * np.sign(lever)
+        signals[joint] = valve.neutral + (valve.full - valve.neutral) * u
+    return Signals(machine, fine, signals)
+
+
+class ValvePD:
+    """One PD controller per valve, equation (37) of the electro-hydraulic forwarder paper.
+
+    u = K_p (q_ref - q) + K_d (q_ref' - q') + F_f, with the feedforward F_f that jumps over the
+    dead band d: F_f = d tanh(w / 0.01), w the sum of the other terms. q are the active joints'
+    own coordinates.
+
+    Args:
+        machine: The machine.
+        path: Reference of the active joints.
+        gains: By joint; those of the machine file if not given.
+
+    Raises:
+        InputError: No valves, or no gains for one.
+    """
+
+    measured = False
+    period = 0.0
+
+    def __init__(self, machine: Machine, path: Path, gains: Mapping[str, PDGains] | None = None):
+        circuit = circuit_of(machine)
+        gains = circuit.control if gains is None else gains
+        for joint in circuit.joints:
+            if joint not in gains:
+                raise InputError(
+                    f"no gains for the valve of '{joint}' of '{machine.name}', give kp and kd "
+                    "under 'control' of its 'hydraulics'"
+                )
+        self.path: Path | None = path
+        self._reference = path
+        self._which = [machine.active.index(joint) for joint in circuit.joints]
+        valves = circuit.valves.values()
+        numbers = [
+            [gains[joint].kp for joint in circuit.joints],
+            [gains[joint].kd for joint in circuit.joints],
+            [valve.dead_band for valve in valves],
+            [valve.neutral for valve in valves],
+            [valve.full - valve.neutral for valve in valves],
+        ]
+        self.settings = np.array(numbers, dtype=np.float64).ravel()
+        self.columns = 2 * len(self._which)
+
+    def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
+        """See `Command`."""
+
+    def references(self, times: Array) -> Array:
+        """See `Command`."""
+        q, v, _ = self._reference(times)
+        return np.hstack([q[:, self._which], v[:, self._which]])
+
+    def signals(
+        self,
+        q_a: Sequence[Number],
+        v_a: Sequence[Number],
+        settings: Sequence[Number],
+        reference: Sequence[Number],
+    ) -> list[Number]:
+        """See `Command`."""
+        m = len(self._which)
+        kp, kd, dead, neutral, span = (settings[i * m : (i + 1) * m] for i in range(5))
+        out: list[Number] = []
+        for i, joint in enumerate(self._which):
+            wanted = kp[i] * (reference[i] - q_a[joint])
+            wanted = wanted + kd[i] * (reference[m + i] - v_a[joint])
+            jump = dead[i] * apply("tanh", wanted * (1.0 / _JUMP))
+            out.append(neutral[i] + span[i] * (wanted + jump))
+        return out
+
+
+class Sampled:
+    """A program of the user that sets the valves once per period, as a control unit does.
+
+    Args:
+        function: (t, q_a, v_a, pressures) -> signals, in the order of `machine.hydraulics.joints`;
+            t [s], q_a and v_a (n,), pressures (m, 2) of A and B [Pa], signals (m,) [V].
+        machine: The machine.
+        period: [s], a whole number of steps of the simulation.
+    """
+
+    path: Path | None = None
+    measured = False
+    settings = np.zeros(0)
+
+    def __init__(
+        self,
+        function: Callable[[float, Array, Array, Array], ArrayLike],
+        machine: Machine,
+        period: float = 0.01,
+    ):
+        if not callable(function):
+            raise InputError(f"{function!r} is no function (t, q_a, v_a, pressures) -> signals")
+        self._function = function
+        self._joints = circuit_of(machine).joints
+        self._active = machine.closure.active
+        self.period = as_number(period, "the period", "s", above=0)
+        self.columns = len(self._joints)
+        self._held = np.zeros(self.columns)
+
+    def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
+        """See `Command`."""
+        answer = self._function(time, q[self._active].copy(), v_a.copy(), pressures)
+        what = f"the signals at t = {time:g} s"
+        self._held = as_sample(answer, self.columns, what, self._joints)
+
+    def references(self, times: Array) -> Array:
+        """See `Command`."""
+        return np.tile(self._held, (len(times), 1))
+
+    def signals(
+        self,
+        q_a: Sequence[Number],
+        v_a: Sequence[Number],
+        settings: Sequence[Number],
+        reference: Sequence[Number],
+    ) -> list[Number]:
+        """See `Command`."""
+        return list(reference)

@@ -1,0 +1,184 @@
+"""Measured valve signals put through the model, and what comes out beside what was measured."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from crane import timeseries
+from crane.control import Signals, ValveDrive
+from crane.errors import InputError, RecordingError, known
+from crane.machine import Machine
+from crane.measured import motion_of
+from crane.recording import Recording
+from crane.samples import Array
+from crane.simulation import Progress, simulate
+from crane.timeseries import TIME, Table
+
+_SIGNAL, _SUPPLY, _TANK = "voltage_", "pressure_supply", "pressure_tank"
+_FIRST = 0.1  # over which the velocity at the start is fitted [s]
+_FEWEST = 5  # samples of that fit
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """One channel, measured and simulated at the measured instants.
+
+    Attributes:
+        name: Of the column.
+        unit: Its unit.
+        measured: (N,).
+        simulated: (N,).
+    """
+
+    name: str
+    unit: str
+    measured: Array
+    simulated: Array
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square of the difference, in the channel's unit."""
+        return float(np.sqrt(np.mean((self.simulated - self.measured) ** 2)))
+
+    @property
+    def relative(self) -> float:
+        """The same over that of the measured channel about its mean; infinite if that rests."""
+        spread = float(np.std(self.measured))
+        return self.rms / spread if spread > 0 else (0.0 if self.rms == 0 else np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A recording beside the simulation of the same inputs.
+
+    Attributes:
+        time: Instants (N,) [s] from the start.
+        channels: What both hold.
+    """
+
+    time: Array
+    channels: tuple[Channel, ...]
+
+    def to_markdown(self) -> str:
+        """A table with a row per channel."""
+        lines = [
+            "| channel | unit | RMS error | relative to its variation |",
+            "|---|---|---:|---:|",
+        ]
+        lines += [
+            f"| {x.name} | {x.unit} | {x.rms:.4g} | {100 * x.relative:.2f} % |"
+            for x in self.channels
+        ]
+        return "\n".join(lines) + "\n"
+
+
+def replay(
+    machine: Machine, path: str | Path, step: float = 1e-3, progress: Progress | None = None
+) -> tuple[Recording, Comparison]:
+    """Simulate a hydraulic machine with measured valve signals.
+
+    The file has a column voltage_X [V] for every valve that was moved, pressures of pump and tank
+    where they were measured (pressure_supply, pressure_tank), and whatever else is to be compared:
+    strokes or angles, velocities, pressures (see `crane.measured`). The simulation starts from the
+    measured posture, its velocity fitted over the first tenth of a second, and from the measured
+    pressures; where the file does not tell, from the home posture at rest, and from what holds it.
+
+    Args:
+        machine: The machine.
+        path: A CSV or npz file.
+        step: Of the simulation [s].
+        progress: Called with the finished share, 0 to 1.
+
+    Returns:
+        The simulated recording, and its comparison with the file.
+
+    Raises:
+        RecordingError: The file is malformed, or has no signals.
+        InputError: The machine has no valves.
+    """
+    table = timeseries.read(path)
+    try:
+        time, drive, initial = _prepare(machine, table)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
+    steps = int(time[-1] / step + 1e-9)
+    if steps < 1:
+        raise RecordingError(f"{path}: is shorter than a step of {step:g} s, shorten the step")
+    task = Path(path).stem
+    recording = simulate(machine, drive, initial, steps * step, step, task=task, progress=progress)
+    return recording, compare(table, recording)
+
+
+def compare(table: Table, recording: Recording) -> Comparison:
+    """Channels that a file and a simulation both hold, but for the inputs.
+
+    Args:
+        table: What was measured.
+        recording: What was simulated from the same instant on.
+    """
+    time = _column(table, TIME)
+    time = time - time[0]
+    inside = time <= recording.time[-1] * (1 + 1e-12)
+    columns = recording.columns()
+    found = [
+        Channel(
+            name,
+            table.units[name],
+            _column(table, name)[inside],
+            np.interp(time[inside], recording.time, columns[name]),
+        )
+        for name in table.units
+        if name in columns and name not in (TIME, _SUPPLY, _TANK) and not name.startswith(_SIGNAL)
+    ]
+    return Comparison(time[inside], tuple(found))
+
+
+def _prepare(
+    machine: Machine, table: Table
+) -> tuple[Array, ValveDrive, tuple[Array, Array] | None]:
+    """Time from zero, the valves' drive, and the state at the start."""
+    joints = machine.hydraulics.joints if machine.hydraulics else ()
+    if not joints:
+        raise InputError(
+            f"machine '{machine.name}' has no valves, describe its circuit under 'hydraulics' of "
+            "the machine file"
+        )
+    time = _column(table, TIME)
+    time = time - time[0]
+    if len(time) < 2:
+        raise RecordingError("has one sample, give at least two")
+    signals = {}
+    for name in table.units:
+        if name.startswith(_SIGNAL):
+            joint = name.removeprefix(_SIGNAL)
+            if joint not in joints:
+                raise RecordingError(f"column '{name}' is of no valve, {known(joints, joint)}")
+            signals[joint] = _column(table, name)
+    if not signals:
+        names = ", ".join(f"'{_SIGNAL}{joint} [V]'" for joint in joints)
+        raise RecordingError(f"no signal of a valve, give at least one of {names}")
+    supply, tank = (
+        _column(table, name) if name in table.units else None for name in (_SUPPLY, _TANK)
+    )
+    pressures: dict[str, tuple[float, float]] = {}
+    for joint in joints:
+        pair = [f"pressure_{joint}_{side}" for side in "ab"]
+        if all(name in table.units for name in pair):
+            a, b = (float(_column(table, name)[0]) for name in pair)
+            pressures[joint] = a, b
+    drive = ValveDrive(machine, Signals(machine, time, signals, supply, tank), pressures)
+    initial = None
+    if any(joint in table.units for joint in machine.joints):
+        q_a, v_a = motion_of(machine, table)
+        first = time <= max(_FIRST, time[min(_FEWEST, len(time)) - 1])
+        if any(f"{joint}_velocity" in table.units for joint in machine.joints):
+            initial = q_a[0], v_a[0]
+        else:
+            slope = np.polyfit(time[first], q_a[first], 1)[0] if first.sum() > 2 else v_a[0]
+            initial = q_a[0], slope
+    return time, drive, initial
+
+
+def _column(table: Table, name: str) -> Array:
+    return table.values[:, list(table.units).index(name)]

@@ -1,0 +1,81 @@
+"""Derivatives of traced formulas, as formulas."""
+
+from collections.abc import Callable, Sequence
+
+from crane.straight.scalar import Expression, Number, Tape, apply, where_positive, with_sign_of
+
+# Of functions of one number: f'(x) by x and y = f(x).
+_ONE: dict[str, Callable[[Expression, Expression], Number]] = {
+    "sin": lambda x, y: apply("cos", x),
+    "cos": lambda x, y: -apply("sin", x),
+    "exp": lambda x, y: y,
+    "log": lambda x, y: 1.0 / x,
+    "tanh": lambda x, y: 1.0 - y * y,
+    "sqrt": lambda x, y: 0.5 / y,
+    "abs": lambda x, y: with_sign_of(1.0, x),
+}
+
+
+def derivatives(outputs: Sequence[Number], by: Sequence[Expression]) -> list[list[Number]]:
+    """Jacobian of formulas, the derivative that is not there being the number 0.
+
+    At a kink it is that of one of the two sides.
+
+    Args:
+        outputs: (m,) formulas on one tape.
+        by: (n,) what was loaded, or any expressions on the tape that count as independent.
+
+    Returns:
+        (m, n) formulas on the same tape.
+    """
+    if not by:
+        return [[] for _ in outputs]
+    tape = by[0].tape
+    columns = [_along(tape, outputs, variable.index) for variable in by]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _along(tape: Tape, outputs: Sequence[Number], variable: int) -> list[Number]:
+    last = max((x.index for x in outputs if isinstance(x, Expression)), default=-1)
+    slope: dict[int, Number] = {variable: 1.0}
+    for index in range(variable + 1, last + 1):
+        kind, *operands = tape.operations[index]
+        if kind == "load":
+            continue
+        if not any(type(x) is int and x in slope for x in operands):
+            continue
+        change = _change(tape, index, kind, operands, slope)
+        if isinstance(change, Expression) or change != 0:
+            slope[index] = change
+    return [slope.get(x.index, 0.0) if isinstance(x, Expression) else 0.0 for x in outputs]
+
+
+def _change(tape: Tape, index: int, kind: str, operands: list, slope: dict[int, Number]) -> Number:
+    value: list[Number] = [Expression(tape, x) if type(x) is int else x for x in operands]
+    moved: list[Number] = [slope.get(x, 0.0) if type(x) is int else 0.0 for x in operands]
+    a, da = value[0], moved[0]
+    if kind == "fneg":
+        return -da
+    if kind in _ONE:
+        assert isinstance(a, Expression)
+        return da * _ONE[kind](a, Expression(tape, index))
+    b, db = value[1], moved[1]
+    if kind == "fadd":
+        return da + db
+    if kind == "fsub":
+        return da - db
+    if kind == "fmul":
+        return da * b + a * db
+    if kind == "fdiv":
+        return (da - Expression(tape, index) * db) / b
+    if kind == "maximum":
+        return where_positive(a - b, da, db)
+    if kind == "copysign":
+        # |a| with the sign of b: as a changes while both have one sign, else against it
+        assert isinstance(b, Expression)
+        flipped = with_sign_of(1.0, b)
+        if isinstance(a, Expression):
+            flipped = flipped * with_sign_of(1.0, a)
+        return da * flipped
+    assert kind == "positive"
+    return where_positive(a, db, moved[2])

@@ -1,0 +1,63 @@
+"""Measured beside simulated channels as one figure."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from crane.recording import FORCE_UNITS
+from crane.replay import Channel, Comparison
+from crane.summary import READING_UNITS
+from crane.view.plots import DASHED, RECORDED, write_figure
+
+_ACROSS = 3
+_MOST = 4000  # instants that a line needs
+_READING = {
+    **READING_UNITS,
+    **{f"{unit}/s": (f"{name}/s", scale) for unit, (name, scale) in READING_UNITS.items()},
+    "Pa": ("bar", 1e-5),
+    "m3/s": ("l/min", 6e4),
+    **{unit: (unit, 1.0) for unit in FORCE_UNITS.values()},
+}
+
+
+def plot_comparison(comparison: Comparison, path: str | Path) -> None:
+    """Write the figure of a comparison: measured lines, dashed what the model says.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    write_figure(path, lambda: _figure(comparison))
+
+
+def _figure(comparison: Comparison) -> Figure:
+    count = len(comparison.channels)
+    across = min(_ACROSS, count)
+    rows = -(-count // across)
+    figure = Figure(figsize=(3.4 * across, 1.9 * rows + 0.4), layout="constrained")
+    panels = figure.subplots(rows, across, sharex=True, squeeze=False).ravel()
+    every = -(-len(comparison.time) // _MOST)
+    time = comparison.time[::every]
+    for axes, channel in zip(panels, comparison.channels, strict=False):
+        unit, scale = _reading(channel)
+        axes.plot(time, scale * channel.measured[::every], color=RECORDED, label="measured")
+        axes.plot(time, scale * channel.simulated[::every], label="simulated", **DASHED)
+        label = f" [{unit}]" if unit else ""
+        axes.set_ylabel(f"{channel.name.replace('$', '')}{label}")
+        axes.set_title(
+            f"RMS {scale * channel.rms:.3g} {unit}, {100 * channel.relative:.3g} %", fontsize=8
+        )
+        axes.margins(x=0.0)
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    for axes in panels[max(count - across, 0) : count]:
+        axes.tick_params(labelbottom=True)
+        axes.set_xlabel("time [s]")
+    panels[0].legend(loc="best", fontsize=7)
+    return figure
+
+
+def _reading(channel: Channel) -> tuple[str, float]:
+    """Unit to read a channel in, and how many of it make one SI unit."""
+    name, scale = _READING.get(channel.unit, (channel.unit, 1.0))
+    return name, float(np.float64(scale))

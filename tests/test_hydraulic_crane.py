@@ -1,0 +1,273 @@
+"""The full-size crane on its hydraulics: what the issue of it asks to be shown."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import crane
+from crane.control import Sampled, Signals, TipVelocity, ValveDrive, ValvePD, joystick
+from crane.hydraulics.circuit import BALANCES
+from crane.paths import task_path
+
+LOAD = {"payload.mass": 211.4}
+LIFT = 1  # column of X_lift
+
+
+@pytest.fixture(scope="module")
+def patu():
+    return crane.load("patu655")
+
+
+@pytest.fixture(scope="module")
+def loaded():
+    return crane.load("patu655", changes=LOAD)
+
+
+def lifting(machine, volts=5.0):
+    return Signals(machine, [0.0, 1.0, 1.1], {"X_lift": [5.8, 5.8, volts]})
+
+
+def change(recording, name):
+    return recording.channels[name][-1] - recording.channels[name][0]
+
+
+def swept(machine, recording):
+    """What the cylinders' volumes have grown by [m3]."""
+    total = 0.0
+    for joint, cylinder in machine.hydraulics.cylinders.items():
+        x = recording.q[:, recording.joints.index(joint)]
+        total += (cylinder.area_a - cylinder.area_b) * (x[-1] - x[0])
+    return total
+
+
+def check_balances(machine, recording, energy=1e-4):
+    """Oil to 1e-9, energy to 1e-4 of what went through."""
+    channels = recording.channels
+    assert all(np.isfinite(values).all() for values in channels.values())
+    assert np.isfinite(recording.q).all()
+    oil = change(recording, "oil_pumped") - change(recording, "oil_returned")
+    oil -= change(recording, "oil_stored") + swept(machine, recording)
+    through = np.ptp(channels["oil_pumped"]) + np.ptp(channels["oil_returned"]) + 1e-9
+    assert abs(oil) < 1e-9 * through
+    hydraulic = change(recording, "pump_work") - change(recording, "work")
+    hydraulic -= change(recording, "hydraulic_loss") + change(recording, "oil_energy")
+    mechanical = change(recording, "work") - change(recording, "dissipated")
+    mechanical -= change(recording, "kinetic") + change(recording, "potential")
+    work = max(np.ptp(channels[name]) for name in ("pump_work", "work", "potential")) + 1e-6
+    assert abs(hydraulic) < energy * work
+    assert abs(mechanical) < energy * work
+    assert (np.diff(channels["hydraulic_loss"]) > -1e-6).all()
+
+
+def test_steady_lifting_is_the_published_speed(patu, loaded):
+    """14.1 mm/s at 5.0 V; the valve's law says 14.6 on the piston's area."""
+    law = 40 / 6e4 * ((0.8 / 3 - 0.1143) / 0.8857) / 7.853981633974483e-3
+    assert law == pytest.approx(14.1e-3, rel=0.04)
+    for machine in (patu, loaded):
+        recording = crane.simulate(machine, lifting(machine), duration=6.0)
+        speed = recording.v[-1000:, LIFT].mean()
+        # what is missing leaks, and is pressed together
+        assert speed == pytest.approx(law, rel=3e-3)
+        assert speed <= law
+        check_balances(machine, recording)
+
+
+def test_holding_pressure_is_the_published_one(patu, loaded):
+    """66 bar at rest near level with the load, about half of it without."""
+    empty, full = (
+        crane.simulate(machine, duration=0.5).channels["pressure_X_lift_a"][0]
+        for machine in (patu, loaded)
+    )
+    assert full == pytest.approx(66e5, rel=0.12)
+    assert empty == pytest.approx(full / 2, rel=0.12)
+
+
+def test_closed_valves_leak_by_the_law(loaded):
+    """The lift cylinder sinks by leakage alone: x' = -k (p_A - p_R) / A_A."""
+    recording = crane.simulate(loaded, duration=20.0)
+    late = recording.time > 10.0
+    x = recording.q[late, LIFT]
+    sinking = np.polyfit(recording.time[late], x, 1)[0]
+    cylinder = loaded.hydraulics.cylinders["X_lift"]
+    p = recording.channels["pressure_X_lift_a"][late].mean()
+    law = -cylinder.leakage_a * (p - 1e5) / cylinder.area_a
+    assert sinking == pytest.approx(law, rel=1e-2)
+    check_balances(loaded, recording)
+
+
+def test_without_leakage_closed_valves_hold():
+    none = {
+        f"cylinder.{joint}.leakage_{side}": 0.0
+        for joint in ("slew", "X_lift", "X_tilt", "X_ext")
+        for side in "ab"
+    }
+    machine = crane.load("patu655", changes=LOAD | none)
+    recording = crane.simulate(machine, duration=20.0)
+    assert np.abs(recording.q - recording.q[0]).max() < 1e-9
+
+
+def test_stiff_oil_moves_with_its_flow(loaded):
+    """The stiffer the oil, the nearer the speed is to Q / A at every instant."""
+    gaps = []
+    for factor in (1.0, 10.0, 100.0):
+        changes = {
+            "oil.bulk_modulus": factor * 1.65e9,
+            "oil.hose_modulus": factor * 0.7e9,
+            "oil.steel_modulus": factor * 2.1e11,
+        }
+        machine = crane.load("patu655", changes=LOAD | changes)
+        smooth = Signals(
+            machine, np.linspace(0, 4, 401),
+            {"X_lift": 5.8 - 0.4 - 0.3 * np.sin(np.pi * np.linspace(0, 4, 401) / 2) ** 2},
+        )  # fmt: skip
+        recording = crane.simulate(machine, smooth, duration=4.0)
+        flow = recording.channels["flow_X_lift_a"] / machine.hydraulics.cylinders["X_lift"].area_a
+        late = recording.time > 1.0
+        gaps.append(np.sqrt(np.mean((recording.v[late, LIFT] - flow[late]) ** 2)))
+    assert gaps[1] < gaps[0] / 5
+    assert gaps[2] < gaps[1] / 5
+
+
+@pytest.mark.parametrize("task", ["reach", "swing"])
+def test_halving_the_step_changes_nothing(loaded, task):
+    control = ValvePD(loaded, task_path(loaded, task))
+    whole = crane.simulate(loaded, control)
+    half = crane.simulate(loaded, control, step=5e-4)
+    assert np.abs(half.q[::2] - whole.q).max() < 1e-6
+    error = whole.q - np.column_stack([whole.channels[f"reference_{x}"] for x in whole.joints])
+    assert np.abs(error[:, 1:3]).max() < 0.03  # and it does follow
+    check_balances(loaded, whole)
+
+
+def test_machine_code_agrees_with_scipy_on_pinocchio(patu):
+    """Another method, another path of the dynamics, formulas in floats."""
+    opening = Signals(patu, [0.0, 0.1, 0.2], {"X_lift": [5.8, 5.8, 4.6]})
+    fast = crane.simulate(patu, opening, duration=0.4, step=1e-2)
+    slow = crane.simulate(patu, opening, duration=0.4, step=1e-2, path="pinocchio")
+    assert np.ptp(fast.q[:, LIFT]) > 3e-3
+    assert np.abs(fast.q - slow.q).max() < 1e-7
+    for joint in fast.joints:
+        name = f"pressure_{joint}_a"
+        assert np.abs(fast.channels[name] - slow.channels[name]).max() < 2e3
+    assert set(fast.channels) == set(slow.channels)
+
+
+def test_a_minute_of_work_balances(loaded):
+    """Every function, both ways, over 60 s: oil to 1e-9, energy to 1e-4 of the throughput."""
+    levers = {
+        "slew": [(0, 0), (2, 0.2), (8, 0.2), (9, -0.2), (15, -0.2), (16, 0), (60, 0)],
+        "X_lift": [(0, 0), (10, 0), (11, 0.25), (20, 0.25), (21, -0.1), (40, -0.1), (41, 0)],
+        "X_tilt": [(0, 0), (25, 0), (26, 0.2), (32, 0.2), (33, -0.2), (38, -0.2), (39, 0)],
+        "X_ext": [(0, 0), (45, 0), (46, 0.3), (50, 0.3), (52, -0.3), (56, -0.3), (57, 0)],
+    }
+    recording = crane.simulate(loaded, joystick(loaded, levers), duration=60.0)
+    check_balances(loaded, recording)
+    assert set(BALANCES) <= set(recording.channels)
+    assert np.ptp(recording.channels["pump_work"]) > 5e4
+
+
+def test_tip_velocity_is_the_commanded_one(loaded):
+    """Outwards, then upwards, then sideways; open loop."""
+
+    def wanted(t):
+        def pulse(start):
+            return np.clip((t - start) / 0.5, 0, 1) * np.clip((start + 3 - t) / 0.5, 0, 1)
+
+        return np.array([0.25 * pulse(0.5), 0.15 * pulse(8.0), 0.15 * pulse(4.0)])
+
+    recording = crane.simulate(loaded, TipVelocity(loaded, wanted), duration=12.0)
+    tip = np.column_stack([recording.channels[f"tip_{axis}"] for axis in "xyz"])
+    speed = np.gradient(tip, recording.time, axis=0)
+    for at in (2.5, 6.0, 10.0):
+        near = np.abs(recording.time - at) < 0.25
+        assert np.abs(speed[near].mean(axis=0) - wanted(at)).max() < 0.03
+
+
+def test_a_program_sees_what_the_machine_does(patu):
+    """The user's own control unit, called once per period with posture and pressures."""
+    calls = []
+
+    def program(time, q_a, v_a, pressures):
+        calls.append((time, q_a.copy(), pressures.copy()))
+        return [5.8, 5.0 if q_a[LIFT] < 0.13 else 5.8, 5.8, 5.8]
+
+    recording = crane.simulate(patu, Sampled(program, patu, period=0.02), duration=3.0)
+    assert [t for t, _, _ in calls] == pytest.approx(0.02 * np.arange(150))
+    t, q_a, pressures = calls[50]
+    at = round(t * 1000)
+    np.testing.assert_array_equal(q_a, recording.q[at])
+    assert pressures[LIFT, 0] == recording.channels["pressure_X_lift_a"][at]
+    assert recording.q[-1, LIFT] == pytest.approx(0.13, abs=2e-3)
+
+
+# What goes wrong on real machines
+
+
+def test_supply_pressure_zero(loaded):
+    """Compensators let nothing back: the boom stays up, the cylinder does not extend."""
+    machine = crane.load("patu655", changes=LOAD | {"supply.pressure": 0.0})
+    recording = crane.simulate(machine, lifting(machine), duration=3.0)
+    check_balances(machine, recording)
+    assert np.abs(recording.q - recording.q[0]).max() < 1e-3
+    lowering = Signals(machine, [0, 1, 1.2], {"X_lift": [5.8, 5.8, 6.6]})
+    recording = crane.simulate(machine, lowering, duration=3.0)
+    check_balances(machine, recording)
+    assert recording.q[-1, LIFT] < recording.q[0, LIFT] - 0.01  # by its weight
+
+
+def test_valve_stuck_open_runs_into_the_end_stop(loaded):
+    stuck = Signals(loaded, [0.0], {"X_lift": [2.8]})
+    recording = crane.simulate(loaded, stuck, duration=15.0)
+    check_balances(loaded, recording)
+    upper = loaded.upper[LIFT]
+    assert recording.q[-1, LIFT] == pytest.approx(upper, abs=5e-3)
+    assert abs(recording.v[-1, LIFT]) < 1e-4
+    # the compensator lets nothing back: what the jolt pressed together stays, but for leakage
+    assert recording.channels["pressure_X_lift_a"][-1] > 0.99 * 9.25e6
+
+
+def test_ten_times_the_load_comes_down():
+    """It takes more than the shock valves hold: they let the boom down onto its stop."""
+    machine = crane.load("patu655", changes={"payload.mass": 2114.0})
+    recording = crane.simulate(machine, lifting(machine, 2.8), duration=8.0)
+    check_balances(machine, recording)
+    pressures = np.array([v for k, v in recording.channels.items() if k.startswith("pressure_X")])
+    assert pressures.min() >= machine.hydraulics.oil.vapour_pressure
+    relief = machine.hydraulics.cylinders["X_lift"].relief
+    assert recording.channels["pressure_X_lift_a"][0] > relief
+    assert recording.q[-1, LIFT] < 0.01
+    assert np.abs(recording.v[-1]).max() < 1e-2
+
+
+def test_pressures_at_the_start_are_checked(patu):
+    with pytest.raises(crane.CraneError, match=r"cannot be negative: add 1e5"):
+        ValveDrive(patu, lifting(patu), {"X_lift": (-1e5, 1e5)})
+    with pytest.raises(crane.CraneError, match="finite"):
+        ValveDrive(patu, lifting(patu), {"X_lift": (np.nan, 1e5)})
+    with pytest.raises(crane.CraneError, match="no cylinder at 'X_lfit'.*X_lift"):
+        ValveDrive(patu, lifting(patu), {"X_lfit": (1e5, 1e5)})
+
+
+def test_locked_slewing_has_no_valve():
+    machine = crane.load("patu655", lock={"slew": 0.3})
+    assert machine.hydraulics.joints == ("X_lift", "X_tilt", "X_ext")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        recording = crane.simulate(machine, lifting(machine), duration=2.0)
+    check_balances(machine, recording)
+
+
+def test_signals_that_cannot_be_are_refused(patu):
+    with pytest.raises(crane.CraneError, match="no valve for 'q2'"):
+        Signals(patu, [0.0, 1.0], {"q2": [5.8, 5.8]})
+    with pytest.raises(crane.CraneError, match="does not increase"):
+        Signals(patu, [0.0, 0.0], {"X_lift": [5.8, 5.8]})
+    with pytest.raises(crane.CraneError, match="finite"):
+        Signals(patu, [0.0, 1.0], {"X_lift": [5.8, np.nan]})
+    with pytest.raises(crane.CraneError, match="-1 to 1"):
+        joystick(patu, {"X_lift": [(0, 1.5)]})
+    with pytest.raises(crane.CraneError, match="period"):
+        crane.simulate(patu, Sampled(lambda *_: [5.8] * 4, patu, 0.0015), duration=0.1)
+    with pytest.raises(crane.CraneError, match="has no valves"):
+        ValvePD(crane.load("mini_forwarder"), None)

@@ -1,0 +1,150 @@
+"""Measured valve signals put through the model."""
+
+import numpy as np
+import pytest
+from hydraulic_rig import COMPENSATED, rig
+
+import crane
+from crane import timeseries
+from crane.control import Signals
+from crane.errors import CraneError, RecordingError
+from crane.replay import replay
+from crane.timeseries import Table
+
+
+@pytest.fixture
+def measured(tmp_path):
+    """A rig's file, from a simulation that begins before the file does."""
+    machine = rig(tmp_path, COMPENSATED, supply={"pressure": 1.2e7})
+    times = np.linspace(0, 4, 41)
+    signals = Signals(machine, times, {"x": 5.8 - 0.9 * np.sin(2 * np.pi * times / 2)})
+    recording = crane.simulate(machine, signals, duration=4.0)
+    return machine, recording
+
+
+def write(path, columns, units):
+    timeseries.write(path, Table(units, np.column_stack(list(columns.values())), {}))
+    return path
+
+
+def columns_of(recording, start=0, every=1):
+    chosen = slice(start, None, every)
+    columns = {
+        "time": recording.time[chosen] + 12.5,
+        "x": 1e3 * recording.q[chosen, 0],
+        "x_velocity": recording.v[chosen, 0],
+        "voltage_x": recording.channels["voltage_x"][chosen],
+        "pressure_x_a": recording.channels["pressure_x_a"][chosen] / 1e5,
+        "pressure_x_b": recording.channels["pressure_x_b"][chosen] / 1e5,
+        "pressure_supply": recording.channels["pressure_supply"][chosen],
+    }
+    units = dict(zip(columns, ("s", "mm", "m/s", "V", "bar", "bar", "Pa"), strict=True))
+    return columns, units
+
+
+def test_the_model_s_own_recording_comes_back(tmp_path, measured):
+    """From a lift on, in mm and bar, with a clock of its own: everything as it was."""
+    machine, recording = measured
+    path = write(tmp_path / "file.csv", *columns_of(recording, start=300))
+    again, comparison = replay(machine, path)
+    rows = {channel.name: channel for channel in comparison.channels}
+    assert set(rows) == {"x", "x_velocity", "pressure_x_a", "pressure_x_b"}
+    assert rows["x"].rms < 1e-7
+    assert rows["pressure_x_a"].rms < 2e3
+    assert rows["x"].relative < 1e-5
+    assert again.time[-1] == pytest.approx(3.7)
+    assert again.task == "file"
+    assert np.ptp(recording.q[300:, 0]) > 0.005
+
+
+def test_a_wrong_model_shows(tmp_path, measured):
+    """RMS error and its share of the variation, against numpy."""
+    machine, recording = measured
+    path = write(tmp_path / "file.csv", *columns_of(recording, every=10))
+    slower = machine.replace(hydraulics=crane.load(_slower(tmp_path)).hydraulics)
+    again, comparison = replay(slower, path)
+    x = next(channel for channel in comparison.channels if channel.name == "x")
+    gap = np.interp(recording.time[::10], again.time, again.q[:, 0]) - recording.q[::10, 0]
+    assert x.rms == pytest.approx(np.sqrt(np.mean(gap**2)), rel=1e-9)
+    assert x.relative == pytest.approx(x.rms / np.std(recording.q[::10, 0]), rel=1e-9)
+    assert x.relative > 0.05
+    assert f"| x | m | {x.rms:.4g} |" in comparison.to_markdown()
+
+
+def _slower(folder):
+    other = folder / "slower"
+    other.mkdir()
+    rig(other, {**COMPENSATED, "flow": 20 / 6e4}, supply={"pressure": 1.2e7})
+    return other / "rig.yaml"
+
+
+def test_measured_pressures_of_supply_and_tank_drive_it(tmp_path, measured):
+    """A supply that fails half-way: the load stops rising."""
+    machine, _ = measured
+    time = np.linspace(0, 4, 401)
+    columns = {
+        "time": time,
+        "x": np.full(401, 0.2),
+        "voltage_x": np.full(401, 5.0),
+        "pressure_supply": np.where(time < 2, 1.2e7, 1e5),
+        "pressure_tank": np.full(401, 3e5),
+    }
+    units = dict(zip(columns, ("s", "m", "V", "Pa", "Pa"), strict=True))
+    again, _ = replay(machine, write(tmp_path / "file.csv", columns, units))
+    speed = again.v[:, 0]
+    assert speed[1800] == pytest.approx(14.6e-3, rel=0.02)
+    assert abs(speed[-200:]).max() < 1e-4
+    assert again.channels["pressure_tank"] == pytest.approx(3e5)
+    assert again.channels["pressure_supply"][-1] == 1e5
+
+
+def test_angles_serve_as_well_as_strokes(tmp_path):
+    """A crane with an angle sensor at the boom, in degrees."""
+    machine = crane.load("patu655", lock={"slew": 0.0})
+    recording = crane.simulate(machine, crane.joystick(machine, "stir"), duration=6.0)
+    columns = {
+        "time": recording.time,
+        "q2": np.degrees(recording.channels["q2"]),
+        "X_tilt": recording.q[:, 1],
+        "X_ext": recording.q[:, 2],
+        "voltage_X_lift": recording.channels["voltage_X_lift"],
+        "voltage_X_ext": recording.channels["voltage_X_ext"],
+    }
+    units = dict(zip(columns, ("s", "deg", "m", "m", "V", "V"), strict=True))
+    _, comparison = replay(machine, write(tmp_path / "file.csv", columns, units))
+    rows = {channel.name: channel.rms for channel in comparison.channels}
+    assert set(rows) == {"q2", "X_tilt", "X_ext"}
+    assert max(rows.values()) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (lambda c, u: c.pop("voltage_x"), "no signal of a valve, give at least one of 'voltage_x"),
+        (lambda c, u: c.update(voltage_y=c.pop("voltage_x")), "'voltage_y' is of no valve"),
+        (lambda c, u: c["voltage_x"].__setitem__(3, np.nan), "'nan' is not a finite number"),
+        (lambda c, u: c["pressure_x_a"].__setitem__(0, -3.0), "cannot be negative: add 1e5"),
+        (lambda c, u: c["x"].__setitem__(0, 9e3), "outside of its limits"),
+    ],
+)
+def test_bad_files_are_refused_in_one_line(tmp_path, measured, change, line):
+    machine, recording = measured
+    columns, units = columns_of(recording, every=100)
+    columns = {name: values.copy() for name, values in columns.items()}
+    change(columns, units)
+    units = {name: units.get(name, "V") for name in columns}
+    path = write(tmp_path / "file.csv", columns, units)
+    with pytest.raises(CraneError) as caught:
+        replay(machine, path)
+    assert line in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_one_sample_and_other_machines_are_refused(tmp_path, measured):
+    machine, recording = measured
+    columns, units = columns_of(recording)
+    one = write(tmp_path / "one.csv", {k: v[:1] for k, v in columns.items()}, units)
+    with pytest.raises(RecordingError, match=r"one\.csv: has one sample, give at least two"):
+        replay(machine, one)
+    with pytest.raises(CraneError, match="has no valves"):
+        replay(crane.load("mini_forwarder"), one)
