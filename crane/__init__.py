@@ -19,8 +19,11 @@ if TYPE_CHECKING:
     from crane.description import EndStop, ForceElement, Friction, GasSpring, PIGains
     from crane.dynamics import Dynamics
     from crane.errors import CraneError, CraneWarning
+    from crane.identification.cylinder_friction import cylinder_friction
     from crane.identification.identify import identify
+    from crane.identification.orifices import identify_orifices
     from crane.identification.result import Identification
+    from crane.identification.valve import identify_valve
     from crane.kinematics import Kinematics
     from crane.machine import Machine, Payload, load
     from crane.measured import read_measured
@@ -47,7 +50,10 @@ _HOMES = {
     "crane.description": ("EndStop", "ForceElement", "Friction", "GasSpring", "PIGains"),
     "crane.dynamics": ("Dynamics",),
     "crane.errors": ("CraneError", "CraneWarning"),
+    "crane.identification.cylinder_friction": ("cylinder_friction",),
     "crane.identification.identify": ("identify",),
+    "crane.identification.orifices": ("identify_orifices",),
+    "crane.identification.valve": ("identify_valve",),
     "crane.identification.result": ("Identification",),
     "crane.kinematics": ("Kinematics",),
     "crane.machine": ("Machine", "Payload", "load"),
@@ -64,7 +70,8 @@ __all__ = [
     "PI", "Batch", "Closure", "Comparison", "ComputedTorque", "CraneError", "CraneWarning",
     "Dynamics", "EndStop", "ForceElement", "Friction", "GasSpring", "Identification", "Kinematics",
     "Machine", "PIGains", "Path", "Payload", "Recording", "Sampled", "Signals", "Study",
-    "TipVelocity", "ValveDrive", "ValvePD", "identify", "joystick", "load", "point_to_point",
+    "TipVelocity", "ValveDrive", "ValvePD", "cylinder_friction", "identify",
+    "identify_orifices", "identify_valve", "joystick", "load", "point_to_point",
     "polynomial", "read_measured", "replay", "simulate", "simulate_batch", "study", "task_path",
     "tip_path",
 ]  # fmt: skip

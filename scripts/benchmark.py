@@ -16,6 +16,7 @@ from pathlib import Path
 
 from engines import work_precision
 from evaluations import agree, forward_dynamics, one_step, task
+from hydraulic_crane import hydraulic_crane
 from stacks import stacks, threads
 from starting import starts
 from subject import swinging
@@ -54,6 +55,7 @@ def main() -> None:
         ("A controlled task", lambda: task(mini, few)),
         ("Stacks", lambda: stacks(mini, few)),
         ("Threads", lambda: threads(mini, few)),
+        ("A crane on its valves", lambda: hydraulic_crane(few)),
         ("Starting", lambda: starts(few)),
         ("Work and precision", lambda: work_precision(bare, few, picture)),
     ):

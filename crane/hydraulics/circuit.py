@@ -1,57 +1,26 @@
-"""Pressures, flows and forces of a circuit as formulas, equations (20) to (23)."""
+"""A circuit as formulas: cylinders with their valves, spools, supply, and what balances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from crane.description import Counterbalance, Cylinder, Hydraulics, Valve
-from crane.hydraulics.flow import clipped, in_series, root, through
+from crane.description import Hydraulics
+from crane.hydraulics.flow import clipped
+from crane.hydraulics.function import FIELDS, WIDTH, Chamber, Function, row_of
 from crane.samples import Array
 from crane.straight import Number, maximum
-from crane.straight.scalar import apply, where_positive
 
-GAS_PRESSURE = 1.0e5  # at which volumes of entrapped gas are given [Pa]
 # Integrals that balance: pumped = returned + stored + volume swept, and pump_work = work of the
 # cylinders + hydraulic_loss + oil_energy.
 BALANCES = {
     "oil_pumped": "m3", "oil_returned": "m3", "oil_stored": "m3",
     "pump_work": "J", "hydraulic_loss": "J", "oil_energy": "J",
 }  # fmt: skip
-_SLIGHT = 0.1  # of the hose's volume, the least that a chamber holds
-_FIELDS = (
-    "area_a", "area_b", "hose_a", "hose_b", "gas_a", "gas_b", "leakage", "leakage_a", "leakage_b",
-    "relief", "relief_gain", "refill", "cushion", "cushion_resistance", "stiffness", "damping",
-    "stroke", "c1", "c2", "c3", "c4", "margin", "neutral", "per_signal", "dead_band", "per_stroke",
-    "bandwidth", "spool_damping", "rate",
-)  # fmt: skip
-_HOLDING = ("pressure", "pilot_ratio", "per_range", "coefficient")
-_WIDTH = len(_FIELDS) + 2 * len(_HOLDING)
 _COMMON = (
     "oil", "hose", "steel", "vapour", "gas_power", "pump", "tank", "pump_flow", "per_droop",
     "line",
 )  # fmt: skip
-
-
-@dataclass
-class Chamber:
-    """One side of a cylinder at an instant.
-
-    Attributes:
-        pressure: [Pa].
-        volume: [m3].
-        area: [m2], [m3/rad].
-        valve: Flow through the valve into it [m3/s].
-        net: Flow into it less what its volume grows by [m3/s].
-        slope: Rate of the state that stands for its pressure [Pa/s].
-    """
-
-    pressure: Number
-    volume: Number
-    area: Number
-    valve: Number
-    net: Number
-    slope: Number
 
 
 @dataclass
@@ -108,7 +77,7 @@ class Circuit:
         parts = list(
             zip(hydraulics.cylinders.values(), hydraulics.valves.values(), strokes, strict=True)
         )
-        rows = [_row(cylinder, valve, stroke) for cylinder, valve, stroke in parts]
+        rows = [row_of(cylinder, valve, stroke) for cylinder, valve, stroke in parts]
         self._strokes = np.array(strokes, dtype=np.float64)
         self.numbers = np.array([*self._common(), *(x for row in rows for x in row)])
         self._compliant = [cylinder.stiffness > 0 for cylinder, _, _ in parts]
@@ -216,12 +185,14 @@ class Circuit:
         lost: Number = 0.0
         kept: Number = 0.0
         for i in range(len(self.joints)):
-            start = len(_COMMON) + _WIDTH * i
-            part = dict(zip(_FIELDS, numbers[start : start + len(_FIELDS)], strict=True))
+            start = len(_COMMON) + WIDTH * i
+            row = numbers[start : start + WIDTH]
             own = state[self._offsets[i] : self._offsets[i + 1]]
+            part = dict(zip(FIELDS, row, strict=False))
             spool, spool_rates = self._spool(i, part, own, signals[i])
-            function = _Function(common, part, numbers[start + len(_FIELDS) : start + _WIDTH])
-            function.evaluate(supply, tank, spool, x[i], v[i], own, self._compliant[i])
+            function = Function(
+                common, row, supply, tank, spool, x[i], v[i], own, self._compliant[i]
+            )
             spools.append(spool)
             forces.append(function.force)
             chambers.append(function.chambers)
@@ -259,140 +230,3 @@ class Circuit:
             moved = clipped(speed, -rate, rate)
         pull = w * (w * (wanted - spool) - 2.0 * part["spool_damping"] * speed)
         return spool, [moved, pull]
-
-
-class _Function:
-    """One valve and its cylinder."""
-
-    def __init__(
-        self, common: dict[str, Number], part: dict[str, Number], holding: Sequence[Number]
-    ):
-        self._common, self._part = common, part
-        width = len(_HOLDING)
-        self._holding = [
-            dict(zip(_HOLDING, holding[side * width : (side + 1) * width], strict=True))
-            for side in range(2)
-        ]
-
-    def evaluate(
-        self,
-        supply: Number,
-        tank: Number,
-        spool: Number,
-        x: Number,
-        v: Number,
-        own: Sequence[Number],
-        compliant: bool,
-    ) -> None:
-        """Flows, net flows and rates; see the attributes set here."""
-        common, part = self._common, self._part
-        vapour = common["vapour"]
-        pressures = [vapour + maximum(own[side], 0.0) for side in range(2)]
-        areas = [part["area_a"], part["area_b"]]
-        self.force = areas[0] * pressures[0] - areas[1] * pressures[1]
-        self.spring_rate: list[Number] = []
-        self.spring_power: Number = 0.0
-        damped: Number = 0.0
-        if compliant:
-            # massless: the spring and its damper carry the cylinder's force
-            pressing = part["stiffness"] * own[2]
-            squeezed = (self.force - pressing) / part["damping"]
-            x, v = x + own[2], v + squeezed
-            self.spring_rate = [squeezed]
-            self.spring_power = pressing * squeezed
-            damped = part["damping"] * squeezed * squeezed
-        open_positive = clipped((spool - part["dead_band"]) * part["per_stroke"], 0.0, 1.0)
-        open_negative = clipped((-spool - part["dead_band"]) * part["per_stroke"], 0.0, 1.0)
-        past = part["leakage"] * (pressures[0] - pressures[1])
-        self.drawn: Number = 0.0
-        self.returned: Number = 0.0
-        self.lost = past * (pressures[0] - pressures[1]) + damped
-        sides: list[Chamber] = []
-        for side, name in enumerate("ab"):
-            p, other, area = pressures[side], pressures[1 - side], areas[side]
-            left = x if side == 0 else part["stroke"] - x
-            inlet = part["c1"] * open_positive if side == 0 else part["c4"] * open_negative
-            outlet = part["c3"] * open_negative if side == 0 else part["c2"] * open_positive
-            fed = self._inflow(supply - p, inlet, side, p, other, left)
-            drained = -through(
-                tank - p, outlet, in_series(outlet, *self._obstacles(side, p, other, left))
-            )
-            drained = drained + part[f"leakage_{name}"] * (p - tank)
-            if part["relief"] != 0.0:
-                drained = drained + part["relief_gain"] * maximum(p - part["relief"], 0.0)
-            if part["refill"] != 0.0:
-                drained = drained - part["refill"] * root(maximum(tank - p, 0.0))
-            self.drawn, self.returned = self.drawn + fed, self.returned + drained
-            self.lost = self.lost + fed * (supply - p) + drained * (p - tank)
-            sign = 1.0 if side == 0 else -1.0
-            net = fed - drained - sign * past - sign * area * v
-            hose = part[f"hose_{name}"]
-            volume = maximum(hose + area * left, _SLIGHT * hose)
-            softness = self._softness(volume, hose, part[f"gas_{name}"], p)
-            middle = common["oil"] * (hose + 0.5 * area * part["stroke"])
-            slope = net / where_positive(own[side], softness, middle)
-            sides.append(Chamber(p, volume, area, fed - drained, net, slope))
-        self.chambers = (sides[0], sides[1])
-
-    def _inflow(
-        self, drop: Number, inlet: Number, side: int, p: Number, other: Number, left: Number
-    ) -> Number:
-        """From the supply; a compensator keeps the pressure drop and lets nothing back."""
-        margin = self._part["margin"]
-        if margin != 0.0:
-            return inlet * root(clipped(drop, 0.0, margin))
-        back = in_series(inlet, *self._obstacles(side, p, other, left))
-        return through(drop, inlet, back)
-
-    def _obstacles(
-        self, side: int, p: Number, other: Number, left: Number
-    ) -> tuple[Number | None, Number]:
-        """In the way of the outflow: coefficient of the holding valve, 1 / c^2 of the cushion."""
-        holding = None
-        valve = self._holding[side]
-        if valve["coefficient"] != 0.0:
-            raised = p + valve["pilot_ratio"] * other - valve["pressure"]
-            holding = valve["coefficient"] * clipped(raised * valve["per_range"], 0.0, 1.0)
-        cushion: Number = 0.0
-        if self._part["cushion"] != 0.0:
-            near = clipped(1.0 - left / self._part["cushion"], 0.0, 1.0)
-            cushion = self._part["cushion_resistance"] * near * near
-        return holding, cushion
-
-    def _softness(self, volume: Number, hose: Number, gas: Number, p: Number) -> Number:
-        """Volume per pressure, V / K = V / B_oil + (V - V_h) / B_steel + V_h / B_hose + gas's."""
-        common = self._common
-        soft = volume * common["oil"] + hose * common["hose"]
-        if common["steel"] != 0.0:
-            soft = soft + common["steel"] * maximum(volume - hose, 0.0)
-        if gas != 0.0:
-            # V = gas (p0 / p)^(1/n), -dV/dp = gas / (n p0) (p0 / p)^(1 + 1/n)
-            power = common["gas_power"]
-            thin = apply("log", maximum(p, 1.0) * (1.0 / GAS_PRESSURE))
-            soft = soft + gas * (power - 1.0) * (1.0 / GAS_PRESSURE) * apply("exp", -power * thin)
-        return soft
-
-
-def _row(cylinder: Cylinder, valve: Valve, stroke: float) -> list[float]:
-    values = {
-        **vars(cylinder),
-        "cushion_resistance": cylinder.cushion_coefficient**-2,
-        "stroke": stroke,
-        "c1": valve.c1, "c2": valve.c2, "c3": valve.c3, "c4": valve.c4,
-        "margin": valve.margin,
-        "neutral": valve.neutral,
-        "per_signal": 1.0 / (valve.full - valve.neutral),
-        "dead_band": valve.dead_band,
-        "per_stroke": 1.0 / (1.0 - valve.dead_band),
-        "bandwidth": valve.bandwidth,
-        "spool_damping": valve.damping,
-        "rate": valve.rate,
-    }  # fmt: skip
-    holding = [_holding(cylinder.counterbalance_a), _holding(cylinder.counterbalance_b)]
-    return [*(float(values[name]) for name in _FIELDS), *holding[0], *holding[1]]
-
-
-def _holding(valve: Counterbalance | None) -> list[float]:
-    if valve is None:
-        return [0.0] * len(_HOLDING)
-    return [valve.pressure, valve.pilot_ratio, 1.0 / valve.range, valve.coefficient]
