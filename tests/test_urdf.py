@@ -370,11 +370,19 @@ JOINTS = [
     ),
     case(
         "mimic",
-        "ground.urdf:10: joint 'crank' mimics another, which is not supported: "
-        "make it fixed, or lock it",
+        "ground.urdf:14: joint 'crank' mimics the unknown joint 'rocker', known: coupler, crank",
         swap(
             '<limit lower="-1.5" upper="2.5" effort="10" velocity="5"/>',
-            '<limit lower="-1.5" upper="2.5" effort="10" velocity="5"/><mimic joint="coupler"/>',
+            '<limit lower="-1.5" upper="2.5" effort="10" velocity="5"/><mimic joint="rocker"/>',
+            GROUND,
+        ),
+    ),
+    case(
+        "mimic of itself",
+        "ground.urdf:14: joint 'crank' mimics itself, name another",
+        swap(
+            '<limit lower="-1.5" upper="2.5" effort="10" velocity="5"/>',
+            '<limit lower="-1.5" upper="2.5" effort="10" velocity="5"/><mimic joint="crank"/>',
             GROUND,
         ),
     ),

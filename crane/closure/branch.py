@@ -226,7 +226,7 @@ class Branch:
             extra = np.abs(phi[self._structure.redundant])
             if extra.max() > 1e3 * _TOLERANCE * self.size:
                 row = self._structure.redundant[extra.argmax()]
-                loop = self._equations.loops[self._equations.loop_of_row[row]].name
+                loop = self._equations.names[self._equations.loop_of_row[row]]
                 raise OutOfReachError(
                     f"loop '{loop}' stays {extra.max():.3g} {self._unit(row)} open at "
                     f"{self._at(posture.q_a)}{sample}, its surplus equations hold only near home: "
@@ -259,7 +259,7 @@ class Branch:
                 f"{self._at(target)}{sample}, but the branch does not lead straight there from "
                 f"{self._at(last.q_a)}: go around in between, or give a nearer guess"
             )
-        loop = self._equations.loops[self._equations.loop_of_row[worst]].name
+        loop = self._equations.names[self._equations.loop_of_row[worst]]
         unit = self._unit(worst)
         return OutOfReachError(
             f"loop '{loop}' cannot be closed at {self._at(target)}{sample}: it stays "
@@ -278,7 +278,7 @@ class Branch:
 
     def _loops_of(self, rows: Indices) -> str:
         loops = sorted(set(self._equations.loop_of_row[self._structure.rows[rows]].tolist()))
-        names = " and ".join(f"'{self._equations.loops[i].name}'" for i in loops)
+        names = " and ".join(f"'{self._equations.names[i]}'" for i in loops)
         return ("loop " if len(loops) == 1 else "the group of loops ") + names
 
     def _at(self, q_a: Array) -> str:

@@ -12,7 +12,7 @@ from crane.closure.branch import Branch
 from crane.closure.compiled import Cursor, FastClosure
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import Structure, analyse
-from crane.description import LoopSpec
+from crane.description import Coupling, LoopSpec
 from crane.errors import BranchEdgeError, InputError
 from crane.samples import Array, as_samples, per_sample, solve
 from crane.straight import TooLongError
@@ -36,6 +36,7 @@ class Closure:
         loops: The loops that close it.
         active: Names of the active joints, in the order of q_A.
         guess: (nq,) active coordinates of the home posture, and a first guess of the others.
+        couplings: Linear constraints of joints.
 
     Raises:
         MechanismError: The loops cannot be closed from the guess, or the active joints do not
@@ -51,10 +52,15 @@ class Closure:
     home: Array
 
     def __init__(
-        self, model: pin.Model, loops: Sequence[LoopSpec], active: Sequence[str], guess: Array
+        self,
+        model: pin.Model,
+        loops: Sequence[LoopSpec],
+        active: Sequence[str],
+        guess: Array,
+        couplings: Sequence[Coupling] = (),
     ):
         self.model = model
-        self.equations = LoopEquations(model, loops)
+        self.equations = LoopEquations(model, loops, couplings)
         self._local = threading.local()
         self.active_names = tuple(active)
         ids = [model.getJointId(name) for name in active]

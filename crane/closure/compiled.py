@@ -241,7 +241,8 @@ class FastClosure:
         geometry, equations, structure = self.geometry, self._equations, self._structure
         arrays = (
             geometry.turns, equations.axis1, equations.axis2, equations.is_translation,
-            equations.loop_of_row, equations.sign, structure.rows, structure.redundant,
+            equations.loop_of_row, equations.sign, equations.factors, equations.offsets,
+            structure.rows, structure.redundant,
             self._active, self._passive, signs,
         )  # fmt: skip
         return (

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from crane.description import LOOP_TYPES, LoopSpec
+from crane.description import LOOP_TYPES, Coupling, LoopSpec
 from crane.errors import MechanismError
 from crane.samples import Array
 
@@ -45,7 +45,7 @@ def aligned_axes(loop_type: str) -> list[int]:
 
 
 class LoopEquations:
-    """All equations of all loops of a machine.
+    """All equations of all loops and couplings of a machine.
 
     A loop joins frame 1 (predecessor) and frame 2 (successor), both turned so that the loop's
     axis is their z. With their axes a_i, b_k and origins p_1, p_2 in the world, its equations are
@@ -56,14 +56,22 @@ class LoopEquations:
 
     Row by row there is a wrench w = [a_i; p_2 x a_i] or [0; b_k x a_i] at the world's origin, so
     that phi' = w . (V_2 - V_1) with the spatial velocities V. Columns of joints that carry both
-    frames therefore cancel exactly.
+    frames therefore cancel exactly. Couplings of joints follow, sum c_j q_j - offset = 0 each.
 
     Args:
         model: The spanning tree.
         loops: The loops.
+        couplings: Linear constraints of joints.
+
+    Attributes:
+        names: Of what the equations belong to: loops, then couplings.
+        loop_of_row: (m,) index in `names` of every equation.
+        is_translation: (m,) whether it is about a length.
     """
 
-    def __init__(self, model: pin.Model, loops: Sequence[LoopSpec]):
+    def __init__(
+        self, model: pin.Model, loops: Sequence[LoopSpec], couplings: Sequence[Coupling] = ()
+    ):
         self.model = model
         self._local = threading.local()  # a machine may be used by several threads
         self.loops = tuple(loops)
@@ -86,12 +94,25 @@ class LoopEquations:
                 rows += [(index, False, 0, 1), (index, False, 1, 2), (index, False, 2, 0)]
             elif len(free) == 1:
                 rows += [(index, False, i, free[0]) for i in range(3) if i != free[0]]
-        self.loop_of_row = np.array([row[0] for row in rows], dtype=np.intp)
-        self.is_translation = np.array([row[1] for row in rows], dtype=bool)
+        self._loop = np.array([row[0] for row in rows], dtype=np.intp)
+        self._moves = np.array([row[1] for row in rows], dtype=bool)
         self.axis1 = np.array([row[2] for row in rows], dtype=np.intp)
         self.axis2 = np.array([row[3] for row in rows], dtype=np.intp)
         self.sign = sign
-        self._row_sign = sign[self.loop_of_row]
+        self._row_sign = sign[self._loop]
+        self.couplings = tuple(couplings)
+        self.factors = np.zeros((len(self.couplings), model.nv))
+        self.offsets = np.array([coupling.offset for coupling in self.couplings])
+        lengths = []
+        for row, coupling in zip(self.factors, self.couplings, strict=True):
+            for name, factor in coupling.factors.items():
+                joint = model.joints[model.getJointId(name)]
+                row[joint.idx_v] = factor
+            lengths.append(joint.shortname().startswith("JointModelP"))
+        self.names = (*(loop.name for loop in loops), *(item.name for item in couplings))
+        own = len(self.loops) + np.arange(len(self.couplings), dtype=np.intp)
+        self.loop_of_row = np.concatenate([self._loop, own])
+        self.is_translation = np.concatenate([self._moves, np.array(lengths, dtype=bool)])
 
     @property
     def data(self) -> pin.Data:
@@ -108,7 +129,7 @@ class LoopEquations:
         placements = [bodies[joint] * local for joint, local in self.frames]
         turns = np.array([placement.rotation for placement in placements])
         origins = np.array([placement.translation for placement in placements])
-        one = 2 * self.loop_of_row
+        one = 2 * self._loop
         return (
             turns[one, :, self.axis1],
             turns[one + 1, :, self.axis2],
@@ -118,7 +139,7 @@ class LoopEquations:
 
     def _wrenches(self, a: Array, b: Array, p2: Array) -> Array:
         wrenches = np.zeros((len(a), 6))
-        moved = self.is_translation
+        moved = self._moves
         wrenches[moved, :3] = a[moved]
         wrenches[:, 3:] = _cross(np.where(moved[:, None], p2, b), a)
         return wrenches
@@ -132,12 +153,16 @@ class LoopEquations:
         Returns:
             phi (m,) [m] for translations, [1] for rotations, and dphi/dq (m, nv).
         """
+        coupled = self.factors @ q - self.offsets
         if not self.loops:
-            return np.zeros(0), np.zeros((0, self.model.nv))
+            return coupled, self.factors.copy()
         jacobian = pin.computeJointJacobians(self.model, self.data, q)
         self._local.last = a, b, p1, p2 = self._geometry()
-        phi = np.einsum("ij,ij->i", a, np.where(self.is_translation[:, None], p2 - p1, b))
-        return phi, self._row_sign * (self._wrenches(a, b, p2) @ jacobian)
+        phi = np.einsum("ij,ij->i", a, np.where(self._moves[:, None], p2 - p1, b))
+        slopes = self._row_sign * (self._wrenches(a, b, p2) @ jacobian)
+        if not self.couplings:
+            return phi, slopes
+        return np.concatenate([phi, coupled]), np.vstack([slopes, self.factors])
 
     def turned_over(self, q: Array) -> str | None:
         """Name of a loop whose axes are antiparallel, which also solves its equations."""
@@ -167,21 +192,22 @@ class LoopEquations:
             (m,).
         """
         if not self.loops:
-            return np.zeros(0)
+            return np.zeros(len(self.couplings))
         a, b, _, p2 = self._local.last
         rate = pin.computeJointJacobiansTimeVariation(self.model, self.data, q, v)
         velocity = np.array([self.data.ov[joint].vector for joint, _ in self.frames])
-        one = 2 * self.loop_of_row
+        one = 2 * self._loop
         v2, w1, w2 = velocity[one + 1, :3], velocity[one, 3:], velocity[one + 1, 3:]
-        moved = self.is_translation[:, None]
+        moved = self._moves[:, None]
         arm = np.where(moved, p2, b)
         arm_rate = _cross(w2, arm) + np.where(moved, v2, 0.0)
         a_rate = _cross(w1, a)
         wrench_rate = np.zeros((len(a), 6))
-        wrench_rate[self.is_translation, :3] = a_rate[self.is_translation]
+        wrench_rate[self._moves, :3] = a_rate[self.is_translation]
         wrench_rate[:, 3:] = _cross(arm_rate, a) + _cross(arm, a_rate)
         split = self._row_sign * v  # (m, nv): v of frame 2 minus v of frame 1
         relative, bias = split @ self.data.J.T, split @ rate.T
-        return np.einsum("ij,ij->i", wrench_rate, relative) + np.einsum(
+        bent = np.einsum("ij,ij->i", wrench_rate, relative) + np.einsum(
             "ij,ij->i", self._wrenches(a, b, p2), bias
         )
+        return np.concatenate([bent, np.zeros(len(self.couplings))])

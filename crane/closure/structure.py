@@ -90,7 +90,7 @@ def analyse(
     model = equations.model
     names = list(model.names)[1:]
     everything = np.arange(model.nv)
-    if not equations.loops:
+    if not equations.names:
         if len(passive):
             raise MechanismError(_miscounted(names, active, passive, model.nv), "active")
         none = np.zeros(0, dtype=np.intp)
@@ -108,12 +108,12 @@ def analyse(
         if np.abs(equations.evaluate(near)[0]).max() < _CLOSED:
             postures.append(near)
     jacobians = [equations.evaluate(q)[1] for q in postures]
-    for index, loop in enumerate(equations.loops):
+    for index, name in enumerate(equations.names):
         rows = equations.loop_of_row == index
         if max(np.abs(jacobian[rows]).max() for jacobian in jacobians) < _CLOSED:
             raise MechanismError(
-                f"loop '{loop.name}' locks nothing that the joints do not lock already: remove it",
-                f"loop {loop.name}",
+                f"loop '{name}' locks nothing that the joints do not lock already: remove it",
+                f"loop {name}",
             )
     rank = max(_rank(jacobian) for jacobian in jacobians)
     freedom = model.nv - rank
@@ -182,12 +182,12 @@ def _check_closed(equations: LoopEquations, q: Array, where: str, hint: str) -> 
     phi, _ = equations.evaluate(q)
     worst = int(np.abs(phi).argmax())
     if not abs(phi[worst]) <= _CLOSED:  # also NaN
-        loop = equations.loops[equations.loop_of_row[worst]]
+        loop = equations.names[equations.loop_of_row[worst]]
         unit = "m" if equations.is_translation[worst] else "rad"
         raise MechanismError(
-            f"loop '{loop.name}' cannot be closed {where}: it stays {abs(phi[worst]):.3g} {unit} "
+            f"loop '{loop}' cannot be closed {where}: it stays {abs(phi[worst]):.3g} {unit} "
             f"open, {hint}",
-            f"loop {loop.name}",
+            f"loop {loop}",
         )
 
 

@@ -137,13 +137,14 @@ class Posture:
         q: (nb,).
 
     Attributes:
+        q: (nb,).
         rotation: Of every body, (3, 3).
         origin: Of every body, (3,).
         columns: Of every joint, its spatial column at the trunk's origin: linear, angular.
     """
 
     def __init__(self, geometry: Geometry, constants: Constants, q: Sequence[Number]):
-        self.geometry, self._constants = geometry, constants
+        self.geometry, self._constants, self.q = geometry, constants, list(q)
         still: list[Vector] = [[float(r == c) for c in range(3)] for r in range(3)]
         self.rotation: list[list[Vector]] = [still]
         self.origin: list[Vector] = [[0.0] * 3]
@@ -193,6 +194,14 @@ class Row:
     slopes: dict[int, Number]  # joint -> dphi/dq
 
 
+def _coupled(factors: Array, offset: float, q: Sequence[Number]) -> Row:
+    """A coupling of joints, whose slopes are constant: nothing bends it."""
+    still: Vector = [0.0] * 3
+    slopes: dict[int, Number] = {i + 1: float(x) for i, x in enumerate(factors) if x}
+    phi = dot([float(x) for x in factors], q) - float(offset)
+    return Row((0, 0), False, still, still, (still, still), phi, slopes)
+
+
 class Loops:
     """The independent loop equations at a traced posture.
 
@@ -229,6 +238,9 @@ class Loops:
         self._others = [self._row(equations, int(row), posture) for row in structure.redundant]
 
     def _row(self, equations: LoopEquations, row: int, posture: Posture) -> Row:
+        coupling = int(equations.loop_of_row[row]) - len(equations.loops)
+        if coupling >= 0:
+            return _coupled(equations.factors[coupling], equations.offsets[coupling], posture.q)
         one = 2 * int(equations.loop_of_row[row])
         (axes1, origin1), (axes2, origin2) = self._frames[one], self._frames[one + 1]
         axis = [line[equations.axis1[row]] for line in axes1]

@@ -16,6 +16,7 @@ from crane.description.sources import bundled, examples
 from crane.description.spec import (
     LOOP_TYPES,
     Chain,
+    Coupling,
     EndStop,
     ForceElement,
     Friction,
@@ -27,8 +28,8 @@ from crane.description.spec import (
 )
 
 __all__ = [
-    "LOOP_TYPES", "Chain", "Counterbalance", "Cylinder", "EndStop", "ForceElement", "Friction",
-    "GasSpring", "Hydraulics", "LoopSpec", "MachineSpec", "Oil", "PDGains", "PIGains", "Supply",
-    "Task", "Valve", "bundled", "changed", "examples", "inertia_problem", "locked", "parameters",
-    "read",
+    "LOOP_TYPES", "Chain", "Counterbalance", "Coupling", "Cylinder", "EndStop", "ForceElement",
+    "Friction", "GasSpring", "Hydraulics", "LoopSpec", "MachineSpec", "Oil", "PDGains", "PIGains",
+    "Supply", "Task", "Valve", "bundled", "changed", "examples", "inertia_problem", "locked",
+    "parameters", "read",
 ]  # fmt: skip

@@ -11,7 +11,7 @@ from lxml import etree
 
 from crane.description.circuit_section import numbers_of
 from crane.description.hydraulics import Hydraulics
-from crane.description.spec import Chain, Friction, MachineSpec
+from crane.description.spec import Chain, Coupling, Friction, MachineSpec
 from crane.description.urdf import read_urdf
 from crane.errors import InputError, known
 from crane.samples import as_number
@@ -166,6 +166,7 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
     """
     tree = copy.deepcopy(spec.tree)
     joints = {j.get("name"): j for j in tree.iterfind("joint") if j.get("type") != "fixed"}
+    lock, couplings = _coupled(spec.couplings, lock)
     for name, given in lock.items():
         if name not in joints:
             raise InputError(f"joint '{name}' to lock is unknown, {known(joints, name)}")
@@ -196,7 +197,46 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
             for name, task in spec.tasks.items()
             if not (task.space == "active" and task.coefficients.keys() & lock.keys())
         },
-        mimics=tuple(name for name in spec.mimics if name not in lock),
+        couplings=couplings,
+    )
+
+
+def _coupled(
+    couplings: tuple[Coupling, ...], lock: Mapping[str, float]
+) -> tuple[dict[str, float], tuple[Coupling, ...]]:
+    """Locks with what couplings make of them, and the couplings of what still moves."""
+    locked = {
+        name: as_number(x, f"the coordinate to lock '{name}' at", "") for name, x in lock.items()
+    }
+    rest = list(couplings)
+    settled = False
+    while not settled:
+        settled = True
+        for coupling in tuple(rest):
+            free = {name: x for name, x in coupling.factors.items() if name not in locked}
+            held = coupling.factors.keys() - free.keys()
+            left = coupling.offset - sum(coupling.factors[name] * locked[name] for name in held)
+            if len(free) > 1 or not held:
+                continue
+            rest.remove(coupling)
+            if not free:
+                if abs(left) > 1e-9:
+                    raise InputError(
+                        f"coupling '{coupling.name}' does not allow "
+                        f"{', '.join(f'{x} = {locked[x]:g}' for x in sorted(held))}, lock one of "
+                        "them alone"
+                    )
+                continue
+            ((name, factor),) = free.items()
+            locked[name], settled = left / factor, False
+    return locked, tuple(
+        dataclasses.replace(
+            coupling,
+            factors={name: x for name, x in coupling.factors.items() if name not in locked},
+            offset=coupling.offset
+            - sum(x * locked[name] for name, x in coupling.factors.items() if name in locked),
+        )
+        for coupling in rest
     )
 
 

@@ -10,6 +10,7 @@ from crane.description.sources import find
 from crane.description.spec import (
     LOOP_TYPES,
     Chain,
+    Coupling,
     EndStop,
     ForceElement,
     Friction,
@@ -26,7 +27,7 @@ from crane.errors import CraneWarning, DescriptionError, known
 
 _KEYS = (
     "name", "source", "chains", "loops", "active", "home", "friction", "forces",
-    "gas_springs", "end_stops",
+    "gas_springs", "end_stops", "couplings",
     "tip", "payload", "tasks", "control", "hydraulics",
 )  # fmt: skip
 
@@ -65,23 +66,24 @@ def _read_single(path: Path) -> MachineSpec:
         active=urdf.independent,
         friction=urdf.friction,
         tip=tree.only_leaf(),
-        mimics=urdf.mimics,
-        where=tree.where | {f"loop {loop.name}": loop.where for loop in urdf.loops},
+        couplings=urdf.couplings,
+        where=tree.where | _places(urdf.loops, urdf.couplings),
     )
 
 
 def _read_machine(path: Path) -> MachineSpec:
     top = Section.read(path, _KEYS)
     name, source = top.text("name"), top.text("source", "")
-    chains, tree, friction, mimics = _chains(top, path)
+    chains, tree, friction, couplings = _chains(top, path)
     loops = _loops(top, tree)
+    couplings += _couplings(top, tree)
     active = top.names("active")
     for joint in active:
         tree.check_joint(joint, top.where("active"))
     if not active:
         raise top.fail("active", "'active' is empty, name the driven joints")
     where = {key: top.where(key) for key in top} | tree.where
-    where |= {f"loop {loop.name}": loop.where for loop in loops}
+    where |= _places(loops, couplings)
     home = {}
     if (section := top.section("home", "'home'")) is not None:
         for joint in section:
@@ -103,17 +105,17 @@ def _read_machine(path: Path) -> MachineSpec:
     control = _control(top, active)
     return MachineSpec(
         name, source, path, chains, tree.robot, loops, active, home, friction, forces,
-        gas_springs, end_stops, tip, tasks, control, hydraulics, mimics, where, payload,
+        gas_springs, end_stops, tip, tasks, control, hydraulics, couplings, where, payload,
     )  # fmt: skip
 
 
 def _chains(
     top: Section, path: Path
-) -> tuple[tuple[Chain, ...], Tree, dict[str, Friction], tuple[str, ...]]:
+) -> tuple[tuple[Chain, ...], Tree, dict[str, Friction], tuple[Coupling, ...]]:
     chains: list[Chain] = []
     tree = Tree()
     friction: dict[str, Friction] = {}
-    mimics: tuple[str, ...] = ()
+    couplings: tuple[Coupling, ...] = ()
     for item in top.sections("chains", "chain", "name", "urdf", "parent"):
         name, parent, file = item.text("name"), item.text("parent", None), item.file("urdf")
         if any(chain.name == name for chain in chains):
@@ -134,12 +136,12 @@ def _chains(
         tree.add(chain, urdf)
         chains.append(chain)
         friction |= urdf.friction
-        mimics += urdf.mimics
+        couplings += urdf.couplings
     if not chains:
         raise top.fail("chains", "there are no chains, add one under 'chains:'")
     if not tree.joints:
         raise top.fail("chains", "no joint of these chains moves, add one")
-    return tuple(chains), tree, friction, mimics
+    return tuple(chains), tree, friction, couplings
 
 
 def _loops(top: Section, tree: Tree) -> tuple[LoopSpec, ...]:
@@ -174,6 +176,30 @@ def _loop(section: Section, tree: Tree) -> LoopSpec:
     loop = LoopSpec(name, kind, ends[0], ends[1], axis, section.where())
     tree.check_loop(loop)
     return loop
+
+
+def _places(loops: tuple[LoopSpec, ...], couplings: tuple[Coupling, ...]) -> dict[str, str]:
+    """Where loops and couplings were written, as errors about them look it up."""
+    places = {f"loop {loop.name}": loop.where for loop in loops}
+    return places | {f"loop {coupling.name}": coupling.where for coupling in couplings}
+
+
+def _couplings(top: Section, tree: Tree) -> tuple[Coupling, ...]:
+    found: dict[str, Coupling] = {}
+    for item in top.sections("couplings", "coupling", "name", "joints", "offset"):
+        name, joints = item.text("name"), item.section("joints", "'joints'")
+        if name in found:
+            raise item.fail("name", f"two couplings are named '{name}', rename one")
+        if joints is None or len(list(joints)) < 2:
+            raise item.fail("joints", f"coupling '{name}' joins less than two joints, add some")
+        factors = {}
+        for joint in joints:
+            tree.check_joint(joint, joints.where(joint))
+            factors[joint] = joints.number(joint)
+            if factors[joint] == 0:
+                raise joints.fail(joint, f"the factor of '{joint}' is 0, leave it out")
+        found[name] = Coupling(name, factors, item.number("offset", 0.0), item.where())
+    return tuple(found.values())
 
 
 def _friction(top: Section, tree: Tree) -> dict[str, Friction]:

@@ -62,6 +62,23 @@ class LoopSpec:
     where: str
 
 
+@dataclass(frozen=True)
+class Coupling:
+    """A linear constraint of joints, sum factor q = offset: a gear, a joint that mimics another.
+
+    Attributes:
+        name: Its name.
+        factors: By joint, the first that of the joint which follows.
+        offset: [rad], [m].
+        where: Where it was written, for errors.
+    """
+
+    name: str
+    factors: Mapping[str, float]
+    offset: float
+    where: str
+
+
 def unit_vector(xyz: Sequence[float]) -> tuple[float, float, float] | None:
     """The direction of three numbers; None if they are not three, or all zero."""
     largest = max(abs(value) for value in xyz)
@@ -249,6 +266,6 @@ class MachineSpec:
     tasks: Mapping[str, Task] = field(default_factory=dict)
     control: Mapping[str, PIGains] = field(default_factory=dict)
     hydraulics: Hydraulics | None = None
-    mimics: tuple[str, ...] = ()  # joints that mimic another, which have to be locked
+    couplings: tuple[Coupling, ...] = ()
     where: Mapping[str, str] = field(default_factory=dict)  # section -> "file:line"
     payload: Chain | None = None  # what payload.mass hangs on the tip; None: a point mass

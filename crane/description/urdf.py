@@ -9,7 +9,7 @@ import numpy as np
 from lxml import etree
 
 from crane.description.inertia import inertia_problem
-from crane.description.spec import Friction, LoopSpec
+from crane.description.spec import Coupling, Friction, LoopSpec
 from crane.description.urdf_loops import Placement, independent, read_loops
 from crane.description.xml import XmlFile
 from crane.errors import CraneWarning, known
@@ -60,7 +60,7 @@ class Urdf:
         loops: Loops of `<loop>` elements.
         independent: Joints marked `independent="true"`; None where no joint has the attribute.
         friction: Friction of `<dynamics>` elements.
-        mimics: Joints that mimic another.
+        couplings: Joints that mimic another.
     """
 
     file: Path
@@ -70,7 +70,7 @@ class Urdf:
     loops: tuple[LoopSpec, ...]
     independent: tuple[str, ...] | None
     friction: Mapping[str, Friction]
-    mimics: tuple[str, ...]
+    couplings: tuple[Coupling, ...]
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -119,8 +119,39 @@ def read_urdf(file: Path) -> Urdf:
             raise xml.fail(joints[joint], f"joint '{joint}' has the name of a loop's, rename it")
         _add_joint(robot, joint, "fixed", frame.placement, (frame.link, frame.name))
         lines |= {("link", frame.name): frame.where, ("joint", joint): frame.where}
-    mimics = tuple(name for name, joint in joints.items() if joint.find("mimic") is not None)
-    return Urdf(file, robot, root, lines, loops, driven, friction, mimics)
+    couplings = _mimics(xml, joints, driven)
+    return Urdf(file, robot, root, lines, loops, driven, friction, couplings)
+
+
+def _mimics(
+    xml: XmlFile, joints: Mapping[str, etree._Element], driven: tuple[str, ...] | None
+) -> tuple[Coupling, ...]:
+    """Couplings q = multiplier q_other + offset of joints that mimic another."""
+    moving = [name for name, joint in joints.items() if joint.get("type") != "fixed"]
+    found = []
+    for name, joint in joints.items():
+        mimic = xml.only(joint, "mimic", f"joint '{name}'")
+        if mimic is None or name not in moving:
+            continue
+        other = mimic.get("joint", "")
+        if other not in moving:
+            what = (
+                f"mimics '{other}', which does not move"
+                if other in joints
+                else (f"mimics the unknown joint '{other}'")
+            )
+            raise xml.fail(mimic, f"joint '{name}' {what}, {known(moving, other)}")
+        if other == name:
+            raise xml.fail(mimic, f"joint '{name}' mimics itself, name another")
+        if driven is not None and name in driven:
+            raise xml.fail(
+                mimic, f"joint '{name}' mimics '{other}' and is independent, keep one of the two"
+            )
+        multiplier = xml.number(mimic, "multiplier", f"the mimic of '{name}'", 1.0)
+        offset = xml.number(mimic, "offset", f"the mimic of '{name}'", 0.0)
+        factors = {name: 1.0, other: -multiplier} if multiplier else {name: 1.0}
+        found.append(Coupling(f"{name}_mimic", factors, offset, xml.where(mimic)))
+    return tuple(found)
 
 
 def _named(xml: XmlFile, kind: str) -> dict[str, etree._Element]:

@@ -47,15 +47,13 @@ def load(
         spec = changed(spec, changes)
     if lock:
         spec = locked(spec, lock)
-    for joint in spec.mimics:
-        raise DescriptionError(
-            f"{spec.where[f'joint {joint}']}: joint '{joint}' mimics another, which is not "
-            "supported: make it fixed, or lock it"
-        )
     model = _assemble(spec)
-    active = tuple(model.names)[1:] if spec.active is None else spec.active
+    followers = {next(iter(coupling.factors)) for coupling in spec.couplings}
+    active = spec.active or tuple(name for name in model.names[1:] if name not in followers)
     try:
-        closure = Closure(model, spec.loops, active, _home_guess(spec, model, active))
+        closure = Closure(
+            model, spec.loops, active, _home_guess(spec, model, active), spec.couplings
+        )
     except MechanismError as error:
         where = spec.where.get(error.about, spec.path.name)
         raise MechanismError(f"{where}: {error}", error.about) from None

@@ -244,7 +244,13 @@ class Machine:
                 raise InputError(
                     f"joint '{name}' is named twice among the active ones, once will do"
                 )
-        closure = Closure(self.model, self.closure.equations.loops, names, self.home)
+        closure = Closure(
+            self.model,
+            self.closure.equations.loops,
+            names,
+            self.home,
+            self.closure.equations.couplings,
+        )
         same = set(names) == set(self.active)
         return dataclasses.replace(
             self,
