@@ -352,20 +352,15 @@ JOINTS = [
         swap('type="revolute"', 'type="revolut"', GROUND),
     ),
     case(
-        "floating",
-        "ground.urdf:10: joint 'crank' has the type 'floating', which is not "
-        "supported, known: continuous, fixed, prismatic, revolute",
-        swap('type="revolute"', 'type="floating"', GROUND),
-    ),
-    case(
-        "planar",
-        "ground.urdf:10: joint 'crank' has the type 'planar', which is not "
-        "supported, known: continuous, fixed, prismatic, revolute",
-        swap('type="revolute"', 'type="planar"', GROUND),
+        "unknown type",
+        "ground.urdf:10: joint 'crank' has the type 'screw', which is not supported, known: "
+        "continuous, fixed, floating, planar, prismatic, revolute, spherical",
+        swap('type="revolute"', 'type="screw"', GROUND),
     ),
     case(
         "no type",
-        "ground.urdf:10: joint 'crank' has no type, known: continuous, fixed, prismatic, revolute",
+        "ground.urdf:10: joint 'crank' has no type, known: continuous, fixed, floating, planar, "
+        "prismatic, revolute, spherical",
         swap(' type="revolute"', "", GROUND),
     ),
     case(

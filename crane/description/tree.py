@@ -52,7 +52,7 @@ class Tree:
             name, kind = element.get("name"), element.get("type")
             names = self.links if kind is None else self.joints if kind in MOVING else self._fixed
             self._enter(element.tag, name, urdf.lines[element.tag, name], names)
-            if kind == "continuous":
+            if kind in MOVING and element.find("limit") is None:
                 self._endless.add(name)
             self.robot.append(copy.deepcopy(element))
         self._attach(urdf)

@@ -9,10 +9,11 @@ import numpy as np
 from lxml import etree
 
 from crane.description.inertia import inertia_problem
+from crane.description.series import SEVERAL, parts_of, write_series
 from crane.description.spec import Coupling, Friction, LoopSpec
 from crane.description.urdf_loops import Placement, independent, read_loops
 from crane.description.xml import XmlFile
-from crane.errors import CraneWarning, known
+from crane.errors import CraneWarning, DescriptionError, known
 
 MOVING = ("revolute", "continuous", "prismatic")
 
@@ -101,7 +102,11 @@ def read_urdf(file: Path) -> Urdf:
     for name, link in links.items():
         _write_link(xml, name, link, name in moved, robot)
     friction = {}
+    made: dict[tuple[str, str], str] = {}
     for name, joint in joints.items():
+        if joint.get("type") in SEVERAL:
+            made |= _write_several(xml, name, joint, ends[name], robot)
+            continue
         _write_joint(xml, name, joint, ends[name], robot)
         if (found := _friction(xml, name, joint)) is not None:
             friction[name] = found
@@ -110,6 +115,10 @@ def read_urdf(file: Path) -> Urdf:
         for kind, elements in (("link", links), ("joint", joints))
         for name, element in elements.items()
     }
+    for (kind, name), where in made.items():
+        if (kind, name) in lines:
+            raise DescriptionError(f"{where}: its {kind} '{name}' is there already, rename one")
+    lines |= made
     driven = independent(xml, joints)
     loops, frames = read_loops(xml, _named(xml, "loop"), links)
     for frame in frames:
@@ -127,7 +136,7 @@ def _mimics(
     xml: XmlFile, joints: Mapping[str, etree._Element], driven: tuple[str, ...] | None
 ) -> tuple[Coupling, ...]:
     """Couplings q = multiplier q_other + offset of joints that mimic another."""
-    moving = [name for name, joint in joints.items() if joint.get("type") != "fixed"]
+    moving = [name for name, joint in joints.items() if joint.get("type") in MOVING]
     found = []
     for name, joint in joints.items():
         mimic = xml.only(joint, "mimic", f"joint '{name}'")
@@ -174,7 +183,7 @@ def _ends(
     xml: XmlFile, name: str, joint: etree._Element, links: Mapping[str, etree._Element]
 ) -> tuple[str, str]:
     """Parent and child link of a joint of a known type."""
-    what, kinds = f"joint '{name}'", (*MOVING, "fixed")
+    what, kinds = f"joint '{name}'", (*MOVING, *SEVERAL, "fixed")
     kind = joint.get("type")
     if kind not in kinds:
         raise xml.fail(
@@ -302,6 +311,25 @@ def _write_joint(
         axis = xml.direction(joint, what, (1.0, 0.0, 0.0))
         etree.SubElement(clean, "axis", xyz=_text(*axis))
         _write_limit(xml, what, joint, clean)
+
+
+def _write_several(
+    xml: XmlFile,
+    name: str,
+    joint: etree._Element,
+    ends: tuple[str, str],
+    robot: etree._Element,
+) -> dict[tuple[str, str], str]:
+    """A joint with several freedoms as a series of joints; where each link and joint was written."""
+    what, kind = f"joint '{name}'", joint.get("type")
+    for tag in ("dynamics", "mimic"):
+        if (found := xml.only(joint, tag, what)) is not None:
+            raise xml.fail(found, f"{what} is {kind}, for which <{tag}> has no meaning, remove it")
+    axis = xml.direction(joint, what, (1.0, 0.0, 0.0))
+    xyz, rpy = xml.placement(joint, what)
+    origin = {"xyz": _text(*xyz), "rpy": _text(*rpy)}
+    added = write_series(robot, name, parts_of(kind, axis), origin, ends)
+    return dict.fromkeys(added, xml.where(joint))
 
 
 def _write_limit(xml: XmlFile, what: str, joint: etree._Element, clean: etree._Element) -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from lxml import etree
 
+from crane.description.series import SEVERAL, names_of, parts_of
 from crane.description.spec import LoopSpec
 from crane.description.xml import XmlFile
 from crane.errors import known
@@ -92,4 +93,9 @@ def independent(xml: XmlFile, joints: Mapping[str, etree._Element]) -> tuple[str
             raise xml.fail(joint, f"joint '{name}' is fixed and independent, keep one of the two")
     if not marked:
         return None
-    return tuple(name for name, joint in marked.items() if joint.get("independent") == "true")
+    driven = [(name, joint) for name, joint in marked.items() if joint.get("independent") == "true"]
+    out: list[str] = []
+    for name, joint in driven:
+        kind = joint.get("type")
+        out += names_of(name, parts_of(kind, (0.0, 0.0, 1.0))) if kind in SEVERAL else [name]
+    return tuple(out)

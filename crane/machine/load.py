@@ -145,12 +145,15 @@ def _assemble(spec: MachineSpec) -> pin.Model:
         endless = np.abs(limits) >= _NO_LIMIT
         limits[endless] = np.copysign(np.inf, limits[endless])
     model.name = spec.name
+    between = {link.get("name") for link in robot.iter("link") if link.get("between")}
     moved = {joint.get("name"): joint.find("child").get("link") for joint in robot.iter("joint")}
     for index in range(1, model.njoints):
         name = model.names[index]
         inertia = model.inertias[index]
         link = moved[name]
         where = spec.where[f"link {link}"]
+        if link in between:
+            continue
         if not inertia.mass > 0:
             raise DescriptionError(
                 f"{where}: joint '{name}' moves link '{link}', which has no mass, give it an "
