@@ -2,9 +2,9 @@
 
 A joint J becomes joints J_x, J_y, ... with massless links J_1, J_2, ... between them. So every
 coordinate is one number with a rate of its own, and all that holds for machines of revolute and
-prismatic joints holds for these, too. The price is that of Cardan angles: where the second of three
-rotations reaches 90 degrees from its zero, the first and third turn about the same axis, and a closure
-through the joint is at the edge of its branch.
+prismatic joints holds for these, too. The price is that of Cardan angles: where the second of
+three rotations is 90 degrees from its zero, the first and third turn about the same axis, and a
+closure through the joint is at the edge of its branch.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,9 @@ _X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _TURNS: tuple[Part, ...] = (
     ("rx", "continuous", _X), ("ry", "continuous", _Y), ("rz", "continuous", _Z),
 )  # fmt: skip
-_SLIDES: tuple[Part, ...] = (("x", "prismatic", _X), ("y", "prismatic", _Y), ("z", "prismatic", _Z))
+_SLIDES: tuple[Part, ...] = (
+    ("x", "prismatic", _X), ("y", "prismatic", _Y), ("z", "prismatic", _Z),
+)  # fmt: skip
 
 SEVERAL = ("floating", "planar", "spherical")  # types of URDF, and that of balls
 

@@ -320,7 +320,7 @@ def _write_several(
     ends: tuple[str, str],
     robot: etree._Element,
 ) -> dict[tuple[str, str], str]:
-    """A joint with several freedoms as a series of joints; where each link and joint was written."""
+    """A joint with several freedoms as a series; what was added, and where it was written."""
     what, kind = f"joint '{name}'", joint.get("type")
     for tag in ("dynamics", "mimic"):
         if (found := xml.only(joint, tag, what)) is not None:

@@ -93,9 +93,10 @@ def independent(xml: XmlFile, joints: Mapping[str, etree._Element]) -> tuple[str
             raise xml.fail(joint, f"joint '{name}' is fixed and independent, keep one of the two")
     if not marked:
         return None
-    driven = [(name, joint) for name, joint in marked.items() if joint.get("independent") == "true"]
     out: list[str] = []
-    for name, joint in driven:
+    for name, joint in marked.items():
         kind = joint.get("type")
+        if joint.get("independent") == "false":
+            continue
         out += names_of(name, parts_of(kind, (0.0, 0.0, 1.0))) if kind in SEVERAL else [name]
     return tuple(out)
