@@ -184,6 +184,20 @@ def test_tip_velocity_is_the_commanded_one(loaded):
         assert np.abs(speed[near].mean(axis=0) - wanted(at)).max() < 0.03
 
 
+def test_a_path_of_the_tip_serves_as_velocity(loaded):
+    """Out and up along a line; a valve that is not needed stays where it is."""
+    control = TipVelocity(loaded, task_path(loaded, "push"))
+    recording = crane.simulate(loaded, control)
+    channels = recording.channels
+    assert channels["spool_slew"][0] == 0.0
+    gaps = [
+        np.abs(channels[f"tip_{axis}"] - channels[f"reference_tip_{axis}"]).max() for axis in "xyz"
+    ]
+    assert gaps[0] < 0.06  # open loop: it lags, and nobody brings it back
+    assert gaps[1] < 1e-3
+    assert gaps[2] < 0.06
+
+
 def test_a_program_sees_what_the_machine_does(patu):
     """The user's own control unit, called once per period with posture and pressures."""
     calls = []

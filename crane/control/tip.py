@@ -12,6 +12,7 @@ from crane.machine import Machine
 from crane.paths import Path
 from crane.samples import Array, as_sample
 
+_EASE = 1e-3  # opening over which the dead band is jumped
 _NEAR = 1e-3  # of a stroke: a joint so close to its limit goes no further
 
 
@@ -102,6 +103,7 @@ class TipVelocity(Sampled):
         opening /= max(1.0, np.abs(opening).max())
         signals = np.zeros(len(v))
         for i, valve in enumerate(self._circuit.valves.values()):
-            u = opening[i] * (1.0 - valve.dead_band) + valve.dead_band * np.sign(opening[i])
+            jump = valve.dead_band * np.tanh(opening[i] / _EASE)
+            u = opening[i] * (1.0 - valve.dead_band) + jump
             signals[i] = valve.neutral + (valve.full - valve.neutral) * u
         return signals

@@ -279,11 +279,12 @@ class Sampled:
         if not callable(function):
             raise InputError(f"{function!r} is no function (t, q_a, v_a, pressures) -> signals")
         self._function = function
-        self._joints = circuit_of(machine).joints
+        circuit = circuit_of(machine)
+        self._joints = circuit.joints
         self._active = machine.closure.active
         self.period = as_number(period, "the period", "s", above=0)
         self.columns = len(self._joints)
-        self._held = np.zeros(self.columns)
+        self._held = np.array([valve.neutral for valve in circuit.valves.values()])
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """See `Command`."""
