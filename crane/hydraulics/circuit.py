@@ -11,6 +11,7 @@ from crane.hydraulics.function import FIELDS, WIDTH, Chamber, Function, row_of
 from crane.samples import Array
 from crane.straight import Number, maximum
 
+_PRESSURE, _OIL = 1.0, 5e-13  # accuracy that matters [Pa], [m3]
 # Integrals that balance: pumped = returned + stored + volume swept, and pump_work = work of the
 # cylinders + hydraulic_loss + oil_energy.
 BALANCES = {
@@ -91,10 +92,17 @@ class Circuit:
         self.form = (tuple(self._compliant), tuple(self._sluggish), self._limited, measured)
         self.stiff = self._offsets[-1] + self._limited
         self.size = self.stiff + len(BALANCES)
+        modulus = hydraulics.oil.bulk_modulus
         scales: list[float] = []
-        for compliant, sluggish in zip(self._compliant, self._sluggish, strict=True):
-            scales += [1.0, 1.0] + [1e-10] * compliant + [1e-7, 1e-5] * sluggish
-        self.scales = np.array(scales + [1.0] * self._limited + [np.inf] * len(BALANCES))
+        for i, (cylinder, _, stroke) in enumerate(parts):
+            halves = (
+                cylinder.hose_a + 0.5 * cylinder.area_a * stroke,
+                cylinder.hose_b + 0.5 * cylinder.area_b * stroke,
+            )
+            scales += [max(_PRESSURE, modulus * _OIL / volume) for volume in halves]
+            scales += [1e-10] * self._compliant[i] + [1e-7, 1e-5] * self._sluggish[i]
+        line = [max(_PRESSURE, modulus * _OIL / hydraulics.supply.volume)] * self._limited
+        self.scales = np.array(scales + line + [np.inf] * len(BALANCES))
 
     def _common(self) -> list[float]:
         oil, supply = self.hydraulics.oil, self.hydraulics.supply
