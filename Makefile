@@ -17,7 +17,7 @@ help:
 	@echo "make slow    slow tests: browser, MuJoCo, long simulations"
 	@echo "make lint    ruff and mypy"
 	@echo "make bench   measure speed; results in docs/performance.md"
-	@echo "make reproduce   the reduced-scale forwarder paper again; docs/validation/"
+	@echo "make reproduce   both forwarder papers again; docs/validation/"
 	@echo "make clean   remove .venv, caches and results"
 
 setup: $(READY)
@@ -57,6 +57,7 @@ bench: $(READY_BENCH)
 
 reproduce: $(READY)
 	$(BIN)/python scripts/reproduce_mini_forwarder.py --write docs/validation/mini_forwarder.md
+	$(BIN)/python scripts/reproduce_hydraulic_forwarder.py --write docs/validation/hydraulic_forwarder.md
 
 clean:
 	rm -rf .venv .hypothesis .mypy_cache .pytest_cache .ruff_cache build dist demo-output

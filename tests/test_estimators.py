@@ -105,6 +105,7 @@ def draw(kind, strength, rng, count, joints):
     return sosfiltfilt(butter(4, strength, output="sos"), u, axis=0)[300:-300]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("estimator", "kind", "strength", "gaps", "count"),
     [

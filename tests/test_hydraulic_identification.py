@@ -251,6 +251,7 @@ def test_noise_like_the_paper_s(machine, slow, method):
     assert 0.7 < found.misfit < 1.5  # quantisation adds little to this noise
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["weak", "chambers"])
 def test_intervals_cover_and_nothing_is_biased(machine, quick, method):
     data = [column[::5] for column in quick]
@@ -568,6 +569,7 @@ def test_valve_without_noise(compensated, signal, end):
     np.testing.assert_allclose(found.predict(grid), speed_of(grid), atol=4e-4)
 
 
+@pytest.mark.slow
 def test_valve_intervals_cover(compensated):
     time = np.arange(0, 42, 1e-2)
     U = staircase(time)
@@ -682,6 +684,7 @@ def test_friction_without_noise(machine):
     )
 
 
+@pytest.mark.slow
 def test_friction_intervals_cover(machine):
     rng, draws = np.random.default_rng(2), 100
     inside = np.zeros(5)

@@ -80,6 +80,7 @@ def test_noise_is_all_that_is_left(mini, method):
     assert "validation, moving rows" in result.to_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["ols", "wls"])
 def test_intervals_cover_the_truth(mini, method):
     """Of 12 recordings, 90 to 99 % of the 95 % intervals."""

@@ -6,9 +6,9 @@ import numpy as np
 
 from crane.description.hydraulics import Cylinder, Valve
 from crane.errors import InputError, RecordingError, known
-from crane.identification.signals import average_periods, sampling
+from crane.identification.signals import average_periods, differentiate, sampling
 from crane.machine import Machine
-from crane.recording import Recording
+from crane.recording import Recording, derivative
 from crane.samples import Array
 
 _SLACK = 1e-3  # of the stroke by which a noisy sensor may leave it
@@ -70,6 +70,19 @@ def column(recording: Recording, joint: str) -> int:
     if joint not in recording.joints:
         raise RecordingError(f"'{joint}' is not recorded, {known(recording.joints, joint)}")
     return recording.joints.index(joint)
+
+
+def speed(recording: Recording, joint: str) -> Array:
+    """A joint's velocity (N,) as measured, or from a Kalman smoother of its coordinate.
+
+    The latter where the recording's velocity is no more than the differences of its coordinate:
+    of a measured one they are mostly noise.
+    """
+    i = column(recording, joint)
+    q, v = recording.q[:, i], recording.v[:, i]
+    if np.allclose(v, derivative(q, recording.time), rtol=1e-9, atol=1e-12):
+        return differentiate(recording.time, recording.q[:, [i]]).v[:, 0]
+    return v
 
 
 def channel(recording: Recording, name: str, unit: str) -> Array:

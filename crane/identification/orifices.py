@@ -14,6 +14,7 @@ from crane.identification import estimators
 from crane.identification.cylinder_signals import (
     CylinderSignals,
     cylinder_signals,
+    noise_level,
     noise_levels,
     parts,
 )
@@ -188,7 +189,11 @@ def identify_orifices(
     if method == "ls":
         values, covariance, freedom, condition, misfit = _pointwise(machine, joint, runs)
     else:
-        values, covariance, freedom, condition, misfit = _weak(sets, dict(noise or {}), joint)
+        levels = [
+            _filtered(machine, one, joint, len(run.time)) | dict(noise or {})
+            for one, run in zip(recordings, runs, strict=True)
+        ]
+        values, covariance, freedom, condition, misfit = _weak(sets, levels, joint)
     _check_values(values, covariance, joint, method, runs)
     training = tuple(sides(machine, joint, run, values, window) for run in runs)
     return Orifices(
@@ -196,8 +201,22 @@ def identify_orifices(
     )
 
 
+def _filtered(machine: Machine, recording: Recording, joint: str, count: int) -> dict[str, float]:
+    """Noise of an opening that came through the spool's equation, over `count` samples.
+
+    What passes of the signal's white noise is as strong at low frequencies, to which windows
+    answer, as before, and hardly to be seen from sample to sample.
+    """
+    _, valve = parts(machine, joint)
+    if f"spool_{joint}" in recording.channels or not valve.bandwidth:
+        return {}
+    level = noise_level(recording.channels[f"voltage_{joint}"])
+    level /= abs(valve.full - valve.neutral) * (1 - valve.dead_band)
+    return {"opening": level / np.sqrt(max(len(recording.time) // count, 1))}
+
+
 def _weak(
-    sets: list[OrificeRows], noise: dict[str, float], joint: str
+    sets: list[OrificeRows], noise: list[dict[str, float]], joint: str
 ) -> tuple[Array, Array, Array, float, float]:
     """X, covariance, freedom, condition number, misfit."""
     count = len(sets[0].mix)
@@ -224,10 +243,10 @@ def _weak(
     X, scale = estimate.values, estimate.noise**2
     A = sum(Z_all[group == g].T @ W_all[group == g] / scale[g] for g in range(len(scale)))
     middle, explained = np.zeros((5, 5)), 0.0
-    for rows in sets:
+    for rows, given in zip(sets, noise, strict=True):
         w, N = rows.windows, len(rows.signals.time)
         Z_rows = rows.W[:, ::-1] * rows.kept[:, None]
-        for sensor, level in noise_levels(rows.signals, noise).items():
+        for sensor, level in noise_levels(rows.signals, given).items():
             df, dg = rows.sensitivity(X, sensor, level)
             total = np.zeros((N, 5))
             for e in range(count):

@@ -16,7 +16,7 @@ import numpy as np
 
 from crane.errors import RecordingError
 from crane.identification import estimators
-from crane.identification.cylinder_signals import channel, column, parts
+from crane.identification.cylinder_signals import channel, parts, speed
 from crane.identification.steady import steady
 from crane.machine import Machine
 from crane.recording import Recording
@@ -139,6 +139,7 @@ def identify_valve(
         machine: With hydraulics; of its valve `neutral`, `full` and `margin` are used, the first
             two for direction and range only.
         recording: With the joint and `voltage_<joint>`; pressures as in `cylinder_signals`.
+            A velocity that is no more than differences of the coordinate is smoothed.
         joint: The cylinder's.
         settle: [s], several times the spool's and the load's answer.
 
@@ -149,20 +150,20 @@ def identify_valve(
     """
     cylinder, valve = parts(machine, joint)
     signal = channel(recording, f"voltage_{joint}", "V")
-    speed = recording.v[:, column(recording, joint)]
-    kept = steady(recording.time, settle, signal, speed)
-    fastest = float(np.abs(speed).max())
+    v = speed(recording, joint)
+    kept = steady(recording.time, settle, signal, v)
+    fastest = float(np.abs(v).max())
     names = (f"pressure_{joint}_a", f"pressure_{joint}_b", "pressure_supply")
     if valve.margin and all(name in recording.channels for name in names):
         p_a, p_b, supply = (channel(recording, name, "Pa") for name in names)
-        inlet = np.where(speed > 0, p_a, p_b)
+        inlet = np.where(v > 0, p_a, p_b)
         tank = machine.hydraulics.supply.tank if machine.hydraulics else 0.0
         served = (supply - inlet >= valve.margin) & (inlet > 0.5 * tank)
-        kept &= served | (np.abs(speed) < _STILL * fastest)
+        kept &= served | (np.abs(v) < _STILL * fastest)
     span = valve.full - valve.neutral
     turn = float(np.sign(span))
     for sense, word in ((1, "extending"), (-1, "retracting")):
-        moving = kept & (sense * speed > _STILL * fastest)
+        moving = kept & (sense * v > _STILL * fastest)
         if np.count_nonzero(moving) < 2 or np.ptp(signal[moving]) < _FEWEST_LEVELS * np.ptp(
             signal
         ):
@@ -173,10 +174,10 @@ def identify_valve(
     at = np.flatnonzero(kept)
     # so many samples as tell anything anew
     at = at[:: max(1, len(at) // 4000)]
-    U, v = signal[at], speed[at]
-    values = _fit(U, v, turn, fastest)
+    U, speeds = signal[at], v[at]
+    values = _fit(U, speeds, turn, fastest)
     J = _jacobian(values, U, turn)
-    told = estimators.least_squares(J, v - _curve(values, U, turn) + J @ values, samples=at)
+    told = estimators.least_squares(J, speeds - _curve(values, U, turn) + J @ values, samples=at)
     return ValveCurve(
         joint=joint,
         values=values,
@@ -185,7 +186,7 @@ def identify_valve(
         span=span,
         areas=(cylinder.area_a, cylinder.area_b),
         signal=U,
-        speed=v,
+        speed=speeds,
         noise=float(told.noise[0]),
     )
 

@@ -12,13 +12,14 @@ import numpy as np
 from lxml import etree
 
 from crane.description import Chain, Friction, MachineSpec, read
+from crane.description.parallel_robots import is_parallel_robot
 from crane.dynamics import Dynamics
 from crane.errors import CraneError, CraneWarning, InputError, OutputError
 from crane.identification.base import random_samples
 from crane.identification.model import PER_BODY
 from crane.identification.result import Identification
 from crane.identification.urdf import changed_urdf
-from crane.machine import load
+from crane.machine import Machine, load
 from crane.output import replacing, staging
 
 _SAME = 1e-9  # of the largest force, by which the written machine may differ
@@ -57,12 +58,17 @@ def write_machine(result: Identification, folder: str | Path) -> Path:
         The machine file.
 
     Raises:
-        InputError: There are no parameters, the machine is not as its files describe it, or a
-            machine file cannot hold the model's terms.
+        InputError: The machine comes from another format, there are no parameters, the machine is
+            not as its files describe it, or a machine file cannot hold the model's terms.
         CraneError: The parameters belong to no possible machine.
         OutputError: The folder cannot be written, or holds the files that the machine came from.
     """
     machine, parameters = result.machine, result.parameters
+    if not _rewritable(machine):
+        raise InputError(
+            f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
+            f"one: crane convert {machine.path.name} FOLDER"
+        )
     if parameters is None or not result.model.bodies:
         raise InputError("forces determine base parameters only: give prior or feasible=True")
     with warnings.catch_warnings():
@@ -101,6 +107,13 @@ def write_machine(result: Identification, folder: str | Path) -> Path:
         (part / file).write_text(content, encoding="utf-8")
         _check(result, part / file)
     return Path(folder) / file
+
+
+def _rewritable(machine: Machine) -> bool:
+    """Whether the files of a machine can be written again with other numbers in them."""
+    if any(chain.urdf.suffix.lower() != ".urdf" for chain in machine.chains):
+        return False
+    return machine.path.suffix.lower() == ".urdf" or not is_parallel_robot(machine.path)
 
 
 def _names(spec: MachineSpec) -> dict[str, str]:
