@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from crane.recording import FORCE_UNITS
-from crane.replay import Channel, Comparison
+from crane.replays import Channel, Comparison
 from crane.summary import READING_UNITS
 from crane.view.plots import DASHED, RECORDED, write_figure
 

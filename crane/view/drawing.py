@@ -1,11 +1,10 @@
-"""Meshcat's commands for shapes, lines, the ground and motion, kept instead of sent."""
+"""Meshcat's commands for shapes and the ground, kept instead of sent."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from crane.samples import Array
 from crane.view.visuals import Box, Cylinder, Mesh, Sphere, Visual
@@ -48,13 +47,6 @@ def draw_visuals(viewer: Any, visuals: Sequence[Visual]) -> None:
         shape.set_transform(placement)
 
 
-def draw_line(viewer: Any, points: Array, colour: int) -> None:
-    """Draw a line through points (N, 3)."""
-    import meshcat.geometry as g
-
-    viewer.set_object(g.Line(_points(points), g.LineBasicMaterial(color=colour)))
-
-
 def draw_surroundings(viewer: Any, lower: Array, upper: Array) -> None:
     """Background and a grid with round spacing on the ground, around a box (3,), (3,)."""
     import meshcat.geometry as g
@@ -73,23 +65,6 @@ def draw_surroundings(viewer: Any, lower: Array, upper: Array) -> None:
     level = np.concatenate([along, along[:, ::-1]]) + centre
     points = np.column_stack([level, np.full(len(level), lower[2])])
     viewer.set_object(g.LineSegments(_points(points), g.LineBasicMaterial(color=_GRID)))
-
-
-def animate(viewer: Any, poses: Mapping[str, Array], time: Array) -> None:
-    """Move the group of each link through poses (N, 4, 4) at times (N,) [s], again and again."""
-    from meshcat.animation import Animation, AnimationClip, AnimationTrack
-
-    keys = time.tolist()  # one "frame" per second, so that keys are times
-    animation = Animation()
-    for link, pose in poses.items():
-        positions = pose[:, :3, 3].tolist()
-        turns = [pin.Quaternion(matrix[:3, :3]).coeffs().tolist() for matrix in pose]
-        tracks = {
-            "position": AnimationTrack("position", "vector3", keys, positions),
-            "quaternion": AnimationTrack("quaternion", "quaternion", keys, turns),
-        }
-        animation.clips[viewer[link].path] = AnimationClip(tracks, fps=1)
-    viewer.set_animation(animation, play=True, repetitions=10**6)
 
 
 def _points(points: Array) -> Any:

@@ -122,7 +122,7 @@ def recording_figure(recording: Recording) -> Figure:
                 _draw_panel(axes, recording.time, panel)
                 _letter(axes, 3 * band * columns + row * beside + column)
                 if row == 0:
-                    axes.set_title(_symbol(name))
+                    axes.set_title(joint_symbol(name))
                 if row == 2:
                     axes.set_xlabel("time [s]")
                 else:
@@ -253,7 +253,7 @@ def _caption(figure: Figure, recording: Recording) -> None:
         figure.legend(handles=shown, loc="outside upper right", ncols=2)
 
 
-def _symbol(name: str) -> str:
+def joint_symbol(name: str) -> str:
     """A joint's name as mathematics where it is a letter and a number, q1 as q with index 1."""
     if match := re.fullmatch(r"([A-Za-z])(\d+)", name):
         return f"${match[1]}_{{{match[2]}}}$"

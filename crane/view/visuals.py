@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from crane.description.xml import XmlFile
 from crane.errors import CraneWarning
 from crane.machine import Machine
 from crane.samples import Array
@@ -85,13 +86,17 @@ class Visual:
 def read_visuals(machine: Machine) -> list[Visual]:
     """The visuals of every link, or a skeleton where no URDF has any.
 
-    Meshes whose files are missing are left out with a warning.
+    A mesh whose file is missing is a box, with a warning; where nothing but boxes would be left,
+    the skeleton is there, too.
     """
     import yourdfpy
 
     visuals: list[Visual] = []
     missing: list[str] = []
+    box = Box((0.15 * _reach(machine),) * 3)
     for chain in machine.chains:
+        if XmlFile(chain.urdf).root.tag != "robot":  # MJCF, whose shapes are not drawn
+            continue
         robot = yourdfpy.URDF.load(
             str(chain.urdf),
             build_scene_graph=False,
@@ -104,16 +109,24 @@ def read_visuals(machine: Machine) -> list[Visual]:
                 placement = np.eye(4) if visual.origin is None else visual.origin
                 named = visual.material
                 colour = None if named is None else _colour(named) or colours.get(named.name)
-                for shape, own in _shapes(visual.geometry, chain.urdf, missing):
+                for shape, own in _shapes(visual.geometry, chain.urdf, missing, box):
                     visuals.append(Visual(link.name, shape, placement, colour or own or PLAIN))
     if missing:
         warnings.warn(
-            f"{machine.name}: {len(missing)} mesh files are not there and are left out "
+            f"{machine.name}: {len(missing)} mesh files are not there and are drawn as boxes "
             f"({missing[0]}), install the package that has them",
             CraneWarning,
             stacklevel=2,
         )
-    return visuals or skeleton(machine)
+    if all(visual.shape is box for visual in visuals):
+        visuals += skeleton(machine)
+    return visuals
+
+
+def _reach(machine: Machine) -> float:
+    """Largest distance between two joints on one body [m]; 1 where all are in one place."""
+    places = machine.model.jointPlacements
+    return max(float(np.linalg.norm(place.translation)) for place in places) or 1.0
 
 
 def skeleton(machine: Machine) -> list[Visual]:
@@ -148,7 +161,9 @@ def _colour(material: Any) -> Colour | None:
     return red, green, blue, opacity
 
 
-def _shapes(geometry: Any, urdf: Path, missing: list[str]) -> list[tuple[Shape, Colour | None]]:
+def _shapes(
+    geometry: Any, urdf: Path, missing: list[str], box: Box
+) -> list[tuple[Shape, Colour | None]]:
     """The shapes of a geometry, each with its own colour if its file has one."""
     if geometry.box is not None:
         x, y, z = (float(value) for value in geometry.box.size)
@@ -158,17 +173,19 @@ def _shapes(geometry: Any, urdf: Path, missing: list[str]) -> list[tuple[Shape, 
         return [(Cylinder(float(cylinder.radius), float(cylinder.length)), None)]
     if geometry.sphere is not None:
         return [(Sphere(float(geometry.sphere.radius)), None)]
-    return _meshes(geometry.mesh, urdf, missing)
+    return _meshes(geometry.mesh, urdf, missing, box)
 
 
-def _meshes(mesh: Any, urdf: Path, missing: list[str]) -> list[tuple[Shape, Colour | None]]:
+def _meshes(
+    mesh: Any, urdf: Path, missing: list[str], box: Box
+) -> list[tuple[Shape, Colour | None]]:
     import trimesh
     from yourdfpy.urdf import filename_handler_magic
 
     file = Path(filename_handler_magic(mesh.filename, dir=str(urdf.parent)))
     if not file.is_file():
         missing.append(mesh.filename)
-        return []
+        return [(box, None)]
     # unmerged vertices keep the edges of the drawing sharp
     scene = trimesh.load_scene(file, process=False)
     scale = np.eye(4)

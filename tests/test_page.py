@@ -1,0 +1,471 @@
+"""The page in a browser: what it shows is what was recorded, and nothing leaves it."""
+
+import base64
+import dataclasses
+import itertools
+import shutil
+import time as clock
+import warnings
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import crane
+from crane.errors import CraneWarning, RecordingError
+from crane.recording import Recording
+from crane.view.page_channels import Grid, columns, groups
+from crane.view.page_summary import limits_hit, mechanical_work, run_summary
+from crane.view.visuals import read_visuals
+
+WEBGL = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+CORNERS = [[0.0, 0.0221, 0.0108], [0.4, 0.03, 0.0], [1.1, 0.0, 0.03], [-0.7, 0.002, 0.004]]
+
+
+@pytest.fixture(scope="module")
+def machine():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        return crane.load("mini_forwarder")
+
+
+@pytest.fixture(scope="module")
+def recording(machine):
+    """Two seconds at 5 ms from t = 3 s, forces that change their signs on the way."""
+    time = 3.0 + np.linspace(0, 2, 401)
+    nodes = [3.0, 3.75, 4.25, 5.0]
+    q_a = np.column_stack([np.interp(time, nodes, column) for column in np.transpose(CORNERS)])
+    q = machine.closure.solve(q_a)
+    tau = np.column_stack([0.1 * (4.2 - time), 50 * (4 - time), 20 * (time - 4.5)])
+    passive = [joint for joint in machine.joints if joint not in machine.active]
+    channels = {joint: q[:, machine.column(joint)] for joint in passive}
+    channels["pressure_X1_a"] = 1e6 * (1 + np.sin(9 * time) ** 2)
+    channels["reference_X1"] = q_a[:, 1] + 1e-3
+    return Recording(
+        time=time,
+        joints=machine.active,
+        q=q_a,
+        v=np.gradient(q_a, time, axis=0),
+        tau=tau,
+        units={joint: machine.unit(joint) for joint in machine.active},
+        channels=channels,
+        channel_units={"pressure_X1_a": "Pa"},
+        task="round the corners",
+    )
+
+
+def part(recording, rows, time=None):
+    """Some samples of a recording, perhaps at other times."""
+    return dataclasses.replace(
+        recording,
+        time=recording.time[rows] if time is None else time,
+        channels={name: values[rows] for name, values in recording.channels.items()},
+        **{name: getattr(recording, name)[rows] for name in ("q", "v", "tau")},
+    )
+
+
+def decoded(text):
+    return np.frombuffer(base64.b64decode(text), "<f4")
+
+
+def line(found, name):
+    """(group, line) of a column."""
+    ((group, wanted),) = [(g, x) for g in found for x in g["lines"] if x["name"] == name]
+    return group, wanted
+
+
+def test_extremes_survive_thinning_out(machine):
+    """One wild sample of a million is seen, to the precision of a float."""
+    time = np.arange(300_001) * 1e-3
+    rng = np.random.default_rng(3)
+    tau = rng.normal(size=(len(time), 3))
+    tau[123_456, 1], tau[200_001, 1] = 91.25, -77.5
+    q = np.tile(machine.home[machine.closure.active], (len(time), 1))
+    units = {joint: machine.unit(joint) for joint in machine.active}
+    recording = Recording(time, machine.active, q, 0 * q, tau, units)
+    frames = np.arange(0, len(time), 33)
+    grid = Grid.of(recording, frames)
+    _, found = line(groups(machine, recording, grid), "X1_force")
+    low, high = decoded(found["series"]["low"]), decoded(found["series"]["high"])
+    assert len(low) == len(high) < 10_000
+    assert (low.min(), high.max()) == (-77.5, 91.25)
+    centres = np.frombuffer(base64.b64decode(grid.axis()["time"]), "<f8")
+    span = time[-1] / len(centres)
+    assert centres[high.argmax()] == pytest.approx(time[123_456], abs=span)
+    np.testing.assert_allclose(decoded(found["series"]["frames"]), tau[frames, 1], rtol=1e-7)
+
+
+def test_columns_are_grouped_and_read_in_handy_units(machine, recording):
+    grid = Grid.of(recording, np.arange(401))
+    found = groups(machine, recording, grid)
+    expected = {
+        "q1": ("Angles", "deg", 180 / np.pi),
+        "X1": ("Strokes", "mm", 1e3),
+        "X1_velocity": ("Stroke velocities", "mm/s", 1e3),
+        "X1_force": ("Forces", "N", 1.0),
+        "pressure_X1_a": ("Pressures", "bar", 1e-5),
+        "q9": ("Passive angles", "deg", 180 / np.pi),
+    }
+    values = recording.columns()
+    for name, (title, unit, scale) in expected.items():
+        group, there = line(found, name)
+        assert (group["title"], group["unit"]) == (title, unit)
+        shown = decoded(there["series"]["low"])
+        np.testing.assert_allclose(shown, scale * values[name], rtol=2e-7, atol=1e-6)
+    opened = {group["title"] for group in found if group["open"]}
+    assert {"Angles", "Strokes", "Forces", "Pressures"} <= opened
+    assert "Passive angles" not in opened
+    wanted = decoded(line(found, "X1")[1]["reference"]["low"])
+    np.testing.assert_allclose(wanted, 1e3 * (recording.q[:, 1] + 1e-3), rtol=1e-6)
+
+
+def test_every_column_is_on_the_page_once(machine, recording):
+    names = [column.name for column in columns(machine, recording)]
+    references = {"reference_X1"}
+    assert sorted(names) == sorted(set(recording.columns()) - {"time"} - references)
+
+
+def test_work_and_limits(machine, recording):
+    given, taken = mechanical_work(recording)
+    power = (recording.tau * recording.v).sum(axis=1)
+    assert given - taken == pytest.approx(np.trapezoid(power, recording.time), rel=1e-12)
+    assert min(given, taken) >= 0
+    told = limits_hit(machine, recording)
+    assert len(told) == 4  # X1 and X2 go from one end to the other
+    assert told[0].startswith("X1 reaches its lower limit of 0 mm at 4.25 s")
+    assert not run_summary(machine, None)["forces"]
+
+
+def test_a_second_recording_has_to_be_of_the_machine(machine, recording, tmp_path):
+    units = {"q1": "rad", "x1": "m", "X2": "m"}
+    other = dataclasses.replace(
+        recording, joints=tuple(units), units=units, channels={}, channel_units={}
+    )
+    with pytest.raises(RecordingError, match="the second recording: .* no joint 'X1'"):
+        crane.report(machine, recording, tmp_path / "page.html", other)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_minute_at_a_thousand_hertz_is_small_and_quick(machine, recording, tmp_path):
+    rows = np.arange(60_001) % 401
+    long = part(recording, rows, np.arange(60_001) * 1e-3)
+    crane.report(machine, recording, tmp_path / "first.html")  # imports
+    start = clock.perf_counter()
+    page = crane.report(machine, long, tmp_path / "page.html")
+    assert clock.perf_counter() - start < 3
+    assert page.stat().st_size < 5e6
+
+
+@pytest.fixture(scope="module")
+def browser():
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("no chromium in the path")
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=chromium, args=WEBGL)
+        yield started
+        started.close()
+
+
+@pytest.fixture
+def opened(browser, tmp_path):
+    """Opens a report, sees at the end that nothing was asked for and nothing complained."""
+    pages = []
+
+    def open_report(machine, recording, other=None, size=(1280, 720), **options):
+        path = crane.report(machine, recording, tmp_path / f"page{len(pages)}.html", other)
+        page = browser.new_page(
+            viewport=dict(zip(("width", "height"), size, strict=True)), **options
+        )
+        problems, requests = [], []
+        page.on("pageerror", lambda error: problems.append(str(error)))
+        page.on(
+            "console",
+            lambda line: problems.append(line.text) if line.type in ("error", "warning") else None,
+        )
+        page.on("request", lambda request: requests.append(request.url))
+        page.goto(path.as_uri())
+        page.wait_for_function("window.crane !== undefined")
+        pages.append((page, path, problems, requests))
+        return page
+
+    yield open_report
+    for page, path, problems, requests in pages:
+        page.close()
+        assert requests == [path.as_uri()]
+        assert problems == []
+
+
+def world(machine, q, link):
+    """(4, 4) pose of a link."""
+    data = machine.model.createData()
+    pin.forwardKinematics(machine.model, data, q)
+    return pin.updateFramePlacement(machine.model, data, machine.frame(link)).homogeneous
+
+
+def scrub(page, share):
+    """Drag the time bar's thumb there."""
+    box = page.locator("#seek").bounding_box()
+    page.mouse.click(box["x"] + 8 + share * (box["width"] - 16), box["y"] + box["height"] / 2)
+
+
+@pytest.mark.slow
+def test_bodies_are_where_forward_kinematics_has_them(machine, recording, opened):
+    page = opened(machine, recording)
+    links = [f.name for f in machine.model.frames if f.type == pin.FrameType.BODY]
+    assert len(links) > len({visual.link for visual in read_visuals(machine)})  # some bare ones
+    q = machine.closure.solve(recording.q)
+    seen = set()
+    for share in (0.0, 0.23, 0.5, 0.81, 1.0, 0.12):
+        scrub(page, share)
+        time = page.evaluate("crane.time")
+        sample = int(np.argmin(abs(recording.time - time)))
+        assert recording.time[sample] == pytest.approx(time, abs=1e-12)  # a recorded instant
+        assert (time - 3) / 2 == pytest.approx(share, abs=0.02)
+        seen.add(sample)
+        for link in links:
+            shown = np.reshape(page.evaluate("(link) => crane.pose(link)", link), (4, 4)).T
+            np.testing.assert_allclose(shown, world(machine, q[sample], link), atol=1e-6)
+    assert len(seen) == 6
+    assert page.inner_text("#machine") == "mini_forwarder"
+    assert page.inner_text("#task") == "round the corners"
+
+
+@pytest.mark.slow
+def test_marks_are_where_the_machine_has_them(machine, recording, opened):
+    page = opened(machine, recording)
+    page.evaluate("crane.seek(4.2)")
+    sample = int(np.argmin(abs(recording.time - page.evaluate("crane.time"))))
+    q = machine.closure.solve(recording.q[sample])
+    data = machine.model.createData()
+    centre = pin.centerOfMass(machine.model, data, q)
+    shown = page.evaluate("crane.marks.layers.mass.object.children[0].position.toArray()")
+    np.testing.assert_allclose(shown, centre, atol=1e-9)
+    pins = page.evaluate(
+        "crane.marks.layers.pins.object.children.map((pin) => pin.position.toArray())"
+    )
+    loops = machine.closure.equations.loops
+    for place, loop in zip(pins, loops, strict=True):
+        for end in (loop.predecessor, loop.successor):  # both ends: the loops are closed
+            np.testing.assert_allclose(place, world(machine, q, end)[:3, 3], atol=1e-6)
+
+
+@pytest.mark.slow
+def test_cursor_values_and_clock_are_of_one_time(machine, recording, opened):
+    page = opened(machine, recording)
+    for share in (0.3, 0.7):
+        scrub(page, share)
+        time = page.evaluate("crane.time")
+        cursors = page.evaluate(
+            "crane.channels.panels.filter((p) => p.open).map((p) => p.plot.time)"
+        )
+        assert len(cursors) >= 4
+        assert set(cursors) == {time}
+        assert page.inner_text("#clock").startswith(f"{time:.2f} /")
+        sample = int(np.argmin(abs(recording.time - time)))
+        for name, scale in (("X1", 1e3), ("X1_force", 1.0), ("pressure_X1_a", 1e-5)):
+            text = page.inner_text(f"button.chip[title='{name}'] b").replace("\u2212", "-")
+            value = scale * recording.columns()[name][sample]
+            assert float(text) == pytest.approx(value, rel=1e-3, abs=2e-3)
+
+
+@pytest.mark.slow
+def test_dragging_in_a_plot_moves_the_machine(machine, recording, opened):
+    page = opened(machine, recording)
+    box = page.locator(".canvases").first.bounding_box()
+    page.mouse.move(box["x"] + 80, box["y"] + 40)
+    page.mouse.down()
+    page.mouse.move(box["x"] + box["width"] - 30, box["y"] + 40)
+    page.mouse.up()
+    assert page.evaluate("crane.time") > 4.5
+    assert float(page.input_value("#seek")) == pytest.approx(page.evaluate("crane.time"))
+
+
+@pytest.mark.slow
+def test_arrows_turn_with_the_sign_of_the_force(machine, recording, opened):
+    """X1 pushes before 4 s and pulls after, q1 turns back after 4.2 s: red, and then blue.
+
+    A straight arrow points along the force, a round one turns right-handed about the torque.
+    """
+    page = opened(machine, recording)
+    q = machine.closure.solve(recording.q)
+    found = []
+    for time in (3.2, 3.7, 4.4, 4.9):
+        page.evaluate("(time) => crane.seek(time)", time)
+        sample = int(np.argmin(abs(recording.time - page.evaluate("crane.time"))))
+        (direction, length, colour), (normal, _, turning) = page.evaluate(
+            """() => ["X1", "q1"].map((wanted) => {
+                const { arrow } = crane.marks.arrows.find(({ name }) => name === wanted);
+                const own = arrow.shaft ? [0, 1, 0] : [0, 0, 1];
+                const direction = arrow.tip.position.clone().set(...own);
+                const { r, b } = arrow.material.color;
+                direction.applyQuaternion(arrow.object.quaternion);
+                const length = arrow.shaft ? arrow.shaft.scale.y + arrow.tip.scale.y : 0;
+                return [direction.toArray(), length, r - b];
+            })"""
+        )
+        force = recording.tau[sample, 1]
+        axis = world(machine, q[sample], "A1_rod")[:3, 0]
+        np.testing.assert_allclose(direction, np.sign(force) * axis, atol=1e-6)
+        assert np.sign(colour) == np.sign(force)
+        torque = recording.tau[sample, 0]
+        np.testing.assert_allclose(normal, [0, 0, np.sign(torque)], atol=1e-6)
+        assert np.sign(turning) == np.sign(torque)
+        found.append((abs(force), length))
+    (f1, l1), (f2, l2), _, (f4, l4) = found
+    assert l1 / l2 == pytest.approx(f1 / f2, rel=1e-3)
+    assert l1 / l4 == pytest.approx(f1 / f4, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_it_plays_pauses_and_listens_to_keys(machine, recording, opened):
+    page = opened(machine, recording)
+    now = lambda: page.evaluate("crane.time")  # noqa: E731
+    assert now() == 3.0
+    page.click("#play")
+    page.wait_for_function("crane.time > 3.2")
+    page.keyboard.press("Space")
+    stopped = now()
+    page.wait_for_timeout(200)
+    assert now() == stopped
+    assert abs(recording.time - stopped).min() < 1e-12  # stands at a recorded instant
+    page.keyboard.press("Home")
+    assert now() == 3.0
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("ArrowRight")
+    assert now() == pytest.approx(3 + 2 / 30, abs=0.0026)
+    page.keyboard.press("ArrowLeft")
+    assert now() == pytest.approx(3 + 1 / 30, abs=0.0026)
+    page.keyboard.press("End")
+    assert now() == 5.0
+    page.click("#first")
+    page.select_option("#speed", "5")
+    page.keyboard.press("Escape")
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press("Space")
+    page.wait_for_function("crane.time === 5 && !crane.timeline.playing", timeout=10_000)
+
+
+@pytest.mark.slow
+def test_views_marks_and_channels_are_switched(machine, recording, opened):
+    page = opened(machine, recording)
+    for view in ("iso", "side", "front", "top"):
+        page.click(f"#views button:text-is('{view}')")
+        seen = page.evaluate(
+            "crane.viewer.camera.position.clone().sub(crane.viewer.controls.target)"
+            ".normalize().toArray()"
+        )
+        back = {"side": [0, 0, 1], "front": [1, 0, 0], "top": [0, 1, 0]}.get(view)
+        if back is not None:  # the viewer's y axis is up
+            np.testing.assert_allclose(seen, back, atol=2e-3)
+    page.click("#follow")
+    before = page.evaluate("crane.viewer.controls.target.toArray()")
+    page.evaluate("crane.seek(4.0)")
+    after = page.evaluate("crane.viewer.controls.target.toArray()")
+    q = machine.closure.solve(recording.q)
+    x, y, z = (world(machine, q[200], "link7_tip") - world(machine, q[0], "link7_tip"))[:3, 3]
+    np.testing.assert_allclose(np.subtract(after, before), [x, z, -y], atol=1e-6)
+    for layer in ("forces", "path", "mass", "pins"):
+        page.click(f"#layers button[data-layer={layer}]")
+        assert not page.evaluate(f"crane.marks.layers.{layer}.object.visible")
+    lines = "crane.channels.panels.find((p) => p.group.title === 'Strokes').plot.lines.length"
+    count = page.evaluate(lines)
+    page.click("button.chip[title='X1']")  # with its reference
+    assert page.evaluate(lines) == count - 2
+    page.click("#more button:text('Passive angles')")
+    assert page.is_visible("button.chip[title='q9']")
+
+
+@pytest.mark.slow
+def test_a_second_recording_is_a_ghost_with_lines_of_its_own(machine, recording, opened):
+    later = dataclasses.replace(part(recording, np.arange(100, 401)), task="late")
+    page = opened(machine, recording, later)
+    page.evaluate("crane.seek(3.2)")
+    assert not page.evaluate("ghost.visible")  # it has not begun
+    page.evaluate("crane.seek(4.5)")
+    assert page.evaluate("ghost.visible")
+    same = page.evaluate(
+        "Object.keys(ghostGroups).every((link) => ghostGroups[link].matrix.elements"
+        ".every((x, i) => Math.abs(x - crane.space.groups[link].matrix.elements[i]) < 1e-2))"
+    )
+    assert same
+    second = page.inner_text("button.chip[title='X1'] i").replace("\u2212", "-")
+    assert float(second) == pytest.approx(float(page.inner_text("button.chip[title='X1'] b")))
+    apart = dataclasses.replace(recording, time=recording.time + 1e6)
+    page = opened(machine, recording, apart)
+    assert page.evaluate("ghost.visible")  # both start together, which the page tells
+    assert "clock moved" in page.inner_text("#over")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(1280, 720), (390, 844), (844, 390), (768, 1024)])
+def test_one_sample_and_a_still_machine_fit_in_every_window(machine, recording, opened, size):
+    for shown in (part(recording, np.array([70])), None, recording):
+        page = opened(machine, shown, size=size, has_touch=size[0] < 1000)
+        page.wait_for_timeout(300)
+        wide, high = page.evaluate(
+            "[document.documentElement.scrollWidth, document.documentElement.scrollHeight]"
+        )
+        assert (wide, high) == size
+        assert page.evaluate("document.getElementById('side').scrollWidth") <= size[0]
+        cut = page.evaluate(
+            """() => [...document.querySelectorAll("button, select, h1, h2, #clock, #summary")]
+                .filter((item) => item.offsetParent !== null)
+                .map((item) => [item.id || item.textContent, item.getBoundingClientRect()])
+                .filter(([, box]) => box.left < -0.5 || box.right > innerWidth + 0.5)
+                .map(([name]) => name)"""
+        )
+        assert cut == []
+        boxes = page.evaluate(
+            """() => ["views", "layers", "summary"].map((id) => document.getElementById(id))
+                .filter((item) => item.parentElement.id === "space")
+                .map((item) => item.getBoundingClientRect())
+                .map(({ left, right, top, bottom }) => [left, right, top, bottom])"""
+        )
+        for one, two in itertools.combinations(boxes, 2):
+            apart = one[1] <= two[0] or two[1] <= one[0] or one[3] <= two[2] or two[3] <= one[2]
+            assert apart, (one, two)
+        q = machine.home if shown is None else machine.closure.solve(shown.q[0])
+        pose = np.reshape(page.evaluate("crane.pose('link7')"), (4, 4)).T
+        np.testing.assert_allclose(pose, world(machine, q, "link7"), atol=1e-6)
+        assert page.is_visible("#player") == (shown is not None)
+
+
+@pytest.mark.slow
+def test_touch_moves_the_time(machine, recording, opened):
+    page = opened(machine, recording, size=(390, 844), has_touch=True)
+    box = page.locator(".canvases").first.bounding_box()
+    page.touchscreen.tap(box["x"] + 0.6 * box["width"], box["y"] + 30)
+    assert 3.8 < page.evaluate("crane.time") < 4.5
+
+
+@pytest.mark.slow
+def test_a_clock_that_counts_from_long_ago_is_shown_from_its_start(machine, recording, opened):
+    page = opened(machine, part(recording, slice(None), recording.time + 1.7e9 + 0.25))
+    assert page.inner_text("#clock") == "0.25 / 2.25 s"
+    assert "1700000003 s" in page.inner_text("#summary")
+    page.keyboard.press("End")
+    assert page.evaluate("crane.time") == pytest.approx(1.7e9 + 5.25, abs=1e-6)
+
+
+@pytest.mark.slow
+def test_without_webgl_plots_and_numbers_remain(machine, recording, browser, tmp_path):
+    path = crane.report(machine, recording, tmp_path / "page.html")
+    page = browser.new_page()
+    problems = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.add_init_script(
+        "const get = HTMLCanvasElement.prototype.getContext;"
+        "HTMLCanvasElement.prototype.getContext = function (kind, ...more) {"
+        "    return kind.includes('webgl') ? null : get.call(this, kind, ...more);"
+        "};"
+    )
+    page.goto(path.as_uri())
+    page.keyboard.press("End")
+    assert page.evaluate("crane.time") == 5.0
+    assert page.inner_text("button.chip[title='X1'] b") == "2.000"
+    assert "WebGL" in page.inner_text("#pane")
+    page.close()
+    assert problems == []
