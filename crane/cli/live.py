@@ -1,0 +1,56 @@
+"""The command that shows a machine to play with: live."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from crane.cli.shared import Change, Lock, app, load
+from crane.errors import InputError
+
+
+@app.command()
+def live(
+    what: Annotated[
+        str, typer.Argument(metavar="WHAT", help="A machine, a run's folder, or a recording.")
+    ],
+    machine: Annotated[
+        str | None,
+        typer.Option(metavar="MACHINE", help="The machine of a run, if not as recorded."),
+    ] = None,
+    run: Annotated[
+        Path | None, typer.Option(metavar="RUN", help="A run of the machine to play.")
+    ] = None,
+    host: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="To listen on; 0.0.0.0 for all computers.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="To listen on; the first free one from 8080."),
+    ] = None,
+    change: Change = None,
+    lock: Lock = None,
+) -> None:
+    """Move a machine with sliders in a browser, its loops closed at every move."""
+    from crane.live.playback import Playback
+    from crane.live.serve import serve
+    from crane.live.session import Session
+    from crane.runs import machine_of, read_run
+
+    recording = None
+    if Path(what).is_dir() or Path(what).suffix.lower() in (".csv", ".npz"):
+        if run is not None:
+            raise InputError(f"'{what}' is a run already, leave --run out")
+        if change or lock:
+            raise InputError("--set and --lock are for machines, name the run with --run")
+        given = None if machine is None else load(machine)
+        recording = read_run(Path(what), given)
+        loaded = given or machine_of(what, recording.machine)
+    elif machine is not None:
+        raise InputError(f"--machine is for runs, and '{what}' is none, leave it out")
+    else:
+        loaded = load(what, lock, change)
+        if run is not None:
+            recording = read_run(run, loaded)
+    playback = None if recording is None else Playback(loaded, recording)
+    serve(Session(loaded), playback, host, port)

@@ -1,0 +1,67 @@
+"""Commands that draw machines: sketch."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from crane.cli.shared import (
+    Change,
+    Force,
+    Lock,
+    MachineName,
+    OutFile,
+    app,
+    by_joint,
+    load,
+)
+from crane.errors import InputError, known
+
+if TYPE_CHECKING:
+    from crane.machine import Machine
+    from crane.samples import Array
+
+
+@app.command()
+def sketch(
+    machine: MachineName,
+    at: Annotated[
+        str | None,
+        typer.Option(
+            metavar="JOINT=VALUE,...",
+            help="Active coordinates [m], [rad]; home for those that are not named.",
+        ),
+    ] = None,
+    plane: Annotated[
+        str | None,
+        typer.Option(help="xy, xz or yz of the world; the machine's own plane if not given."),
+    ] = None,
+    com: Annotated[bool, typer.Option("--com", help="Mark centres of mass.")] = False,
+    out: OutFile = None,
+    change: Change = None,
+    lock: Lock = None,
+    force: Force = False,
+) -> None:
+    """Draw the mechanism of a machine (png, svg or pdf)."""
+    from crane.output import file_name
+    from crane.runs import check_free
+    from crane.view.sketch import sketch as draw
+
+    loaded = load(machine, lock, change)
+    figure = out or Path(file_name(loaded.name) + "_sketch.png")
+    check_free(figure, force)
+    draw(loaded, figure, posture(loaded, at), plane, com)
+    print(f"written to {figure}")
+
+
+def posture(machine: "Machine", at: str | None) -> "Array":
+    """(n,) home with the active coordinates of --at in place of its own."""
+    q_a = machine.home[machine.closure.active].copy()
+    named = by_joint(
+        "--at", at.split(",") if at else None, "JOINT=VALUE,..., as in q1=0.1,X1=0.02"
+    )
+    for joint, value in named.items():
+        if joint not in machine.active:
+            raise InputError(f"--at: '{joint}' is no active joint, {known(machine.active, joint)}")
+        q_a[machine.active.index(joint)] = value
+    return q_a

@@ -1,0 +1,301 @@
+"""Live views: loops closed at every move, an edge instead of a jump, nothing left at the end."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import warnings
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from conftest import DATA
+from hypothesis import given
+from hypothesis import strategies as st
+
+import crane
+from crane.errors import CraneWarning, InputError, RecordingError
+from crane.live.playback import Playback
+from crane.live.session import Session, round_up
+from crane.live.words import numbers, warning
+from crane.recording import Recording
+
+MAIN = "from crane.cli import main; main()"
+
+
+@pytest.fixture(scope="module")
+def patu():
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        return crane.load("patu655")
+
+
+@pytest.fixture(scope="module")
+def five_bar():
+    return crane.load(DATA / "five_bar.urdf")
+
+
+@pytest.fixture
+def recording(mini):
+    time = np.linspace(2.0, 3.0, 11)
+    q = np.column_stack([0.1 * time, 0.02 - 0.003 * time, 0.01 + 0.002 * time])
+    units = {joint: mini.unit(joint) for joint in mini.active}
+    return Recording(time, mini.active, q, np.zeros_like(q), 10 * q, units)
+
+
+@pytest.mark.parametrize("name", ["mini", "patu", "five_bar", "slider_crank"])
+def test_a_thousand_moves_keep_the_loops_closed(request, name):
+    machine = request.getfixturevalue(name)
+    session, rng = Session(machine), np.random.default_rng(0)
+    refused = 0
+    for index in rng.integers(len(machine.active), size=1000):
+        before = session.posture
+        value = rng.uniform(session.lower[index], session.upper[index])
+        posture = session.move(machine.active[index], value)
+        assert posture.residual < 1e-9
+        assert float(machine.closure.residual(posture.q)) < 1e-9
+        others = np.arange(len(machine.active)) != index
+        np.testing.assert_array_equal(posture.q_a[others], before.q_a[others])
+        if not posture.refused:
+            assert posture.q_a[index] == value
+        refused += bool(posture.refused)
+    assert (refused > 0) == (name == "five_bar")
+
+
+def test_the_numbers_are_those_of_the_machine(mini):
+    session = Session(mini)
+    session.move("q1", 0.7)
+    posture = session.move("X1", 0.011)
+    dynamics, kinematics = crane.Dynamics(mini), crane.Kinematics(mini)
+    np.testing.assert_allclose(posture.q, mini.closure.solve(posture.q_a), atol=1e-12)
+    np.testing.assert_allclose(posture.gravity, dynamics.gravity(posture.q_a), atol=1e-9)
+    np.testing.assert_allclose(posture.tip, kinematics.position(posture.q_a), atol=1e-12)
+    gamma = mini.closure.gamma(posture.q)
+    one, other = posture.gain_of
+    assert abs(posture.gain) == np.abs(gamma[mini.closure.passive]).max()
+    assert posture.gain == gamma[mini.column(one), mini.active.index(other)]
+
+
+@given(shares=st.lists(st.floats(0, 1), min_size=3, max_size=3), mass=st.floats(0, 1))
+def test_payload_adds_the_weight_that_virtual_work_says(mini, shares, mass):
+    session = Session(mini)
+    for joint, share, low, high in zip(
+        mini.active, shares, session.lower, session.upper, strict=True
+    ):
+        session.move(joint, low + share * (high - low))
+    bare = session.posture.gravity
+    loaded = session.load(mass)
+    lever = crane.Kinematics(mini).jacobian(loaded.q_a)[2]
+    np.testing.assert_allclose(loaded.gravity - bare, 9.81 * mass * lever, atol=1e-9)
+    np.testing.assert_allclose(session.load(0.0).gravity, bare, atol=1e-12)
+
+
+def test_at_the_edge_the_machine_stops_and_names_the_loop(five_bar):
+    """The two arms of a five-bar are in line there; see the closed form of its reach."""
+    session = Session(five_bar)
+    posture = session.move("a", 2.0)
+    assert posture.refused == (
+        "a stops at 50.06 deg: beyond it loop 'meeting' leaves its assembly branch or cannot be "
+        "closed"
+    )
+    with pytest.raises(crane.CraneError):
+        five_bar.closure.solve([posture.q_a[0] + 1e-3, 0.0])
+    assert posture.residual < 1e-9 and posture.condition > 100
+    assert session.move("a", 2.0).q_a[0] == pytest.approx(posture.q_a[0], abs=1e-4)
+    assert session.move("a", 0.0).refused == ""
+
+
+@pytest.mark.parametrize("name", ["five_bar", "stewart"])
+def test_there_is_a_way_back_from_every_edge(request, name):
+    machine = request.getfixturevalue(name)
+    session, rng = Session(machine), np.random.default_rng(3)
+    edges = 0
+    while edges < 20:
+        index = rng.integers(len(machine.active))
+        joint, before = machine.active[index], session.posture
+        value = rng.choice([session.lower[index], session.upper[index]])
+        if not session.move(joint, value).refused:
+            continue
+        edges += 1
+        back = session.move(joint, before.q_a[index])
+        assert back.refused == ""
+        np.testing.assert_allclose(back.q, before.q, atol=1e-6)
+
+
+def test_a_long_move_never_jumps_to_where_the_loops_close_again(five_bar):
+    session = Session(five_bar)
+    for value in np.linspace(1.0, np.pi, 20):
+        posture = session.move("a", value)
+        assert posture.refused and posture.q_a[0] < 0.9
+        session.home()
+
+
+def test_wrong_moves(mini, five_bar):
+    session = Session(mini)
+    with pytest.raises(InputError, match="'q3' is no active joint, known: X1, X2, q1"):
+        session.move("q3", 0.0)
+    with pytest.raises(InputError, match="X1 = 0.04 m is outside of 0 to 0.03"):
+        session.move("X1", 0.04)
+    with pytest.raises(InputError, match="the value of X1 is nan m"):
+        session.move("X1", float("nan"))
+    with pytest.raises(InputError, match="must not be negative"):
+        session.load(-1.0)
+    with pytest.raises(InputError, match="'five_bar' has no tip"):
+        Session(five_bar).load(1.0)
+    np.testing.assert_array_equal(session.posture.q, mini.home)
+
+
+def test_slider_ends(mini, five_bar):
+    session = Session(mini)
+    np.testing.assert_array_equal(session.lower, mini.lower)
+    np.testing.assert_array_equal(session.upper, mini.upper)
+    assert session.heaviest == 1.0  # half of 1.287 kg, rounded up
+    np.testing.assert_allclose(Session(five_bar).upper, np.pi)
+    assert [round_up(x) for x in (0.9, 1.0, 1.1, 23, 0.051)] == [1, 1, 2, 50, 0.1]
+
+
+def test_poses_are_those_of_forward_kinematics(mini):
+    session = Session(mini)
+    posture = session.move("X2", 0.021)
+    data = mini.model.createData()
+    pin.framesForwardKinematics(mini.model, data, posture.q)
+    for link, pose in zip(["link3", "base"], session.poses(["link3", "base"]), strict=True):
+        np.testing.assert_array_equal(pose, data.oMf[mini.frame(link)].homogeneous)
+
+
+def test_playback_runs_straight_between_samples(mini, recording):
+    playback = Playback(mini, recording)
+    assert (playback.start, playback.end) == (2.0, 3.0)
+    for t in (2.0, 2.04, 2.5, 3.0):
+        q_a, tau = playback.at(t)
+        expected = [0.1 * t, 0.02 - 0.003 * t, 0.01 + 0.002 * t]
+        np.testing.assert_allclose(q_a, expected, atol=1e-12)
+        np.testing.assert_allclose(tau, 10 * np.array(expected), atol=1e-12)
+    np.testing.assert_array_equal(playback.at(9.0)[0], recording.q[-1])
+    session = Session(mini)
+    posture = session.place(playback.at(2.55)[0])
+    assert posture.refused == "" and posture.residual < 1e-9
+
+
+def test_playback_of_another_machine(patu, recording):
+    with pytest.raises(RecordingError, match="no joint 'slew', which drives patu655"):
+        Playback(patu, recording)
+
+
+def test_words_have_every_number(mini):
+    session = Session(mini)
+    text = numbers(mini, session.load(0.2), 0.2, np.array([1.5, 2.5, 3.5]))
+    for word in (*mini.joints, "recorded", "3.5 N", "payload", "rad/m"):
+        assert word in text
+    assert "payload" not in numbers(mini, session.load(0.0), 0.0)
+    assert warning("") == "" and "&lt;b&gt;" in warning("<b>")
+
+
+def begin(*arguments, code=MAIN):
+    """A live view in a process group of its own, and the line with its address."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, "live", *map(str, arguments)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    return process, process.stdout.readline()
+
+
+def group_is_empty(group):
+    """Whether no process of a group is left."""
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("connected", [False, True])
+def test_both_signals_end_it_and_leave_nothing(number, connected):
+    viser_client = pytest.importorskip("viser") and pytest.importorskip("websockets.sync.client")
+    process, line = begin(DATA / "slider_crank.yaml", "--port", "0")
+    address = re.fullmatch(r"live view at http://(127\.0\.0\.1:\d+) \(Ctrl\+C ends it\)\n", line)
+    assert address, line + process.stderr.read()
+    client = viser_client.connect(f"ws://{address[1]}", subprotocols=[protocol()], max_size=None)
+    if not connected:
+        client.close()
+    process.send_signal(number)
+    out, err = process.communicate(timeout=20)
+    assert (process.returncode, out, err) == (0, "", "")
+    assert group_is_empty(process.pid)
+
+
+@pytest.mark.slow
+def test_a_slider_moves_the_picture_in_time(patu):
+    """From the note of a slider to everything sent: 50 ms, measured in the process's own time."""
+    pytest.importorskip("viser")
+    from queue import SimpleQueue
+
+    from crane.live.page import Page
+    from crane.live.serve import start, stop
+
+    session = Session(patu)
+    server = start("127.0.0.1", 0)
+    try:
+        page, rng, spent = Page(server, session, None, SimpleQueue()), np.random.default_rng(0), []
+        for i in range(300):
+            joint = patu.active[i % len(patu.active)]
+            unit = 180 / np.pi if patu.unit(joint) == "rad" else 1000.0
+            low, high = unit * patu.lower[i % 4], unit * patu.upper[i % 4]
+            begun = time.thread_time()
+            page.work([(f"joint {joint}", rng.uniform(low, high))])
+            spent.append(time.thread_time() - begun)
+            assert session.posture.residual < 1e-9
+    finally:
+        stop(server)
+    assert np.quantile(spent, 0.99) < 0.05
+
+
+def protocol():
+    import viser
+
+    return f"viser-v{viser.__version__}"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["tx4"], "did you mean 'tx40'?"),
+        (["tx40", "--host", "no.such.host.invalid"], "host 'no.such.host.invalid' is not known"),
+        (["tx40", "--machine", "tx40"], "--machine is for runs, and 'tx40' is none"),
+        (["tx40", "--run", "nowhere.csv"], "nowhere.csv: no such file"),
+        (["nowhere.csv"], "nowhere.csv: no such file"),
+    ],
+)
+def test_errors_are_one_line(arguments, text, tmp_path):
+    pytest.importorskip("viser")
+    process, line = begin(*arguments)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, line) == (2, "")
+    assert err.startswith("error: ") and err.count("\n") == 1 and text in err
+
+
+def test_a_port_that_is_taken_is_told():
+    pytest.importorskip("viser")
+    import socket
+
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        process, line = begin("tx40", "--port", port)
+        _, err = process.communicate(timeout=60)
+    assert (process.returncode, line) == (2, "")
+    assert f"127.0.0.1: port {port} can" in err and err.endswith("choose another --port\n")
+
+
+def test_without_viser_it_says_how_to_get_it():
+    process, line = begin("tx40", code=f"import sys; sys.modules['viser'] = None; {MAIN}")
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, line) == (2, "")
+    assert err == (
+        "error: a live view needs viser, install it: pip install 'crane-dynamics[live]'\n"
+    )
