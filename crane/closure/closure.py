@@ -9,6 +9,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from crane.closure.branch import Branch
+from crane.closure.choice import Choice, condition, proposals, scales
 from crane.closure.compiled import Cursor, FastClosure
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import Structure, analyse
@@ -274,6 +275,25 @@ class Closure:
         """
         q = as_samples(q, self.model.nq, "q", self._names)
         return per_sample(lambda one: np.abs(self.equations.evaluate(one)[0]).max(initial=0.0), q)
+
+    def condition(self, q: ArrayLike) -> Array:
+        """How well the active joints drive the machine: ||D^-1 gamma D_A||_2, D = diag(scales).
+
+        1 where no other joint moves, infinite where the branch ends; see `crane.closure.choice`.
+
+        Args:
+            q: (nq,) or (N, nq) closed postures.
+
+        Returns:
+            () or (N,).
+        """
+        return condition(self.gamma(q), scales(self.model), self.active)
+
+    @cached_property
+    def proposals(self) -> list[Choice]:
+        """Choices of active joints for this machine at home, see `crane.closure.choice`."""
+        followers = np.flatnonzero((self.equations.factors != 0).any(axis=0)).tolist()
+        return proposals(self.model, self.equations.evaluate(self.home)[1], followers)
 
     def motion(self, q: Array, v_a: Array) -> tuple[Array, Array, Array]:
         """gamma, v = gamma v_A and drift of one sample, at less cost than one by one.

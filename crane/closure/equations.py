@@ -203,7 +203,7 @@ class LoopEquations:
         arm_rate = _cross(w2, arm) + np.where(moved, v2, 0.0)
         a_rate = _cross(w1, a)
         wrench_rate = np.zeros((len(a), 6))
-        wrench_rate[self._moves, :3] = a_rate[self.is_translation]
+        wrench_rate[self._moves, :3] = a_rate[self._moves]
         wrench_rate[:, 3:] = _cross(arm_rate, a) + _cross(arm, a_rate)
         split = self._row_sign * v  # (m, nv): v of frame 2 minus v of frame 1
         relative, bias = split @ self.data.J.T, split @ rate.T

@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from crane.closure.blocks import Block, block_triangular
+from crane.closure.choice import proposals, words
 from crane.closure.equations import LoopEquations
+from crane.closure.mobility import locked_up, surplus_open
 from crane.errors import MechanismError
 from crane.samples import Array
 
@@ -75,30 +77,34 @@ def analyse(
     """Close the machine at home and find out what its equations determine.
 
     Independent equations are chosen at the home posture by a QR factorisation with column
-    pivoting of J_P^T; ranks are confirmed at other closed postures nearby.
+    pivoting of J_P^T; ranks are confirmed at other closed postures nearby, and that surplus
+    equations hold there.
 
     Args:
         equations: All loop equations.
-        active: Columns of the active joints.
+        active: Columns of the active joints, none to be told which might be.
         passive: Columns of the others.
         guess: (nq,) active coordinates of the home posture and a guess of the others.
 
     Raises:
-        MechanismError: Not closable from the guess, wrong number of active joints, or active
-            joints that cannot drive the others.
+        MechanismError: Not closable from the guess or only there, wrong number of active joints,
+            or active joints that cannot drive the others.
     """
     model = equations.model
     names = list(model.names)[1:]
     everything = np.arange(model.nv)
+    followers = [int(i) for i in range(model.nv) if (equations.factors[:, i] != 0).any()]
     if not equations.names:
+        if not len(active):
+            raise MechanismError(_unnamed(model.nv) + f"try [{', '.join(names)}]", "active")
         if len(passive):
             raise MechanismError(_miscounted(names, active, passive, model.nv), "active")
         none = np.zeros(0, dtype=np.intp)
         return Structure(guess.copy(), none, none, ())
     somewhere = _close(equations, guess, everything)
-    given = _at(names, active, guess)
+    given = f" ({_at(names, active, guess)})" if len(active) else ""
     _check_closed(
-        equations, somewhere, f"from the home guess ({given})", "correct the frames or the guess"
+        equations, somewhere, f"from the home guess{given}", "correct the frames or the guess"
     )
     random = np.random.default_rng(0)
     postures = [somewhere]
@@ -117,22 +123,45 @@ def analyse(
             )
     rank = max(_rank(jacobian) for jacobian in jacobians)
     freedom = model.nv - rank
+    lock = locked_up(
+        equations, somewhere, freedom, _SINGULAR, lambda q: _close(equations, q, everything)
+    )
+    if lock is not None:
+        raise _overconstrained(equations, *lock)
+
+    def proposed(text: str, **choice: Sequence[int]) -> str:
+        found = proposals(model, jacobians[0], followers, **choice)
+        return f"{text}{words(found)}" if found else ""
+
+    if freedom != len(active) and _rank(jacobians[0], _SINGULAR) < rank:
+        raise MechanismError(
+            f"the home posture{given} is singular, where the linkage may go on in several ways: "
+            "choose another under 'home'",
+            "home",
+        )
+    if not len(active) and freedom:
+        raise MechanismError(_unnamed(freedom) + proposed("try "), "active")
     if freedom != len(active):
         stuck = _undetermined(jacobians, passive)
-        raise MechanismError(_miscounted(names, active, stuck, freedom), "active")
+        text = _miscounted(names, active, stuck, freedom)
+        if 0 < freedom < len(active):
+            text += proposed(", such as ", among=[int(i) for i in active])
+        elif freedom - len(active) < len(stuck):
+            text += proposed(", such as ", kept=[int(i) for i in active])
+        raise MechanismError(text, "active")
     drivable = max(_rank(jacobian[:, passive]) for jacobian in jacobians)
     if drivable < rank:
         stuck = _undetermined(jacobians, passive)
         raise MechanismError(
             f"the active joints {_list(names, active)} cannot drive {_list(names, stuck)}: "
-            "choose others",
+            f"choose others{proposed(', such as ')}",
             "active",
         )
     home = _close(equations, guess, passive)
     endless = passive[np.isinf(model.upperPositionLimit[passive])]  # pins may have wound up
     home[endless] = np.remainder(home[endless] + np.pi, 2 * np.pi) - np.pi
     _check_closed(
-        equations, home, f"at home ({given})", "choose other values or guess more passive joints"
+        equations, home, f"at home{given}", "choose other values or guess more passive joints"
     )
     turned = equations.turned_over(home)
     if turned is not None:
@@ -145,12 +174,19 @@ def analyse(
     _, upper, pivots = qr(jacobian.T, mode="economic", pivoting=True)
     diagonal = np.abs(np.diag(upper))
     if (diagonal > _SINGULAR * diagonal[0]).sum() < rank:
+        at_home = equations.evaluate(home)[1]
+        other = ""
+        if _rank(at_home, _SINGULAR) == rank:  # a dead centre of these drives only
+            other = proposed(", or drive it by ")
         raise MechanismError(
             f"the home posture ({_at(names, active, home)}) is at the edge of the assembly "
-            "branch: choose another under 'home'",
+            f"branch: choose another under 'home'{other}",
             "home",
         )
     rows, redundant = (np.sort(part).astype(np.intp) for part in np.split(pivots, [rank]))
+    lock = surplus_open(equations, home, rows, redundant, active)
+    if lock is not None:
+        raise _overconstrained(equations, *lock)
     incidence = np.zeros((rank, rank), dtype=bool)
     for _ in range(3):  # open postures: an entry that is zero only on closed ones must count
         q = home + random.uniform(-0.3, 0.3, model.nv)
@@ -161,11 +197,22 @@ def analyse(
     return Structure(home, rows, redundant, tuple(blocks))
 
 
-def _rank(jacobian: Array) -> int:
+def _rank(jacobian: Array, tolerance: float = _RANK) -> int:
     if not jacobian.size:
         return 0
     values = np.linalg.svd(jacobian, compute_uv=False)
-    return int((values > _RANK * values[0]).sum())
+    return int((values > tolerance * values[0]).sum())
+
+
+def _overconstrained(equations: LoopEquations, row: int, gap: float) -> MechanismError:
+    name = equations.names[equations.loop_of_row[row]]
+    unit = "m" if equations.is_translation[row] else "rad"
+    return MechanismError(
+        f"loop '{name}' closes at home only: a small step beside it leaves it {gap:.2g} {unit} "
+        "open, though to first order the joints could move; the machine is overconstrained and "
+        "locks up, correct frames and axes or use a looser loop type",
+        f"loop {name}",
+    )
 
 
 def _undetermined(jacobians: Sequence[Array], passive: Indices) -> Indices:
@@ -199,10 +246,18 @@ def _at(names: Sequence[str], active: Indices, q: Array) -> str:
     return ", ".join(f"{names[int(i)]} = {q[int(i)]:.6g}" for i in active)
 
 
+def _unnamed(freedom: int) -> str:
+    return (
+        f"{freedom} degree{'s' * (freedom != 1)} of freedom and no active joints, name "
+        f"{'one' if freedom == 1 else freedom}: "
+    )
+
+
 def _miscounted(names: Sequence[str], active: Indices, stuck: Indices, freedom: int) -> str:
     if freedom == 0:
+        listed = _list(names, active) or "all joints"
         return (
-            f"the loops leave {_list(names, active)} no freedom to move: check the types and axes "
+            f"the loops leave {listed} no freedom to move: check the types and axes "
             "of the loops, and the axes of the joints"
         )
     text = (

@@ -1,0 +1,34 @@
+"""The command on where a machine reaches: workspace."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from crane.cli.shared import Change, Force, Lock, MachineName, Out, app, load, status
+
+
+@app.command()
+def workspace(
+    machine: MachineName,
+    out: Out = Path("workspace"),
+    samples: Annotated[int, typer.Option(help="About how many postures.")] = 10_000,
+    frame: Annotated[
+        str | None, typer.Option(metavar="LINK", help="What moves; the tip if not given.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of what is drawn for many strokes.")] = 0,
+    change: Change = None,
+    lock: Lock = None,
+    force: Force = False,
+) -> None:
+    """Map what the tip reaches, which strokes close, and where they are singular."""
+    from crane.runs import check_folder, write_workspace
+    from crane.workspaces import workspace as explore
+
+    check_folder(out, force)
+    loaded = load(machine, lock, change)
+    with status("exploring"):
+        space = explore(loaded, samples, frame, seed)
+    with status("drawing"):
+        text = write_workspace(out, space)
+    print(f"{text}\nwritten to {out}")

@@ -1,0 +1,121 @@
+"""Motions of first order that no finite motion follows: overconstrained machines that lock up.
+
+Planar linkages in space, Sarrus' and Bennett's linkages have more equations than they need, and
+the surplus ones hold all along their motion. Where surplus equations hold at home only, the null
+space of J promises motions that are none: a small step h along them, closed with independent rows,
+leaves the surplus rows open by c h^2.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.linalg import qr
+
+from crane.closure.choice import Indices, motions, scales
+from crane.closure.equations import LoopEquations
+from crane.samples import Array, solve
+
+_STEP = 0.02  # of a joint's scale
+_MOVED = 0.05  # share of a step that a finite motion keeps at least
+_OPEN = 1e-9  # residual that counts as open
+_DIRECTIONS = 3  # drawn, beside those of single joints
+
+
+def locked_up(
+    equations: LoopEquations,
+    q: Array,
+    freedom: int,
+    tolerance: float,
+    close: Callable[[Array], Array],
+) -> tuple[int, float] | None:
+    """Where a machine has less freedom than its equations promise at a closed posture.
+
+    Steps in drawn directions of the null space N are closed with all equations, the shortest way.
+    Joints that N lets move and that stay in all the ways that remain are locked. A linkage in line
+    that may go on in several ways (a bifurcation) has more columns of N than freedom, too, but all
+    its joints move.
+
+    Args:
+        equations: All loop equations.
+        q: (nq,) closed posture.
+        freedom: What the equations leave at other closed postures.
+        tolerance: Relative singular values of J below it count as zero.
+        close: Closes all loops from a near posture.
+
+    Returns:
+        The row that stays open by most, and by how much [m], [rad]; None where all is well.
+    """
+    scale = scales(equations.model)
+    jacobian = equations.evaluate(q)[1]
+    basis = motions(jacobian, scale, tolerance)
+    if basis.shape[1] <= freedom:
+        return None
+    random = np.random.default_rng(1)
+    moved = np.zeros(len(q))  # shares of the step
+    for _ in range(2 * basis.shape[1]):
+        way = basis @ random.normal(size=basis.shape[1])
+        near = close(q + _STEP * scale * way / np.linalg.norm(way))
+        if np.abs(equations.evaluate(near)[0]).max() < _OPEN:
+            moved = np.maximum(moved, np.abs(near - q) / scale / _STEP)
+    promised = np.linalg.norm(basis, axis=1)
+    if not ((promised > 1e-3) & (moved < _MOVED * promised)).any():
+        return None
+    rank = equations.model.nv - basis.shape[1]
+    rows = qr((jacobian * scale).T, mode="r", pivoting=True)[1][:rank].astype(np.intp)
+    worst, size = 0, 0.0
+    for way in basis.T:
+        beside = _closed(equations, q + _STEP * scale * way, rows, basis / scale[:, None])
+        if beside is None:
+            continue
+        phi = np.abs(equations.evaluate(beside)[0])
+        if phi.max() > size:
+            worst, size = int(phi.argmax()), float(phi.max())
+    return worst, size
+
+
+def surplus_open(
+    equations: LoopEquations, home: Array, rows: Indices, surplus: Indices, active: Indices
+) -> tuple[int, float] | None:
+    """A surplus equation that does not hold beside home, and by how much it is open [m], [rad].
+
+    Active joints step one by one, and all together in drawn directions; the others follow by the
+    independent rows.
+    """
+    if not len(surplus) or not len(active):
+        return None
+    scale = scales(equations.model)
+    held = np.zeros((equations.model.nv, len(active)))
+    held[active, np.arange(len(active))] = 1.0
+    ways = [*np.eye(len(active))]
+    if len(active) > 1:
+        ways += [*np.random.default_rng(2).uniform(-1, 1, (_DIRECTIONS, len(active)))]
+    for way in ways:
+        for size in (_STEP, _STEP / 16):
+            q = home.copy()
+            q[active] += size * scale[active] * way
+            moved = _closed(equations, q, rows, held)
+            if moved is None:
+                continue  # near the end of the branch
+            phi = np.abs(equations.evaluate(moved)[0][surplus])
+            if phi.max() > _OPEN:
+                return int(surplus[phi.argmax()]), float(phi.max())
+            break
+    return None
+
+
+def _closed(equations: LoopEquations, q: Array, rows: Indices, held: Array) -> Array | None:
+    """The posture near q (nq,) where independent rows are closed and held^T q is what it was."""
+    q = q.copy()
+    none = np.zeros(held.shape[1])
+    for _ in range(12):
+        phi, jacobian = equations.evaluate(q)
+        if np.abs(phi[rows]).max(initial=0.0) < 1e-13:
+            return q
+        try:
+            change = solve(np.vstack([jacobian[rows], held.T]), np.concatenate([-phi[rows], none]))
+        except np.linalg.LinAlgError:
+            return None
+        if not np.abs(change).max() < 1.0:
+            return None
+        q += change
+    return q if np.abs(phi[rows]).max(initial=0.0) < 1e-11 else None
