@@ -82,12 +82,12 @@ def assert_refused(broken: Broken, folder: Path) -> None:
     with pytest.raises(CraneError) as caught:
         crane.load(path)
     message = str(caught.value)
-    assert message == _with_line(broken.message, folder)
+    assert message == with_line(broken.message, folder)
     assert message.isprintable()
     assert type(caught.value) is not CraneError
 
 
-def _with_line(message: str, folder: Path) -> str:
+def with_line(message: str, folder: Path) -> str:
     if (found := re.match(r"(.+?):\{line of (.+?)\}: ", message)) is None:
         return message
     (file,) = folder.rglob(found[1])

@@ -34,7 +34,8 @@ MECHANISM = [
     case(
         "too many active joints",
         "four_bar.yaml:12: 2 active joints (crank, coupler) for 1 degree of "
-        "freedom: name only 1 of them",
+        "freedom: name only 1 of them, such as [crank] (condition 1.6), or [coupler] "
+        "(condition 1.47)",
         swap("active: [crank]", "active: [crank, coupler]"),
         swap("control:\n  crank: {kp: 50, ki: 20}\n", ""),
         swap(
@@ -58,7 +59,8 @@ MECHANISM = [
     ),
     case(
         "active joints that cannot drive",
-        "four_bar.yaml:12: the active joints crank, coupler cannot drive spin: choose others",
+        "four_bar.yaml:12: the active joints crank, coupler cannot drive spin: choose others, "
+        "such as [coupler, spin] (condition 1.47), or [crank, spin] (condition 1.6)",
         swap("</robot>", WHEEL, ROCKER),
         swap("active: [crank]", "active: [crank, coupler]"),
         swap("control:\n  crank: {kp: 50, ki: 20}\n", ""),
@@ -197,7 +199,8 @@ MINI_FORWARDER = [
     case(
         "chain on a wrong pin",
         "mini_forwarder.yaml:{line of active:}: the active joints q1, X1, X2 cannot"
-        " drive q4, q9, q2: choose others",
+        " drive q4, q9, q2: choose others, such as [q1, q4, q3] (condition 1.76), or [q1, q9, q3] "
+        "(condition 1.76)",
         swap("chain_b1.urdf, parent: link1_B", "chain_b1.urdf, parent: link1_C", MINI),
         machine=MINI,
     ),
@@ -215,7 +218,7 @@ MINI_FORWARDER = [
     case(
         "loop about a wrong axis",
         "mini_forwarder.yaml:{line of active:}: 3 active joints (q1, X1, X2) for 2 "
-        "degrees of freedom: name only 2 of them",
+        "degrees of freedom: name only 2 of them, such as [q1, X2] (condition 2.75)",
         swap("successor: A1_eye, axis: [0, 0, 1]", "successor: A1_eye, axis: [0, 1, 0]", MINI),
         machine=MINI,
     ),
@@ -254,7 +257,8 @@ MINI_FORWARDER = [
     case(
         "joint that follows is active",
         "mini_forwarder.yaml:{line of active:}: the active joints q1, X1, q9 cannot"
-        " drive q10, X2, q6, q7, q2, q11, q3: choose others",
+        " drive q10, X2, q6, q7, q2, q11, q3: choose others, such as [q1, X1, X2] "
+        "(condition 2.71), or [q1, X1, q3] (condition 1.62)",
         swap("active: [q1, X1, X2]", "active: [q1, X1, q9]", MINI),
         swap("  X2: {kp: 18000, ki: 20000}\n", "  q9: {kp: 18000, ki: 20000}\n", MINI),
         machine=MINI,
@@ -333,7 +337,7 @@ MINI_FORWARDER = [
     case(
         "joint axis out of the plane",
         "mini_forwarder.yaml:{line of active:}: 3 active joints (q1, X1, X2) for 2 "
-        "degrees of freedom: name only 2 of them",
+        "degrees of freedom: name only 2 of them, such as [q1, X2] (condition 2.23)",
         swap(
             '    <child link="link2"/>\n    <axis xyz="0 0 1"/>',
             '    <child link="link2"/>\n    <axis xyz="0 1 0"/>',

@@ -1,23 +1,15 @@
 """From a description to a machine."""
 
-import copy
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-import numpy as np
-import pinocchio as pin
-from lxml import etree
-
-from crane.closure import Closure
-from crane.description import MachineSpec, changed, inertia_problem, locked, read
+from crane.description import changed, locked, read
 from crane.description.sources import find
-from crane.errors import DescriptionError, InputError, MechanismError
+from crane.errors import DescriptionError, InputError
+from crane.machine.assemble import assemble, closed, home_guess
 from crane.machine.machine import Machine, fixed
-from crane.samples import Array
-
-_NO_LIMIT = 1e9  # stands for infinity in the text handed to Pinocchio
 
 
 def load(
@@ -47,16 +39,8 @@ def load(
         spec = changed(spec, changes)
     if lock:
         spec = locked(spec, lock)
-    model = _assemble(spec)
-    followers = {next(iter(coupling.factors)) for coupling in spec.couplings}
-    active = spec.active or tuple(name for name in model.names[1:] if name not in followers)
-    try:
-        closure = Closure(
-            model, spec.loops, active, _home_guess(spec, model, active), spec.couplings
-        )
-    except MechanismError as error:
-        where = spec.where.get(error.about, spec.path.name)
-        raise MechanismError(f"{where}: {error}", error.about) from None
+    model = assemble(spec)
+    closure = closed(spec, model, home_guess(spec, model))
     lower, upper = model.lowerPositionLimit, model.upperPositionLimit
     return Machine(
         name=spec.name,
@@ -65,7 +49,7 @@ def load(
         chains=spec.chains,
         model=model,
         closure=closure,
-        active=active,
+        active=closure.active_names,
         lower=fixed(lower[closure.active]),
         upper=fixed(upper[closure.active]),
         friction=MappingProxyType(dict(spec.friction)),
@@ -105,62 +89,3 @@ def recalled(call: str) -> Machine:
             f"'{call}' names no machine, write NAME --set PARAMETER=VALUE --lock JOINT=VALUE"
         ) from None
     return load(name, numbers["--set"], numbers["--lock"])
-
-
-def _home_guess(spec: MachineSpec, model: pin.Model, active: tuple[str, ...]) -> Array:
-    """(nq,) coordinates under `home`, of other joints zero or the limit nearest to it."""
-    lower, upper = model.lowerPositionLimit, model.upperPositionLimit
-    guess = np.clip(np.zeros(model.nq), lower, upper)
-    for joint, value in spec.home.items():
-        column = model.joints[model.getJointId(joint)].idx_q
-        if joint in active and not lower[column] <= value <= upper[column]:
-            raise DescriptionError(
-                f"{spec.where[f'home {joint}']}: home of '{joint}' is {value:g}, outside of its "
-                f"limits {lower[column]:g} to {upper[column]:g}, choose one within them"
-            )
-        guess[column] = value
-    return guess
-
-
-def _assemble(spec: MachineSpec) -> pin.Model:
-    """Pinocchio's model of the merged chains.
-
-    One text for all chains, because Pinocchio then adds the joints depth-first: joints appended
-    chain by chain make its crba wrong without a word.
-    """
-    robot = copy.deepcopy(spec.tree)
-    for joint in robot.iter("joint"):
-        if joint.get("type") == "continuous":
-            joint.set("type", "revolute")  # Pinocchio's continuous joint has two coordinates
-        if joint.get("type") != "fixed":
-            limit = joint.find("limit")
-            if limit is None:
-                limit = etree.SubElement(joint, "limit")
-            for key, sign in (("lower", "-"), ("upper", ""), ("effort", ""), ("velocity", "")):
-                limit.set(key, limit.get(key, f"{sign}{_NO_LIMIT}"))
-    model = pin.buildModelFromXML(etree.tostring(robot).decode())
-    for limits in (
-        model.lowerPositionLimit, model.upperPositionLimit, model.effortLimit, model.velocityLimit,
-    ):  # fmt: skip
-        endless = np.abs(limits) >= _NO_LIMIT
-        limits[endless] = np.copysign(np.inf, limits[endless])
-    model.name = spec.name
-    between = {link.get("name") for link in robot.iter("link") if link.get("between")}
-    moved = {joint.get("name"): joint.find("child").get("link") for joint in robot.iter("joint")}
-    for index in range(1, model.njoints):
-        name = model.names[index]
-        inertia = model.inertias[index]
-        link = moved[name]
-        where = spec.where[f"link {link}"]
-        if link in between:
-            continue
-        if not inertia.mass > 0:
-            raise DescriptionError(
-                f"{where}: joint '{name}' moves link '{link}', which has no mass, give it an "
-                "<inertial>"
-            )
-        if problem := inertia_problem(inertia.mass, inertia.inertia):
-            raise DescriptionError(
-                f"{where}: link '{link}' with what is fixed to it has {problem}"
-            )
-    return model

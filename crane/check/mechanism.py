@@ -1,0 +1,151 @@
+"""Whether the parts make a machine: every loop that does not close or does nothing."""
+
+import warnings
+from collections.abc import Iterator
+
+import numpy as np
+import pinocchio as pin
+from lxml import etree
+
+from crane.closure import Closure
+from crane.closure.equations import LoopEquations
+from crane.closure.structure import least_squares_step
+from crane.description import MachineSpec
+from crane.description.findings import Findings, note
+from crane.errors import CraneWarning, DescriptionError, MechanismError
+from crane.machine.assemble import assemble, closed, home_guess
+from crane.samples import Array
+
+_OPEN = 1e-6  # [m], [rad] from which on a loop is said to be open
+
+
+def check_mechanism(spec: MachineSpec, found: Findings) -> Closure | None:
+    """Assemble and close a machine, and note what is wrong with it.
+
+    Loops that lock nothing are left out once noted, so that the rest is checked, too.
+
+    Args:
+        spec: The machine as read.
+        found: What has been noted so far.
+
+    Returns:
+        The closure, None where there is none.
+    """
+    model = assemble(spec)
+    guess = home_guess(spec, model)
+    if not found.usable:
+        return None
+    loops = list(spec.loops)
+    while True:
+        try:
+            closure = closed(spec, model, guess, loops)
+        except MechanismError as error:
+            idle = [loop for loop in loops if error.about == f"loop {loop.name}"]
+            if "locks nothing" in str(error) and idle:
+                note(error)
+                loops.remove(idle[0])
+                continue
+            _note_with_gaps(spec, model, guess, error)
+            return None
+        _warn_of_limits(spec, closure)
+        return closure
+
+
+def _note_with_gaps(
+    spec: MachineSpec, model: pin.Model, guess: Array, error: MechanismError
+) -> None:
+    """Note an error; where loops stay open, how far each does."""
+    gaps = _gaps(spec, model, guess) if "cannot be closed" in str(error) else {}
+    apart = gaps.pop(error.about, "")
+    note(MechanismError(f"{error}{f' (it is {apart})' if apart else ''}", error.about))
+    for about, gap in gaps.items():
+        what = f"loop '{about.removeprefix('loop ')}' stays open, too: it is {gap}"
+        note(MechanismError(f"{spec.where.get(about, spec.path.name)}: {what}", about))
+
+
+def _gaps(spec: MachineSpec, model: pin.Model, guess: Array) -> dict[str, str]:
+    """How far apart and askew the frames of open loops are, as near as they come to closing."""
+    equations = LoopEquations(model, spec.loops, spec.couplings)
+    active = [model.joints[model.getJointId(name)].idx_v for name in spec.active or ()]
+    every = np.arange(model.nv)
+    phi = np.zeros(0)
+    for free in (every, np.setdiff1d(every, active)):
+        q = guess.copy()
+        for _ in range(200):
+            phi, jacobian = equations.evaluate(q)
+            q[free] += least_squares_step(jacobian[:, free], phi)
+        phi, _ = equations.evaluate(q)
+        if np.abs(phi).max() > _OPEN:
+            break
+    found = {}
+    for index, loop in enumerate(equations.loops):
+        rows = equations.loop_of_row == index
+        length = float(np.linalg.norm(phi[rows & equations.is_translation]))
+        # rows of rotations are cosines of angles that are right ones when closed
+        sine = min(1.0, float(np.linalg.norm(phi[rows & ~equations.is_translation])))
+        if max(length, sine) > _OPEN:
+            found[f"loop {loop.name}"] = (
+                f"{_length(length)} apart and {np.degrees(np.arcsin(sine)):.3g} deg askew"
+            )
+    return found
+
+
+def _length(metres: float) -> str:
+    return f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
+
+
+def _warn_of_limits(spec: MachineSpec, closure: Closure) -> None:
+    """Warn of passive joints that are outside of their limits at home."""
+    model = closure.model
+    for column in closure.passive:
+        name = model.names[int(column) + 1]
+        lower, upper = model.lowerPositionLimit[column], model.upperPositionLimit[column]
+        q = closure.home[column]
+        if not lower - 1e-9 <= q <= upper + 1e-9:
+            place = spec.where.get(f"joint {name}", spec.path.name)
+            warnings.warn(
+                f"{place}: passive joint '{name}' is at {q:.4g} with the loops closed at home, "
+                f"outside of its limits {lower:g} to {upper:g}, widen them or correct the home",
+                CraneWarning,
+                stacklevel=2,
+            )
+
+
+def massless(spec: MachineSpec) -> Iterator[DescriptionError]:
+    """Errors about bodies without mass in a tree that cannot be assembled."""
+    ends = {
+        joint.get("name"): (
+            joint.find("parent").get("link"), joint.find("child").get("link"), joint.get("type"),
+        )
+        for joint in spec.tree.iter("joint")
+    }  # fmt: skip
+    if not all(parent and child for parent, child, _ in ends.values()):
+        return  # what has no place may be the mass that seems to be missing
+    fixed: dict[str, list[str]] = {}
+    for parent, child, kind in ends.values():
+        if kind == "fixed":
+            fixed.setdefault(parent, []).append(child)
+    heavy = {
+        link.get("name")
+        for link in spec.tree.iter("link")
+        if link.get("refused") or link.get("between") or _mass(link) > 0
+    }
+    for name, (_, moved, kind) in ends.items():
+        if kind == "fixed" or f"link {moved}" not in spec.where:
+            continue
+        body, waiting = set(), [moved]
+        while waiting:
+            link = waiting.pop()
+            if link not in body:
+                body.add(link)
+                waiting += fixed.get(link, ())
+        if not body & heavy:
+            yield DescriptionError(
+                f"{spec.where[f'link {moved}']}: joint '{name}' moves link '{moved}', which has "
+                "no mass, give it an <inertial>"
+            )
+
+
+def _mass(link: etree._Element) -> float:
+    mass = link.find("inertial/mass")
+    return 0.0 if mass is None else float(mass.get("value"))

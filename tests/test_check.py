@@ -1,0 +1,915 @@
+"""Everything that `crane check` finds, line by line."""
+
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import test_machine_file
+import test_mechanism
+import test_urdf
+from broken import (
+    GROUND,
+    LOOPED,
+    MACHINE,
+    MINI,
+    ROCKER,
+    Edit,
+    copy_machine,
+    swap,
+    whole,
+    with_line,
+)
+
+import crane
+from crane.check import Report, check
+from crane.description import bundled, examples
+
+CHAIN_B1 = "urdf/mini_forwarder/chain_b1.urdf"
+CHAIN_B2 = "urdf/mini_forwarder/chain_b2.urdf"
+
+CRANK_INERTIA = '<inertia ixx="0.001" ixy="0" ixz="0" iyy="0.006" iyz="0" izz="0.006"/>'
+ROCKER_LINK = '  <link name="rocker_arm">\n'
+ROCKER_INERTIAL = """    <inertial>
+      <origin xyz="0.15 0 0"/>
+      <mass value="1.0"/>
+      <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/>
+    </inertial>
+"""
+DRAWN = """<visual><origin xyz="0.15 0 0" rpy="0 1.5708 0"/>
+  <geometry><cylinder radius="0.01" length="0.3"/></geometry></visual>
+"""
+MESHES = """<visual><geometry><mesh filename="package://gone/link.stl"/></geometry></visual>
+<visual><geometry><mesh filename="broken.stl"/></geometry></visual>
+<visual><geometry><mesh filename="big.obj"/></geometry></visual>
+<collision><geometry><mesh filename="package://gone/link.stl"/></geometry></collision>
+"""
+BIG = "v 0 0 0\nv 300 0 0\nv 0 20 0\nv 0 0 20\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n"
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A broken machine and the lines of its findings."""
+
+    lines: list[str]
+    edits: tuple[Edit, ...]
+    machine: str
+
+
+def seen(name: str, lines: list[str], *edits: Edit, machine: str = MACHINE):
+    return pytest.param(Checked(lines, edits, machine), id=name.replace(" ", "-"))
+
+
+def checked(machine: str, edits: tuple[Edit, ...], folder: Path) -> Report:
+    path = copy_machine(machine, folder)
+    for edit in edits:
+        edit.apply(folder)
+    return check(path)
+
+
+NUMBERS = [
+    seen(
+        "four numbers in one file",
+        [
+            "ground.urdf:14: error: upper=\"nan\" of the limit of joint 'crank' is not "
+            "finite, give a number",
+            "ground.urdf:20: error: value=\"1,5\" of the mass of link 'crank_arm' is not a "
+            "number, write a decimal point",
+            "ground.urdf:26: error: xyz=\"0.2 zero 0\" of the origin of joint 'coupler' is "
+            "not a number, write digits",
+            "ground.urdf:34: error: value=\"inf\" of the mass of link 'coupler_arm' is not "
+            "finite, give a number",
+        ],
+        swap('<mass value="1.5"/>', '<mass value="1,5"/>', GROUND),
+        swap('<mass value="2.0"/>', '<mass value="inf"/>', GROUND),
+        swap(
+            '<origin xyz="0.2 0 0"/>\n    <parent',
+            '<origin xyz="0.2 zero 0"/>\n    <parent',
+            GROUND,
+        ),
+        swap('upper="2.5"', 'upper="nan"', GROUND),
+    ),
+    seen(
+        "all six of an inertia",
+        [
+            "ground.urdf:21: error: ixx=\"a\" of the inertia of link 'crank_arm' is not a "
+            "number, write digits",
+            "ground.urdf:21: error: ixy=\"\" of the inertia of link 'crank_arm' has 0 "
+            "numbers, give 1",
+            "ground.urdf:21: error: ixz=\"1,0\" of the inertia of link 'crank_arm' is not a "
+            "number, write a decimal point",
+            "ground.urdf:21: error: iyy=\"nan\" of the inertia of link 'crank_arm' is not "
+            "finite, give a number",
+            "ground.urdf:21: error: iyz=\"1 2\" of the inertia of link 'crank_arm' has 2 "
+            "numbers, give 1",
+            "ground.urdf:21: error: the inertia of link 'crank_arm' has no izz, add izz=\"...\"",
+        ],
+        swap(CRANK_INERTIA, '<inertia ixx="a" ixy="" ixz="1,0" iyy="nan" iyz="1 2"/>', GROUND),
+    ),
+    seen(
+        "numbers of the machine file",
+        [
+            "four_bar.yaml:15: error: 'crank' of 'home' is '1,2', give a number with a "
+            "decimal point",
+            "four_bar.yaml:21: error: 'viscous' of friction of 'coupler' is nan, give a "
+            "finite number",
+            "four_bar.yaml:27: error: 'stiffness' of end stop of 'crank' is -1, give at least 0",
+            "four_bar.yaml:34: error: 'duration' of task 'swing' is 'two', give a number",
+        ],
+        swap("  crank: 1.2", "  crank: 1,2"),
+        swap("viscous: 0.01", "viscous: .nan"),
+        swap("stiffness: 1e4", "stiffness: -1"),
+        swap("duration: 2", "duration: two"),
+    ),
+    seen(
+        "two numbers in one item",
+        [
+            "four_bar.yaml:20: error: 'coulomb' of friction of 'crank' is -0.3, give at least 0",
+            "four_bar.yaml:20: error: 'viscous' of friction of 'crank' is 'much', give a number",
+            "four_bar.yaml:42: error: 'ki' of control of 'crank' is inf, give a finite number",
+            "four_bar.yaml:42: error: 'kp' of control of 'crank' is -1, give at least 0",
+        ],
+        swap("coulomb: 0.3, viscous: 0.1", "coulomb: -0.3, viscous: much"),
+        swap("kp: 50, ki: 20", "kp: -1, ki: .inf"),
+    ),
+    seen(
+        "files at once",
+        [
+            "four_bar.yaml:16: error: joint 'couple' is unknown, did you mean 'coupler'?",
+            "four_bar.yaml:20: error: unknown key 'colomb' in friction of 'crank', did you "
+            "mean 'coulomb'?",
+            "four_bar.yaml:29: error: the tip frame 'coupler_pn' is unknown, did you mean "
+            "'coupler_pin'?",
+            "four_bar.yaml:38: error: task 'reach' takes no time, give a duration",
+            "ground.urdf:20: error: link 'crank_arm' has the mass -1.5 kg, give a positive one",
+            "rocker.urdf:17: error: xyz=\"0.3 0\" of the origin of joint 'rocker_pin_fixed' "
+            "has 2 numbers, give 3",
+        ],
+        swap('<mass value="1.5"/>', '<mass value="-1.5"/>', GROUND),
+        swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.3 0"/>', ROCKER),
+        swap("tip: coupler_pin", "tip: coupler_pn"),
+        swap("coulomb: 0.3", "colomb: 0.3"),
+        swap("duration: 1\n", "duration: 0\n"),
+        swap("  coupler: -1.0", "  couple: -1.0"),
+    ),
+]
+
+GRAPH = [
+    seen(
+        "two links without a parent and a ring",
+        [
+            "ground.urdf:45: error: 2 links have no parent (ground, lost): join all but one",
+            "ground.urdf:47: error: link 'a' is its own ancestor: cut the ring of joints at"
+            " 'ba' and close it as a loop",
+        ],
+        swap(
+            "</robot>",
+            '<link name="lost"/><link name="a"/><link name="b"/>\n<joint name="ab"'
+            ' type="fixed"><parent link="a"/><child link="b"/></joint>\n'
+            '<joint name="ba" type="fixed"><parent link="b"/><child link="a"/></joint></robot>',
+            GROUND,
+        ),
+    ),
+    seen(
+        "unknown ends",
+        [
+            "ground.urdf:7: error: joint 'pin_B_fixed' has the unknown child 'pin_C', did "
+            "you mean 'pin_B'?",
+            "ground.urdf:27: error: joint 'coupler' has the unknown parent 'crank_am', did "
+            "you mean 'crank_arm'?",
+        ],
+        swap('<parent link="crank_arm"/>', '<parent link="crank_am"/>', GROUND),
+        swap('<child link="pin_B"/>', '<child link="pin_C"/>', GROUND),
+    ),
+    seen(
+        "a child that is unknown leaves no second root",
+        [
+            "rocker.urdf:19: error: joint 'rocker_pin_fixed' has the unknown child "
+            "'roker_pin', did you mean 'rocker_pin'?",
+        ],
+        swap('<child link="rocker_pin"/>', '<child link="roker_pin"/>', ROCKER),
+    ),
+    seen(
+        "two parents and a joint from a link to itself",
+        [
+            "ground.urdf:45: error: link 'coupler_arm' has two parents, joints 'coupler' "
+            "and 'c': keep one and close the other as a loop",
+            "ground.urdf:46: error: joint 'd' joins link 'pin_B' to itself, change one end",
+        ],
+        swap(
+            "</robot>",
+            '<joint name="c" type="fixed"><parent link="ground"/><child'
+            ' link="coupler_arm"/></joint>\n'
+            '<joint name="d" type="fixed"><parent link="pin_B"/><child link="pin_B"/></joint>'
+            "</robot>",
+            GROUND,
+        ),
+    ),
+    seen(
+        "names twice",
+        [
+            "ground.urdf:45: error: link 'pin_B' is there twice (first in line 3), rename one",
+            "ground.urdf:46: error: joint 'crank' is there twice (first in line 10), rename one",
+        ],
+        swap(
+            "</robot>",
+            '<link name="pin_B"/>\n<joint name="crank" type="fixed"><parent'
+            ' link="ground"/><child link="pin_B"/></joint></robot>',
+            GROUND,
+        ),
+    ),
+    seen(
+        "names missing",
+        [
+            'ground.urdf:3: error: a link has no name, add name="..."',
+            'rocker.urdf:3: error: a joint has no name, add name="..."',
+        ],
+        swap('<link name="pin_B"/>', "<link/>", GROUND),
+        swap('<joint name="rocker" type', "<joint type", ROCKER),
+    ),
+    seen(
+        "names of two chains",
+        [
+            "rocker.urdf:8: error: link 'crank_arm' is also in ground.urdf:17, rename one",
+        ],
+        swap('<link name="rocker_arm">', '<link name="crank_arm">', ROCKER),
+        swap('<child link="rocker_arm"/>', '<child link="crank_arm"/>', ROCKER),
+        swap('<parent link="rocker_arm"/>', '<parent link="crank_arm"/>', ROCKER),
+    ),
+    seen(
+        "a lost chain says nothing about what refers to it",
+        [
+            "four_bar.yaml:7: error: chain 'rocker': there is no file "
+            "'four_bar/roker.urdf', give its path from this folder",
+        ],
+        swap("four_bar/rocker.urdf", "four_bar/roker.urdf"),
+    ),
+    seen(
+        "a chain that is not XML, and a slip elsewhere",
+        [
+            "four_bar.yaml:42: error: 'kp' of control of 'crank' is 'fast', give a number",
+            "rocker.urdf:1: error: not XML, Start tag expected, '<' not found, mend it",
+        ],
+        whole("rocker", ROCKER),
+        swap("kp: 50", "kp: fast"),
+        swap("  coupler: -1.0", "  crank_: -1.0"),
+    ),
+    seen(
+        "no chain can be read",
+        [
+            "ground.urdf:1: error: not XML, Start tag expected, '<' not found, mend it",
+            "rocker.urdf: error: the file is empty, write a <robot> in it",
+        ],
+        whole(b"\xff\xfe\x00", GROUND),
+        whole("", ROCKER),
+    ),
+    seen(
+        "types of joints",
+        [
+            "ground.urdf:10: error: joint 'crank' has the type 'revolut', which is not "
+            "supported, did you mean 'revolute'?",
+            "rocker.urdf:3: error: joint 'rocker' has the type 'hinge', which is not "
+            "supported, known: continuous, fixed, floating, planar, prismatic, revolute, "
+            "spherical",
+        ],
+        swap('type="revolute"', 'type="revolut"', GROUND),
+        swap('name="rocker" type="continuous"', 'name="rocker" type="hinge"', ROCKER),
+    ),
+]
+
+SLIPS = [
+    seen(
+        "tags and attributes are read as they were meant",
+        [
+            "ground.urdf:14: error: the limits of joint 'crank' are reversed (-1.5 > -2.5),"
+            " swap them",
+            "ground.urdf:14: error: unknown uper=\"...\" in <limit>, did you mean 'upper'?",
+            "ground.urdf:15: error: damping or friction of joint 'crank' is negative, make "
+            "it positive",
+            "ground.urdf:15: error: unknown dampng=\"...\" in <dynamics>, did you mean 'damping'?",
+            "ground.urdf:26: error: unknown <orign> in <joint>, did you mean 'origin'?",
+            "ground.urdf:26: error: xyz=\"0.2 0\" of the origin of joint 'coupler' has 2 "
+            "numbers, give 3",
+        ],
+        swap('<origin xyz="0.2 0 0"/>\n    <parent', '<orign xyz="0.2 0"/>\n    <parent', GROUND),
+        swap('lower="-1.5" upper="2.5"', 'lower="-1.5" uper="-2.5"', GROUND),
+        swap('damping="0.2"', 'dampng="-0.2"', GROUND),
+    ),
+    seen(
+        "keys are read as they were meant",
+        [
+            "four_bar.yaml:14: error: unknown key 'hoem' in the machine file, did you mean "
+            "'home'?",
+            "four_bar.yaml:15: error: home of 'crank' is 2.6, outside of its limits -1.5 to"
+            " 2.5, choose one within them",
+            "four_bar.yaml:21: error: 'viscous' of friction of 'coupler' is -0.01, give at "
+            "least 0",
+            "four_bar.yaml:21: error: unknown key 'visous' in friction of 'coupler', did "
+            "you mean 'viscous'?",
+            "four_bar.yaml:42: error: 'kp' of control of 'crank' is -50, give at least 0",
+            "four_bar.yaml:42: error: unknown key 'kP' in control of 'crank', known: ki, kp",
+        ],
+        swap("home:\n  crank: 1.2", "hoem:\n  crank: 2.6"),
+        swap("kp: 50", "kP: -50"),
+        swap("viscous: 0.01", "visous: -0.01"),
+    ),
+    seen(
+        "a misspelt section of chains",
+        [
+            "four_bar.yaml:5: error: unknown key 'chain' in the machine file, did you mean "
+            "'chains'?",
+            "four_bar.yaml:10: error: loop 'pin' has the unknown successor 'roker_pin', did"
+            " you mean 'rocker_pin'?",
+            "four_bar.yaml:10: error: unknown key 'sucessor' in loop 'pin', did you mean "
+            "'successor'?",
+        ],
+        swap("chains:", "chain:"),
+        swap("successor: rocker_pin", "sucessor: roker_pin"),
+    ),
+    seen(
+        "keys twice and no names",
+        [
+            "four_bar.yaml:16: error: key 3 is not a name, write names in quotes, and "
+            "decimals with a point",
+            "four_bar.yaml:30: error: key 'tip' is there twice (first in line 29), keep one",
+        ],
+        swap("tip: coupler_pin", "tip: coupler_pin\ntip: rocker_pin"),
+        swap("  coupler: -1.0", "  3: -1.0"),
+    ),
+    seen(
+        "places and doubles",
+        [
+            "ground.urdf:3: error: <mass> has no place in <link>, move it",
+            "ground.urdf:20: error: link 'crank_arm' has 2 <mass>, keep one",
+            'rocker.urdf:10: error: unknown quat_xyzw="..." in <origin>, known: rpy, xyz',
+        ],
+        swap('<link name="pin_B"/>', '<link name="pin_B"><mass value="1"/></link>', GROUND),
+        swap('<mass value="1.5"/>', '<mass value="1.5"/><mass value="1.5"/>', GROUND),
+        swap('<origin xyz="0.15 0 0"/>', '<origin xyz="0.15 0 0" quat_xyzw="0 0 0 1"/>', ROCKER),
+    ),
+]
+
+INERTIAS = [
+    seen(
+        "one of each kind",
+        [
+            "ground.urdf:21: error: link 'crank_arm' has a mass but no inertia, give at "
+            "least a small sphere's",
+            "ground.urdf:35: error: link 'coupler_arm' has an inertia of no possible body: "
+            "principal moments 0.03 + 0.03 < 0.1 kg m2, correct it",
+            "rocker.urdf:12: error: link 'rocker_arm' has the negative principal moment of "
+            "inertia -0.0946 kg m2, correct it",
+        ],
+        swap(CRANK_INERTIA, '<inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>', GROUND),
+        swap(
+            'ixx="0.001" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.03"',
+            'ixx="0.1" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.03"',
+            GROUND,
+        ),
+        swap(
+            'ixx="0.001" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"',
+            'ixx="0.001" ixy="0.1" ixz="0" iyy="0.01" iyz="0" izz="0.01"',
+            ROCKER,
+        ),
+    ),
+    seen(
+        "without mass, and another error that keeps it from being assembled",
+        [
+            "four_bar.yaml:10: error: loop 'pin' has the unknown type 'hinge', known: "
+            "cylindrical, fixed, planar, prismatic, revolute, spherical",
+            "rocker.urdf:8: error: joint 'rocker' moves link 'rocker_arm', which has no "
+            "mass, give it an <inertial>",
+        ],
+        swap(ROCKER_INERTIAL, "", ROCKER),
+        swap("type: revolute", "type: hinge"),
+    ),
+    seen(
+        "parts of an inertial",
+        [
+            "ground.urdf:18: error: the inertial of link 'crank_arm' has no <mass>, add it",
+            "ground.urdf:32: error: the inertial of link 'coupler_arm' has no <inertia>, add it",
+        ],
+        swap('<mass value="1.5"/>', "", GROUND),
+        swap('<inertia ixx="0.001" ixy="0" ixz="0" iyy="0.03" iyz="0" izz="0.03"/>', "", GROUND),
+    ),
+    seen(
+        "in kg mm2",
+        [
+            "ground.urdf:21: warning: link 'crank_arm' has a radius of gyration of 63.2 m, "
+            "and its joints and its centre of mass are at most 0.2 m away, correct the "
+            "inertia (kg m2, about the centre of mass) or the mass (kg)",
+        ],
+        swap(
+            CRANK_INERTIA,
+            '<inertia ixx="1e3" ixy="0" ixz="0" iyy="6e3" iyz="0" izz="6e3"/>',
+            GROUND,
+        ),
+    ),
+    seen(
+        "far too small",
+        [
+            "ground.urdf:21: warning: link 'crank_arm' has a radius of gyration of 8.16e-05"
+            " m, and its joints and its centre of mass are at most 0.2 m away, correct the "
+            "inertia (kg m2, about the centre of mass) or the mass (kg)",
+        ],
+        swap(
+            CRANK_INERTIA,
+            '<inertia ixx="1e-8" ixy="0" ixz="0" iyy="1e-8" iyz="0" izz="1e-8"/>',
+            GROUND,
+        ),
+    ),
+    seen(
+        "against what is drawn",
+        [
+            "rocker.urdf:14: warning: link 'rocker_arm' has a radius of gyration of 3.16 m "
+            "and is drawn 0.301 m large, correct the inertia (kg m2, about the centre of "
+            "mass) or the mass (kg)",
+        ],
+        swap('<mass value="1.0"/>', '<mass value="0.001"/>', ROCKER),
+        swap(ROCKER_LINK, ROCKER_LINK + DRAWN, ROCKER),
+    ),
+    seen(
+        "centre of mass far from what is drawn",
+        [
+            "rocker.urdf:12: warning: link 'rocker_arm' has its centre of mass 14.7 m "
+            "outside of what is drawn, which is 0.301 m large, correct one of them (m, in "
+            "the link's frame)",
+        ],
+        swap('<origin xyz="0.15 0 0"/>', '<origin xyz="15 0 0"/>', ROCKER),
+        swap(ROCKER_LINK, ROCKER_LINK + DRAWN, ROCKER),
+    ),
+    seen(
+        "mass in grams",
+        [
+            "rocker.urdf:13: warning: link 'rocker_arm' has 1000 kg in a box of 0.00012 m3,"
+            " denser than any metal, write kilograms if these are grams",
+        ],
+        swap('<mass value="1.0"/>', '<mass value="1000"/>', ROCKER),
+        swap(
+            'ixx="0.001" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"',
+            'ixx="1" ixy="0" ixz="0" iyy="10" iyz="0" izz="10"',
+            ROCKER,
+        ),
+        swap(ROCKER_LINK, ROCKER_LINK + DRAWN, ROCKER),
+    ),
+]
+
+UNITS = [
+    seen(
+        "millimetres",
+        [
+            "ground.urdf:5: warning: 400 m in <origin> is a long way for a machine (3 such "
+            "in this file), write metres if these are millimetres",
+            "rocker.urdf:17: warning: 300 m in <origin> is a long way for a machine, write "
+            "metres if these are millimetres",
+        ],
+        swap(
+            '<origin xyz="0.2 0 0"/>\n    <parent', '<origin xyz="200 0 0"/>\n    <parent', GROUND
+        ),
+        swap(
+            '<origin xyz="0.4 0 0"/>\n    <parent link="ground"/>',
+            '<origin xyz="400 0 0"/>\n    <parent link="ground"/>',
+            GROUND,
+        ),
+        swap(
+            '<origin xyz="0.4 0 0"/>\n    <parent link="coupler_arm"/>',
+            '<origin xyz="400 0 0"/>\n    <parent link="coupler_arm"/>',
+            GROUND,
+        ),
+        swap('<origin xyz="0.3 0 0"/>', '<origin xyz="300 0 0"/>', ROCKER),
+    ),
+    seen(
+        "degrees",
+        [
+            "four_bar.yaml:15: warning: home of 'crank' is 69 rad, many turns, write "
+            "radians if these are degrees",
+            'ground.urdf:5: warning: rpy="0 0 90" turns more than once, write radians if '
+            "these are degrees",
+            "ground.urdf:14: warning: the limit 143 rad of joint 'crank' is many turns, "
+            "write radians if these are degrees, or make it continuous",
+        ],
+        swap("  crank: 1.2", "  crank: 69"),
+        swap('lower="-1.5" upper="2.5"', 'lower="-90" upper="143"', GROUND),
+        swap(
+            '<origin xyz="0.4 0 0"/>\n    <parent link="ground"/>',
+            '<origin xyz="0.4 0 0" rpy="0 0 90"/>\n    <parent link="ground"/>',
+            GROUND,
+        ),
+    ),
+    seen(
+        "a stroke in millimetres",
+        [
+            "chain_b1.urdf:57: warning: the limit 300 m of joint 'X1' is a long way, write "
+            "metres if these are millimetres",
+        ],
+        swap('lower="0" upper="0.030"', 'lower="0" upper="300"', CHAIN_B1),
+        machine=MINI,
+    ),
+]
+
+MESHES = [
+    seen(
+        "missing, broken and in millimetres",
+        [
+            "rocker.urdf:9: warning: mesh file 'package://gone/link.stl' is not there, "
+            "correct its path or install the package that has it; a box is drawn instead",
+            "rocker.urdf:10: warning: mesh file 'broken.stl' cannot be read, export it again",
+            "rocker.urdf:11: warning: mesh 'big.obj' is 300 m large, give it scale=\"0.001 "
+            '0.001 0.001" if it is in millimetres',
+        ],
+        swap(ROCKER_LINK, ROCKER_LINK + MESHES, ROCKER),
+        whole("solid", "four_bar/broken.stl"),
+        whole(BIG, "four_bar/big.obj"),
+    ),
+]
+
+MECHANISM = [
+    seen(
+        "loop that stays open",
+        [
+            "four_bar.yaml:10: error: loop 'pin' cannot be closed from the home guess "
+            "(crank = 1.2): it stays 0.0962 rad open, correct the frames or the guess (it "
+            "is 10 mm apart and 5.73 deg askew)",
+        ],
+        swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.3 0 0.01" rpy="0.1 0 0"/>', ROCKER),
+    ),
+    seen(
+        "loop too far away",
+        [
+            "four_bar.yaml:10: error: loop 'pin' cannot be closed from the home guess "
+            "(crank = 1.2): it stays 1.59 m open, correct the frames or the guess (it is "
+            "2.09 m apart and 0 deg askew)",
+        ],
+        swap('<origin xyz="0.3 0 0"/>', '<origin xyz="3 0 0"/>', ROCKER),
+    ),
+    seen(
+        "idle loop and wrong number of active joints",
+        [
+            "four_bar.yaml:11: error: loop 'again' locks nothing that the joints do not "
+            "lock already: remove it",
+            "four_bar.yaml:13: error: 2 active joints (crank, coupler) for 1 degree of "
+            "freedom: name only 1 of them, such as [crank] (condition 1.6), or [coupler] "
+            "(condition 1.47)",
+        ],
+        swap(
+            "successor: rocker_pin}\n",
+            "successor: rocker_pin}\n  - {name: again, type: revolute, predecessor:"
+            " pin_B, successor: rocker_arm}\n",
+        ),
+        swap("active: [crank]", "active: [crank, coupler]"),
+        swap("control:\n  crank: {kp: 50, ki: 20}\n", ""),
+        swap(
+            "    active:\n      crank: [1.2, 0.4, -0.2]\n", "    tip: {x: [0], y: [0], z: [0]}\n"
+        ),
+    ),
+    seen(
+        "checked in spite of errors in friction, tasks and gains",
+        [
+            "four_bar.yaml:10: error: loop 'pin' cannot be closed from the home guess "
+            "(crank = 1.2): it stays 0.101 m open, correct the frames or the guess (it is "
+            "102 mm apart and 0.00469 deg askew)",
+            "four_bar.yaml:20: error: 'coulomb' of friction of 'crank' is -0.3, give at least 0",
+            "four_bar.yaml:38: error: 'duration' of task 'reach' is 'soon', give a number",
+            "four_bar.yaml:42: error: 'ki' of control of 'crank' is -20, give at least 0",
+        ],
+        swap("type: revolute", "type: fixed"),
+        swap("coulomb: 0.3", "coulomb: -0.3"),
+        swap("duration: 1\n", "duration: soon\n"),
+        swap("ki: 20", "ki: -20"),
+    ),
+    seen(
+        "home outside of the limits",
+        [
+            "four_bar.yaml:15: error: home of 'crank' is 2.6, outside of its limits -1.5 to"
+            " 2.5, choose one within them",
+        ],
+        swap("  crank: 1.2", "  crank: 2.6"),
+    ),
+    seen(
+        "passive joint outside of its limits",
+        [
+            "rocker.urdf:3: warning: passive joint 'rocker' is at 1.378 with the loops "
+            "closed at home, outside of its limits 0 to 0.5, widen them or correct the home",
+        ],
+        swap('name="rocker" type="continuous"', 'name="rocker" type="revolute"', ROCKER),
+        swap('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1"/><limit lower="0" upper="0.5"/>', ROCKER),
+    ),
+    seen(
+        "two loops stay open",
+        [
+            "mini_forwarder.yaml:{line of - {name: A1}: error: loop 'A1_eye' cannot be "
+            "closed from the home "
+            "guess (q1 = 0, X1 = 0.0221, X2 = 0.0108): it stays 0.1 m open, correct the "
+            "frames or the guess (it is 100 mm apart and 0 deg askew)",
+            "mini_forwarder.yaml:{line of - {name: K}: error: loop 'K' stays open,"
+            " too: it is 50 mm apart and"
+            " 0 deg askew",
+        ],
+        swap('<origin xyz="0.0825 0 0"/>', '<origin xyz="0.0825 0 0.1"/>', CHAIN_B1),
+        swap('<origin xyz="0.0431 0 0"/>', '<origin xyz="0.0431 0 0.05"/>', CHAIN_B2),
+        machine=MINI,
+    ),
+]
+
+SECTIONS = [
+    seen(
+        "joints that are not there",
+        [
+            "four_bar.yaml:12: error: joint 'crnk' is unknown, did you mean 'crank'?",
+            "four_bar.yaml:12: error: joint 'rocker_pin_fixed' is fixed, name a moving one",
+            "four_bar.yaml:24: error: joint 'roker' is unknown, did you mean 'rocker'?",
+        ],
+        swap("active: [crank]", "active: [crnk, rocker_pin_fixed]"),
+        swap("{joint: rocker,", "{joint: roker,"),
+    ),
+    seen(
+        "lists that are none",
+        [
+            "four_bar.yaml:9: error: 'loops' is 'pin', give a list, its items with '- '",
+            "four_bar.yaml:11: error: 'active' of the machine file is 'crank', give a list "
+            "such as [q1, q2]",
+            "four_bar.yaml:13: error: 'home' is a list, give a mapping 'name: value'",
+        ],
+        swap("active: [crank]", "active: crank"),
+        swap(
+            "loops:\n  - {name: pin, type: revolute, predecessor: coupler_pin,"
+            " successor: rocker_pin}\n",
+            "loops: pin\n",
+        ),
+        swap("home:\n  crank: 1.2\n  coupler: -1.0\n  rocker: 1.5", "home: [1.2]"),
+    ),
+    seen(
+        "a loop with four slips",
+        [
+            "four_bar.yaml:10: error: 'name' of a loop is 4, give text (or quote it)",
+            "four_bar.yaml:10: error: a loop has the unknown predecessor 'coupler_pn', did "
+            "you mean 'coupler_pin'?",
+            "four_bar.yaml:10: error: a loop has the unknown type 'hinge', known: "
+            "cylindrical, fixed, planar, prismatic, revolute, spherical",
+            "four_bar.yaml:10: error: the axis of a loop is no direction, give three "
+            "numbers, not all zero",
+        ],
+        swap(
+            "{name: pin, type: revolute, predecessor: coupler_pin, successor: rocker_pin}",
+            "{name: 4, type: hinge, predecessor: coupler_pn, successor: rocker_pin, axis: [0, 0]}",
+        ),
+    ),
+    seen(
+        "offsets larger than their means",
+        [
+            "four_bar.yaml:20: warning: friction of 'crank' drives the joint in one "
+            "direction (|coulomb_offset| 0.4 > coulomb 0.3), a constant force may hide in "
+            "it",
+            "four_bar.yaml:21: warning: friction of 'coupler' drives the joint in one "
+            "direction (|viscous_offset| 0.02 > viscous 0.01), a constant force may hide in"
+            " it",
+        ],
+        swap("coulomb: 0.3", "coulomb: 0.3, coulomb_offset: 0.4"),
+        swap("viscous: 0.01", "viscous: 0.01, viscous_offset: -0.02"),
+    ),
+]
+
+LOOPS = [
+    seen(
+        "of a URDF",
+        [
+            "four_bar_loop.urdf:5: error: independent=\"yes\" of joint 'crank' is neither "
+            "true nor false",
+            "four_bar_loop.urdf:46: error: loop 'pin' has the unknown predecessor "
+            "'coupler_am', did you mean 'coupler_arm'?",
+            'four_bar_loop.urdf:46: error: xyz="0,4 0 0" of the origin of the predecessor '
+            "of loop 'pin' is not a number, write a decimal point",
+            "four_bar_loop.urdf:48: error: the axis of loop 'pin' is zero, give a direction",
+        ],
+        swap(
+            '<predecessor link="coupler_arm"><origin xyz="0.4 0 0"/>',
+            '<predecessor link="coupler_am"><origin xyz="0,4 0 0"/>',
+            LOOPED,
+        ),
+        swap('<axis xyz="0 0 2"/>', '<axis xyz="0 0 0"/>', LOOPED),
+        swap(' independent="true"', ' independent="yes"', LOOPED),
+        machine=LOOPED,
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    "case",
+    [*NUMBERS, *GRAPH, *SLIPS, *INERTIAS, *UNITS, *MESHES, *MECHANISM, *SECTIONS, *LOOPS],
+)
+def test_says_all_at_once(case, tmp_path):
+    report = checked(case.machine, case.edits, tmp_path)
+    lines = [str(finding) for finding in report.findings]
+    if case.machine == MINI:  # whose friction is told every time
+        lines = [line for line in lines if "a constant force may hide" not in line]
+    assert lines == [with_line(line, tmp_path) for line in case.lines]
+    assert all(line.isprintable() for line in lines)
+
+
+def refused():
+    for module in (test_urdf, test_machine_file, test_mechanism):
+        for name, cases in vars(module).items():
+            if name.isupper() and isinstance(cases, list):
+                for case in cases:
+                    yield pytest.param(case.values[0], id=f"{name.lower()}-{case.id}")
+
+
+@pytest.mark.parametrize("broken", list(refused()))
+@pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+def test_what_load_raises_is_among_the_findings(broken, tmp_path):
+    path = copy_machine(broken.machine, tmp_path)
+    for edit in broken.edits:
+        edit.apply(tmp_path)
+    with pytest.raises(crane.CraneError) as caught:
+        crane.load(path)
+    report = check(path)
+    messages = [str(finding).replace(": error: ", ": ", 1) for finding in report.findings]
+    assert any(message.startswith(str(caught.value)) for message in messages), messages
+    assert report.status == 2
+    assert report.summary is None
+
+
+def test_says_no_more_than_load_of_single_slips(tmp_path):
+    """One slip is one finding, wherever it is: nothing that only follows from it."""
+    more = {}
+    for case in refused():
+        broken, folder = case.values[0], tmp_path / case.id
+        if broken.machine == MINI:
+            continue
+        folder.mkdir()
+        findings = checked(broken.machine, broken.edits, folder).findings
+        if sum(finding.error for finding in findings) > 1:
+            more[broken.name] = [str(finding) for finding in findings]
+    # which are several slips, or one that really breaks several things
+    assert more.keys() <= {
+        "infinite limit", "misspelt successor", "nothing moves", "unknown key far from all",
+        "payload without a tip", "payload with a moving joint", "control not of all",
+        "control characters in a key",
+    }, more  # fmt: skip
+
+
+@pytest.mark.parametrize("name", bundled())
+def test_bundled_machines_are_clean(name):
+    report = check(name)
+    assert report.errors == 0
+    told = [finding.what for finding in report.findings]
+    assert [what for what in told if "a constant force may hide" not in what] == []
+    assert f"{report.summary}".endswith("m at home")
+
+
+ARMS = (
+    "kinova", "panda", "panda_collision", "so100", "TwoDofs", "ur10_joint_limited_robot",
+    "ur10_robot", "ur3_gripper", "ur3_joint_limited_robot", "ur3_robot", "ur5_gripper",
+    "ur5_joint_limited_robot", "ur5_robot", "xarm7", "z1",
+)  # fmt: skip
+
+
+@pytest.mark.skipif(not examples(), reason="example-robot-data is not installed")
+@pytest.mark.parametrize("name", ARMS)
+def test_arms_give_no_false_alarm(name):
+    assert check(name).findings == ()
+
+
+@pytest.mark.skipif(not examples(), reason="example-robot-data is not installed")
+@pytest.mark.slow
+def test_published_robots_load_where_they_are_not_refused():
+    for name in examples():
+        report = check(name)
+        try:
+            crane.load(name)
+        except crane.CraneError as error:
+            assert any(finding.what in str(error) for finding in report.findings), name
+        else:
+            assert report.errors == 0, (name, report.findings)
+
+
+def run(*arguments, cwd=None):
+    return subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "from crane.cli import main; main()",
+            "check",
+            *map(str, arguments),
+        ],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        timeout=120,
+    )
+
+
+def test_status_and_counts_of_a_clean_machine(tmp_path):
+    result = run(copy_machine(MACHINE, tmp_path))
+    assert (result.returncode, result.stderr) == (0, "")
+    assert result.stdout.startswith("four_bar: 3 joints, 1 loops, 1 degrees of freedom, loops ")
+    assert result.stdout.count("\n") == 1
+
+
+def test_status_and_counts_with_warnings(tmp_path):
+    path = copy_machine(MACHINE, tmp_path)
+    swap("coulomb: 0.3", "coulomb: 0.3, coulomb_offset: 0.4").apply(tmp_path)
+    result = run(path)
+    assert (result.returncode, result.stderr) == (1, "")
+    first, summary, counts = result.stdout.splitlines()
+    assert first.startswith("four_bar.yaml:20: warning: friction of 'crank' drives the joint")
+    assert summary.startswith("four_bar: 3 joints")
+    assert counts == "no errors, 1 warning"
+
+
+def test_status_and_counts_with_errors(tmp_path):
+    path = copy_machine(MACHINE, tmp_path)
+    swap("coulomb: 0.3", "coulomb: -0.3, coulomb_offset: 0.4").apply(tmp_path)
+    swap("viscous: 0.01", "viscous: 0.01, viscous_offset: 1").apply(tmp_path)
+    swap("  crank: 1.2", "  crank: up").apply(tmp_path)
+    result = run(path)
+    assert (result.returncode, result.stderr) == (2, "")
+    assert [line.split(": ")[1] for line in result.stdout.splitlines()[:-1]] == [
+        "error", "error", "warning",
+    ]  # fmt: skip
+    assert result.stdout.splitlines()[-1] == "2 errors, 1 warning"
+
+
+def test_folder_and_missing_file_are_no_machines(tmp_path):
+    (tmp_path / "folder.yaml").mkdir()
+    for name in ("folder.yaml", "nothing.urdf", str(tmp_path), "none"):
+        result = run(name, cwd=tmp_path)
+        assert (result.returncode, result.stdout) == (2, "")
+        assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
+
+
+ROW = (
+    '<link name="l{0}"><inertial><mass value="{1}"/>'
+    '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
+    '<joint name="j{0}" type="continuous"><parent link="l{2}"/><child link="l{0}"/></joint>\n'
+)
+
+
+def tree(count, parent, mass="1"):
+    rows = "".join(ROW.format(i, mass, parent(i)) for i in range(1, count + 1))
+    return f'<robot name="r"><link name="l0"/>\n{rows}</robot>'
+
+
+ODD = {
+    "empty.yaml": b"",
+    "empty.urdf": b" \n",
+    "zeros.yaml": b"\0" * 1000,
+    "zeros.urdf": b"\0" * 1000,
+    "bytes.yaml": bytes(range(256)) * 100,
+    "bytes.urdf": bytes(range(256)) * 100,
+    "utf16.yaml": "name: krän\n".encode("utf-16"),
+    "utf16.urdf": '<robot name="krän"><link name="a"/></robot>'.encode("utf-16"),
+    "mark.yaml": b"\xef\xbb\xbfname: x\n",
+    "mark.urdf": b'\xef\xbb\xbf<robot name="r"><link name="a"/></robot>',
+    "latin.urdf": b'<?xml version="1.0" encoding="iso-8859-1"?><robot name="kr\xe4n"/>',
+    "encoding.urdf": b'<?xml version="1.0" encoding="nonsense"?><robot/>',
+    "surrogate.yaml": b'name: "\\ud800"\nchains: [{name: a, urdf: "\\ud800.urdf"}]\n',
+    "recursive.yaml": b"name: &a {x: *a}\n",
+    "number.yaml": b"name: x\nhome: {a: " + b"9" * 5000 + b"}\n",
+    "kinds.yaml": (
+        b"name: 1\nchains: 5\nloops: 3\nactive: {a: 1}\ntip: [1]\ntasks: 4\nhome: 1e999\n"
+    ),
+    "nested.yaml": b"[" * 100_000,
+    "nested.urdf": b'<robot name="r">' + b"<a>" * 100_000 + b"</a>" * 100_000 + b"</robot>",
+    "deep.urdf": tree(10_000, lambda i: i - 1).encode(),
+    "wide.urdf": tree(10_000, lambda i: 0, "1,5").encode(),
+    "strangers.urdf": tree(10_000, lambda i: f"x{i}").encode(),
+    "large.yaml": b"name: x\n" + b"# comment\n" * 1_000_000,
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_odd_files_are_findings_soon(name, tmp_path):
+    path = tmp_path / name
+    path.write_bytes(ODD[name])
+    begin = time.perf_counter()
+    report = check(path)
+    assert time.perf_counter() - begin < 20
+    assert report.status == 2
+    assert all(finding.file in (name, "") for finding in report.findings)
+    assert all(str(finding).isprintable() for finding in report.findings)
+
+
+def test_many_findings_end_somewhere(tmp_path):
+    path = tmp_path / "wide.urdf"
+    path.write_bytes(ODD["wide.urdf"])
+    report = check(path)
+    assert report.errors == 200
+    assert report.counts == "200 errors, no warnings; there is more, mend these first"
+
+
+def test_a_tree_deeper_than_the_stack_is_refused(tmp_path):
+    path = tmp_path / "deep.urdf"
+    path.write_text(tree(10_000, lambda i: i - 1).replace("continuous", "fixed", 9_500))
+    with pytest.raises(crane.CraneError, match="th in a row, join links to have at most 2000"):
+        crane.load(path)
+
+
+def test_collecting_leaves_nothing_behind(tmp_path):
+    path = copy_machine(MACHINE, tmp_path)
+    swap("kp: 50, ki: 20", "kp: -50, ki: -20").apply(tmp_path)
+    assert check(path).errors == 2
+    with pytest.raises(crane.CraneError, match="'kp' of control of 'crank' is -50"):
+        crane.load(path)
