@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from crane.description import EndStop, ForceElement, Friction, GasSpring, PIGains
     from crane.dynamics import Dynamics
     from crane.errors import CraneError, CraneWarning
+    from crane.formats import write_machine, write_mjcf, write_urdf_plus
     from crane.identification.cylinder_friction import cylinder_friction
     from crane.identification.identify import identify
     from crane.identification.orifices import identify_orifices
@@ -29,9 +30,12 @@ if TYPE_CHECKING:
     from crane.measured import read_measured
     from crane.paths import Path, point_to_point, polynomial, task_path, tip_path
     from crane.recording import Recording
-    from crane.replay import Comparison, replay
+    from crane.replays import Comparison, replay
     from crane.simulation import simulate
     from crane.studies import Study, study
+    from crane.view.page import report
+    from crane.view.sketch import sketch
+    from crane.workspaces import Workspace, workspace
 
 __version__ = "0.1.0"
 
@@ -50,6 +54,7 @@ _HOMES = {
     "crane.description": ("EndStop", "ForceElement", "Friction", "GasSpring", "PIGains"),
     "crane.dynamics": ("Dynamics",),
     "crane.errors": ("CraneError", "CraneWarning"),
+    "crane.formats": ("write_machine", "write_mjcf", "write_urdf_plus"),
     "crane.identification.cylinder_friction": ("cylinder_friction",),
     "crane.identification.identify": ("identify",),
     "crane.identification.orifices": ("identify_orifices",),
@@ -61,19 +66,22 @@ _HOMES = {
     "crane.paths": ("Path", "point_to_point", "polynomial", "task_path", "tip_path"),
     "crane.recording": ("Recording",),
     "crane.batch": ("Batch", "simulate_batch"),
-    "crane.replay": ("Comparison", "replay"),
+    "crane.replays": ("Comparison", "replay"),
     "crane.simulation": ("simulate",),
     "crane.studies": ("Study", "study"),
+    "crane.view.page": ("report",),
+    "crane.workspaces": ("Workspace", "workspace"),
+    "crane.view.sketch": ("sketch",),
 }
 
 __all__ = [
     "PI", "Batch", "Closure", "Comparison", "ComputedTorque", "CraneError", "CraneWarning",
     "Dynamics", "EndStop", "ForceElement", "Friction", "GasSpring", "Identification", "Kinematics",
     "Machine", "PIGains", "Path", "Payload", "Recording", "Sampled", "Signals", "Study",
-    "TipVelocity", "ValveDrive", "ValvePD", "cylinder_friction", "identify",
-    "identify_orifices", "identify_valve", "joystick", "load", "point_to_point",
-    "polynomial", "read_measured", "replay", "simulate", "simulate_batch", "study", "task_path",
-    "tip_path",
+    "TipVelocity", "ValveDrive", "ValvePD", "Workspace", "cylinder_friction", "identify",
+    "identify_orifices", "identify_valve", "joystick", "load", "point_to_point", "polynomial",
+    "read_measured", "replay", "report", "simulate", "simulate_batch", "sketch", "study",
+    "task_path", "tip_path", "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 

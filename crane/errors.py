@@ -79,11 +79,16 @@ class CraneWarning(UserWarning):
     """Something is unusual enough to be told, and not wrong enough to refuse."""
 
 
+_MANY, _LISTED = 2000, 100  # names to search for a similar one, and to write into a line
+
+
 def known(names: Iterable[str], wanted: str | None = None) -> str:
     """Words an error ends with: the nearest of the names that exist, or all of them."""
     names = list(names)
     if not names:
         return "there are none"
-    if wanted is not None and (near := get_close_matches(wanted, names, 1, 0.75)):
+    few = len(names) <= _MANY
+    if few and wanted is not None and (near := get_close_matches(wanted, names, 1, 0.75)):
         return f"did you mean '{near[0]}'?"
-    return "known: " + ", ".join(sorted(names))
+    listed = sorted(names)[:_LISTED] + ["..."] * (len(names) > _LISTED)
+    return "known: " + ", ".join(listed)

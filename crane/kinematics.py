@@ -217,11 +217,15 @@ class Kinematics:
         tolerance = 1e-2 * _ACCURACY * max(1.0, float(np.abs(targets).max()))
         return best if beside.all() and before.max() <= tolerance else None
 
-    def _jacobian(self, q: Array) -> Array:
-        tree = pin.computeFrameJacobian(
+    def tree_jacobian(self, q: Array) -> Array:
+        """Jacobian dx/dq (3, nv) of the spanning tree at one posture (nq,)."""
+        tree: Array = pin.computeFrameJacobian(
             self._model, self._data, q, self._frame, pin.LOCAL_WORLD_ALIGNED
-        )
-        reduced: Array = tree[:3] @ self.machine.closure.gamma(q)
+        )[:3]
+        return tree
+
+    def _jacobian(self, q: Array) -> Array:
+        reduced: Array = self.tree_jacobian(q) @ self.machine.closure.gamma(q)
         return reduced
 
     @cached_property

@@ -11,12 +11,13 @@ from crane.machine import Machine, recalled
 from crane.measured import is_measured, read_measured
 from crane.output import staging
 from crane.recording import Recording
-from crane.replay import Comparison
+from crane.replays import Comparison
 from crane.studies.table import Study
 from crane.summary import summarize
 
 if TYPE_CHECKING:
     from crane.identification.result import Identification
+    from crane.workspaces import Workspace
 
 RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
 COMPARISON = "comparison.md"
@@ -95,11 +96,11 @@ def write_comparison(
 
 def write_views(folder: Path, machine: Machine, recording: Recording) -> None:
     """Write figure and page of a recording into a folder."""
-    from crane.view.page import write_page
+    from crane.view.page import report
     from crane.view.plots import plot_recording
 
     plot_recording(recording, folder / FIGURE)
-    write_page(machine, folder / PAGE, recording)
+    report(machine, recording, folder / PAGE)
 
 
 def write_study(folder: Path, study: Study) -> None:
@@ -113,6 +114,26 @@ def write_study(folder: Path, study: Study) -> None:
     with staging(folder) as part:
         study.to_csv(part / "study.csv")
         plot_study(study, part / "study.png")
+
+
+def write_workspace(folder: Path, space: "Workspace") -> str:
+    """Write tables, summary and picture of a workspace into a folder, created where there is none.
+
+    Returns:
+        The summary, Markdown.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.workspace_plots import plot_workspace
+
+    text = space.to_markdown()
+    with staging(folder) as part:
+        space.to_csv(part / "workspace.csv")
+        space.curves_to_csv(part / "curves.csv")
+        (part / "workspace.md").write_text(text, encoding="utf-8")
+        plot_workspace(space, part / "workspace.png")
+    return text
 
 
 def write_identification(

@@ -133,7 +133,9 @@ def test_check_tells_warnings_by_its_status():
     result = run("check", "mini_forwarder")
     assert result.returncode == 1
     assert "3 degrees of freedom" in result.stdout
-    assert result.stderr.startswith("warning: mini_forwarder.yaml:")
+    assert result.stdout.startswith("mini_forwarder.yaml:")
+    assert result.stdout.endswith("no errors, 1 warning\n")
+    assert result.stderr == ""
     assert run("check", "ur5_robot").returncode == 0
 
 

@@ -14,6 +14,8 @@ from crane.description import LOOP_TYPES, Friction, bundled, examples, inertia_p
 from crane.description.sources import find
 from crane.errors import CraneError, CraneWarning, MechanismError, known
 
+NO_MACHINE = "not a machine, give a machine file (.yaml), a URDF (.urdf) or a MJCF (.xml)"
+
 
 @pytest.fixture
 def four_bar(tmp_path):
@@ -287,9 +289,9 @@ class TestSources:
             ("folder/crane.urdf", "folder/crane.urdf: no such file, check the path"),
             ("a\0b", "no machine and no file is named 'a b', known: {bundled}; "
              "crane list shows all names"),
-            ("folder", "folder: not a machine, give a machine file (.yaml) or a URDF (.urdf)"),
-            ("", ".: not a machine, give a machine file (.yaml) or a URDF (.urdf)"),
-            ("a.txt", "a.txt: not a machine, give a machine file (.yaml) or a URDF (.urdf)"),
+            ("folder", f"folder: {NO_MACHINE}"),
+            ("", f".: {NO_MACHINE}"),
+            ("a.txt", f"a.txt: {NO_MACHINE}"),
             ("folder.yaml", "folder.yaml: is a folder, give a file"),
             ("folder.urdf", "folder.urdf: is a folder, give a file"),
         ],

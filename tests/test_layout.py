@@ -8,9 +8,9 @@ PACKAGE = Path(__file__).parents[1] / "crane"
 # A module may import those before it. Within a room, modules may not form a circle either.
 ORDER = [
     "errors", "samples", "output", "timeseries", "straight", "description", "closure", "machine",
-    "dynamics", "kinematics", "hydraulics", "paths", "control", "integration", "recording",
-    "measured", "summary", "simulation", "replay", "batch", "studies", "rig",
-    "identification", "view", "runs", "demo", "cli",
+    "check", "formats", "dynamics", "kinematics", "workspaces", "hydraulics", "paths", "control",
+    "integration", "recording", "measured", "summary", "simulation", "replays", "batch", "studies",
+    "rig", "identification", "view", "live", "runs", "demo", "cli",
 ]  # fmt: skip
 
 
@@ -67,3 +67,11 @@ def test_no_circles_within_a_room():
         assert free, f"circle among {sorted(graph)}"
         for name in free:
             del graph[name]
+
+
+def test_no_module_hides_a_name_of_the_package():
+    """Importing crane.x puts the module in the place of a function crane.x."""
+    import crane
+
+    modules = {path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in files()}
+    assert not modules & set(crane.__all__)

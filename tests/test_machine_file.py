@@ -226,7 +226,8 @@ KEYS = [
     ),
     case(
         "no active",
-        "four_bar.yaml:2: the machine file has no 'active', add it",
+        "four_bar.yaml: 1 degree of freedom and no active joints, name one: try "
+        "[crank] (condition 1.6), or [coupler] (condition 1.47)",
         swap("active: [crank]", ""),
     ),
     case(
@@ -351,7 +352,8 @@ TYPES = [
     ),
     case(
         "active is empty",
-        "four_bar.yaml:12: 'active' is empty, name the driven joints",
+        "four_bar.yaml:12: 1 degree of freedom and no active joints, name one: try "
+        "[crank] (condition 1.6), or [coupler] (condition 1.47)",
         swap("active: [crank]", "active: []"),
     ),
     case(

@@ -8,7 +8,7 @@ import crane
 from crane import timeseries
 from crane.control import Signals
 from crane.errors import CraneError, RecordingError
-from crane.replay import replay
+from crane.replays import replay
 from crane.timeseries import Table
 
 

@@ -583,7 +583,7 @@ TREE = [
     ),
     case(
         "coupling",
-        "ground.urdf:45: <coupling> is not supported, couple the joints by a loop",
+        "ground.urdf:45: coupling 'c' has no predecessor, add <predecessor link=\"...\"/>",
         swap("</robot>", '<coupling name="c"/>\n</robot>', GROUND),
     ),
     case(
@@ -599,15 +599,17 @@ TREE = [
 LOOPS = [
     case(
         "no driven joint",
-        "four_bar_loop.urdf:45: a loop, but no joint is driven, mark those that are"
-        ' with independent="true"',
+        "four_bar_loop.urdf:45: 1 degree of freedom and no active joints, name one: try "
+        "[crank] (condition 1.6), or [coupler] (condition 1.46), and mark what you choose with "
+        'independent="true"',
         swap(' independent="true"', "", LOOPED),
         machine=LOOPED,
     ),
     case(
         "no joint is independent",
-        "four_bar_loop.urdf:45: a loop, but no joint is driven, mark those that are"
-        ' with independent="true"',
+        "four_bar_loop.urdf:45: 1 degree of freedom and no active joints, name one: try "
+        "[crank] (condition 1.6), or [coupler] (condition 1.46), and mark what you choose with "
+        'independent="true"',
         swap(' independent="true"', ' independent="false"', LOOPED),
         machine=LOOPED,
     ),
@@ -636,8 +638,8 @@ LOOPS = [
     ),
     case(
         "too many independent joints",
-        "four_bar_loop.urdf: 2 active joints (crank, coupler) for 1 degree of "
-        "freedom: name only 1 of them",
+        "four_bar_loop.urdf: 2 active joints (crank, coupler) for 1 degree of freedom: name "
+        "only 1 of them, such as [crank] (condition 1.6), or [coupler] (condition 1.46)",
         swap(
             'name="coupler" type="continuous"',
             'name="coupler" type="continuous" independent="true"',
@@ -670,14 +672,14 @@ LOOPS = [
     case(
         "unknown loop type",
         "four_bar_loop.urdf:45: loop 'pin' has the unknown type 'hinge', known: "
-        "continuous, fixed, planar, prismatic, revolute, spherical",
+        "continuous, cylindrical, fixed, planar, prismatic, revolute, spherical",
         swap('<loop name="pin" type="continuous">', '<loop name="pin" type="hinge">', LOOPED),
         machine=LOOPED,
     ),
     case(
         "no loop type",
-        "four_bar_loop.urdf:45: loop 'pin' has no type, known: continuous, fixed, "
-        "planar, prismatic, revolute, spherical",
+        "four_bar_loop.urdf:45: loop 'pin' has no type, known: continuous, "
+        "cylindrical, fixed, planar, prismatic, revolute, spherical",
         swap('<loop name="pin" type="continuous">', '<loop name="pin">', LOOPED),
         machine=LOOPED,
     ),

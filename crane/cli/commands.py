@@ -1,6 +1,5 @@
-"""Commands on machines and runs: list, info, check, simulate, view, plot, demo."""
+"""Commands on machines and runs: list, info, simulate, view, plot, demo."""
 
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,9 +15,8 @@ from crane.cli.shared import (
     app,
     load,
     progress_bar,
-    say,
 )
-from crane.errors import CraneWarning, InputError
+from crane.errors import InputError
 
 if TYPE_CHECKING:
     from crane.machine import Machine
@@ -51,53 +49,42 @@ def info(machine: MachineName) -> None:
 
 
 @app.command()
-def check(file: MachineName) -> None:
-    """Read a machine and say what is wrong; exit status 0, 1 with warnings, 2 with an error."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", CraneWarning)
-        loaded = load(file)
-    for warning in caught:
-        say(f"warning: {warning.message}")
-    residual = float(loaded.closure.residual(loaded.home))
-    loops = len(loaded.closure.equations.loops)
-    freedom = loaded.closure.degrees_of_freedom
-    print(
-        f"{loaded.name}: {len(loaded.joints)} joints, {loops} loops, {freedom} "
-        f"degrees of freedom, loops closed to {residual:.1e} m at home"
-    )
-    if caught:
-        raise typer.Exit(1)
-
-
-@app.command()
 def view(
     what: Annotated[
         str, typer.Argument(metavar="WHAT", help="A machine, a run's folder, or a recording.")
     ],
     machine: RunMachine = None,
+    over: Annotated[
+        Path | None,
+        typer.Option(metavar="RUN", help="A second run of the machine, laid over the first."),
+    ] = None,
     out: OutFile = None,
     no_open: NoOpen = False,
     force: Force = False,
 ) -> None:
-    """Write a page that shows a machine or plays a run, and open it."""
+    """Write a page that shows a machine, or a run with its forces and numbers, and open it."""
     from crane.output import file_name
     from crane.runs import PAGE, check_free, machine_of, read_run
-    from crane.view.page import open_in_browser, write_page
+    from crane.view.page import open_in_browser, report
 
-    recording = None
+    recording = other = None
     if _is_run(what):
         path = Path(what)
         given = None if machine is None else load(machine)
         recording = read_run(path, given)
         loaded = given or machine_of(what, recording.machine)
+        if over is not None:
+            other = read_run(over, loaded)
         page = out or (path if path.is_dir() else path.parent) / PAGE
+    elif over is not None:
+        raise InputError(f"--over is for runs, and '{what}' is none, leave it out")
     elif machine is None:
         loaded = load(what)
         page = out or Path(file_name(loaded.name) + ".html")
     else:
         raise InputError(f"--machine is for runs, and '{what}' is none, leave it out")
     check_free(page, force)
-    write_page(loaded, page, recording)
+    report(loaded, recording, page, other)
     print(f"written to {page}")
     if not no_open and not open_in_browser(page):
         print("no browser found here, open the page yourself")
@@ -136,6 +123,8 @@ def demo(out: Out = Path("demo-output"), force: Force = False) -> None:
 
 def _is_run(what: str) -> bool:
     """Whether a run is meant and no machine."""
+    if (Path(what) / "robot.yaml").is_file():  # a machine as in example-parallel-robots
+        return False
     return Path(what).is_dir() or Path(what).suffix.lower() in (".csv", ".npz")
 
 
@@ -154,31 +143,53 @@ def _describe(machine: "Machine") -> Iterator[str]:
         f"  joints      {len(machine.joints)}, of which {len(machine.active)} active; "
         f"moving mass {mass:.4g} kg"
     )
+    width = max(10, 1 + max(map(len, (*machine.joints, *closure.equations.names))))
     for i, joint in enumerate(machine.active):
         home = machine.home[closure.active[i]]
         yield (
-            f"    {joint:<10}{machine.lower[i]:.5g} to {machine.upper[i]:.5g} "
+            f"    {joint:<{width}}{machine.lower[i]:.5g} to {machine.upper[i]:.5g} "
             f"{machine.unit(joint)}, home {home:.5g}"
         )
     for i in closure.passive:
         joint = machine.joints[i]
-        yield f"    {joint:<10}passive, home {machine.home[i]:.5g} {machine.unit(joint)}"
+        yield f"    {joint:<{width}}passive, home {machine.home[i]:.5g} {machine.unit(joint)}"
     loops = closure.equations.loops
     yield (
         f"  loops       {len(loops)}: {len(structure.rows)} independent equations, "
         f"{len(structure.redundant)} redundant"
     )
     for loop in loops:
-        yield f"    {loop.name:<10}{loop.type}, {loop.predecessor} to {loop.successor}"
+        yield f"    {loop.name:<{width}}{loop.type}, {loop.predecessor} to {loop.successor}"
+    for coupling in closure.equations.couplings:
+        terms = " + ".join(f"{factor:g} {joint}" for joint, factor in coupling.factors.items())
+        yield f"    {coupling.name:<{width}}coupling, {terms} = {coupling.offset:g}"
     if structure.blocks:
         order = [
             "+".join(machine.joints[closure.passive[i]] for i in columns)
             for _, columns in structure.blocks
         ]
         yield f"  solved as   {', then '.join(order)}"
+    if loops:
+        drive = float(closure.condition(machine.home))
+        better = [c for c in closure.proposals if drive > 10 and c.condition < drive / 2]
+        others = f"; better with {better[0]}" if better else ""
+        yield f"  driven      condition {drive:.3g} at home{others}"
     path = Dynamics(machine).path_of("forward")
     reason = "" if path == "compiled" else ", too large for machine code"
     yield f"  computed    {path}{reason}"
     yield f"  tip         {machine.tip or 'none'}"
+    if machine.hydraulics is not None:
+        supply = machine.hydraulics.supply
+        flow = f", {6e4 * supply.flow:.4g} l/min at most" if supply.flow else ""
+        yield f"  hydraulics  {1e-5 * supply.pressure:.4g} bar{flow}"
+        for joint, cylinder in machine.hydraulics.cylinders.items():
+            valve = machine.hydraulics.valves[joint]
+            kind = "compensated valve" if valve.margin else "orifice valve"
+            unit = "cm2" if machine.unit(joint) == "m" else "cm3/rad"
+            size = 1e4 if unit == "cm2" else 1e6
+            yield (
+                f"    {joint:<{width}}{kind}, {size * cylinder.area_a:.4g} and "
+                f"{size * cylinder.area_b:.4g} {unit}"
+            )
     for task in machine.tasks.values():
         yield f"  task        {task.name}, {task.duration:g} s: {task.description}"

@@ -8,7 +8,17 @@ from typing import Annotated
 import typer
 
 import crane
-from crane.cli import commands, design, simulate  # noqa: F401  register their commands
+from crane.cli import (  # noqa: F401  register their commands
+    check,
+    circuit,
+    commands,
+    convert,
+    design,
+    live,
+    pictures,
+    simulate,
+    workspace,
+)
 from crane.cli.shared import app, say
 from crane.errors import CraneError, CraneWarning
 

@@ -31,7 +31,7 @@ def _place(text: str | Path) -> Path:
 
 MachineName = Annotated[
     str,
-    typer.Argument(metavar="MACHINE", help="A bundled name, a machine file, or a URDF."),
+    typer.Argument(metavar="MACHINE", help="A bundled name, a machine file, a URDF or a MJCF."),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite what is there.")]
 Out = Annotated[

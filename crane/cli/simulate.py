@@ -91,7 +91,7 @@ def _control(
 
 
 def _replay(machine: "Machine", inputs: Path, out: Path, step: float) -> None:
-    from crane.replay import replay
+    from crane.replays import replay
     from crane.runs import write_comparison
 
     with progress_bar("simulating") as progress:

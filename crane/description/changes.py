@@ -172,7 +172,7 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
             raise InputError(f"joint '{name}' to lock is unknown, {known(joints, name)}")
         _fix(joints[name], as_number(given, f"the coordinate to lock '{name}' at", ""))
     active = spec.active and tuple(name for name in spec.active if name not in lock)
-    if active == () or not joints.keys() - lock.keys():
+    if (spec.active and not active) or not joints.keys() - lock.keys():
         raise InputError(f"with {', '.join(lock)} locked nothing drives the machine, lock less")
     chains = tuple(
         dataclasses.replace(chain, joints=tuple(j for j in chain.joints if j not in lock))

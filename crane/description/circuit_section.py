@@ -4,6 +4,7 @@ import math
 from dataclasses import MISSING, fields
 from typing import Any, TypeVar
 
+from crane.description.findings import FollowUpError, kept, note
 from crane.description.hydraulics import (
     Counterbalance,
     Cylinder,
@@ -38,43 +39,57 @@ def read_hydraulics(top: Section, tree: Tree, active: tuple[str, ...]) -> Hydrau
     if section is None:
         return None
     section.only("supply", "oil", "cylinders", "valves", "control")
-    supply_section = section.section("supply", "'supply'")
-    if supply_section is None:
-        raise section.fail(None, "'hydraulics' has no 'supply', give its pressure")
-    supply_section.only(*numbers_of(Supply))
-    supply = _part(supply_section, Supply)
-    oil_section = section.section("oil", "'oil'")
+    supply = None
+    with kept():
+        supply_section = section.section("supply", "'supply'")
+        if supply_section is None:
+            raise section.fail(None, "'hydraulics' has no 'supply', give its pressure")
+        supply_section.only(*numbers_of(Supply))
+        supply = _part(supply_section, Supply)
     oil = Oil()
-    if oil_section is not None:
-        oil_section.only(*numbers_of(Oil))
-        oil = _part(oil_section, Oil)
+    with kept():
+        oil_section = section.section("oil", "'oil'")
+        if oil_section is not None:
+            oil_section.only(*numbers_of(Oil))
+            oil = _part(oil_section, Oil)
+    named: dict[str, list[str]] = {"cylinder": [], "valve": [], "control": []}
     cylinders: dict[str, Cylinder] = {}
     holding = ("counterbalance_a", "counterbalance_b")
     keys = (*numbers_of(Cylinder), *holding)
     for joint, item in section.mappings("cylinders", "cylinder of", *keys):
-        _check_joint(joint, item, active)
-        if not tree.has_limits(joint):
-            raise item.fail(
-                None, f"joint '{joint}' is continuous, a cylinder needs the limits of its stroke"
-            )
-        cylinders[joint] = _part(item, Cylinder, joint=joint, **_holding(item, holding))
+        named["cylinder"].append(joint)
+        with kept():
+            _check_joint(joint, item, active)
+            if not tree.has_limits(joint):
+                problem = (
+                    f"joint '{joint}' is continuous, a cylinder needs the limits of its stroke"
+                )
+                note(item.fail(None, problem))
+            cylinders[joint] = _part(item, Cylinder, joint=joint, **_holding(item, holding))
     valves: dict[str, Valve] = {}
     given = (*numbers_of(Valve), "type", "flow", "meter_out")
     for joint, item in section.mappings("valves", "valve of", *given):
-        _check_joint(joint, item, active)
-        valves[joint] = _valve(item, joint)
-    for joint in (*cylinders, *valves):
-        for parts, what in ((cylinders, "cylinder"), (valves, "valve")):
-            if joint not in parts:
-                raise section.fail(f"{what}s", f"'{joint}' has no {what}, add it")
+        named["valve"].append(joint)
+        with kept():
+            _check_joint(joint, item, active)
+            valves[joint] = _valve(item, joint)
+    for joint in (*named["cylinder"], *named["valve"]):
+        for what in ("cylinder", "valve"):
+            if joint not in named[what]:
+                note(section.fail(f"{what}s", f"'{joint}' has no {what}, add it"))
     control: dict[str, PDGains] = {}
     for joint, item in section.mappings("control", "control of", *numbers_of(PDGains)):
-        _check_joint(joint, item, active)
-        control[joint] = _part(item, PDGains)
-    if control and control.keys() != cylinders.keys():
-        raise section.fail("control", f"give gains of all of {', '.join(cylinders)}, or none")
-    if not cylinders:
-        raise section.fail(None, "'hydraulics' drives nothing, give cylinders and valves")
+        named["control"].append(joint)
+        with kept():
+            _check_joint(joint, item, active)
+            control[joint] = _part(item, PDGains)
+    if named["control"] and set(named["control"]) != set(named["cylinder"]):
+        listed = ", ".join(named["cylinder"])
+        note(section.fail("control", f"give gains of all of {listed}, or none"))
+    if not named["cylinder"]:
+        note(section.fail(None, "'hydraulics' drives nothing, give cylinders and valves"))
+    if supply is None or not cylinders.keys() == valves.keys() <= set(active):
+        raise FollowUpError("the circuit is not complete")
     order = [joint for joint in active if joint in cylinders]
     return Hydraulics(
         supply,

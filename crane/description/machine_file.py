@@ -2,9 +2,13 @@
 
 import copy
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, TypeVar
 
 from crane.description.circuit_section import read_hydraulics
+from crane.description.findings import Anything, FollowUpError, kept, note
+from crane.description.parallel_robots import is_parallel_robot, read_parallel_robot
 from crane.description.section import Section
 from crane.description.sources import find
 from crane.description.spec import (
@@ -18,12 +22,15 @@ from crane.description.spec import (
     LoopSpec,
     MachineSpec,
     PIGains,
+    Task,
     unit_vector,
 )
 from crane.description.tasks import read_tasks
 from crane.description.tree import Tree
-from crane.description.urdf import read_urdf
+from crane.description.urdf import is_urdf, read_urdf
 from crane.errors import CraneWarning, DescriptionError, known
+
+Part = TypeVar("Part")
 
 _KEYS = (
     "name", "source", "chains", "loops", "active", "home", "friction", "forces",
@@ -33,13 +40,20 @@ _KEYS = (
 
 
 def read(name: str | Path) -> MachineSpec:
-    """Read a machine by bundled name, path of a machine file, or path of a URDF.
+    """Read a machine by bundled name or path, in the format that the file has.
 
     Raises:
         DescriptionError: With file, line, what is wrong, and the names that exist.
     """
     path = find(name)
-    return _read_single(path) if path.suffix.lower() == ".urdf" else _read_machine(path)
+    suffix = path.suffix.lower()
+    if suffix == ".urdf" or (suffix in (".xml", ".mjcf") and is_urdf(path)):
+        return _read_single(path)
+    if suffix in (".xml", ".mjcf"):
+        from crane.description.mjcf import read_mjcf  # Pinocchio is in it
+
+        return read_mjcf(path)
+    return read_parallel_robot(path) if is_parallel_robot(path) else _read_machine(path)
 
 
 def _read_single(path: Path) -> MachineSpec:
@@ -48,14 +62,15 @@ def _read_single(path: Path) -> MachineSpec:
     tree = Tree()
     tree.add(chain, urdf)
     if not tree.joints:
-        raise DescriptionError(f"{path.name}: no joint moves in this file, add one")
+        note(DescriptionError(f"{path.name}: no joint moves in this file, add one"))
     for loop in urdf.loops:
-        tree.check_loop(loop)
-    if urdf.loops and not urdf.independent:
-        raise DescriptionError(
-            f"{urdf.loops[0].where}: a loop, but no joint is driven, mark those that are "
-            'with independent="true"'
-        )
+        with kept():
+            tree.check_loop(loop)
+    where = tree.where | _places(urdf.loops, urdf.couplings)
+    where |= {f"home {joint}": place for joint, place in urdf.home_lines.items()}
+    active = urdf.independent
+    if urdf.loops and not active:
+        active, where["active"] = (), urdf.loops[0].where
     return MachineSpec(
         name=urdf.robot.get("name"),
         source=path.name,
@@ -63,11 +78,12 @@ def _read_single(path: Path) -> MachineSpec:
         chains=(chain,),
         tree=tree.robot,
         loops=urdf.loops,
-        active=urdf.independent,
+        active=active,
+        home=urdf.home,
         friction=urdf.friction,
-        tip=tree.only_leaf(),
+        tip=tree.only_leaf() if urdf.tip is None else urdf.tip,
         couplings=urdf.couplings,
-        where=tree.where | _places(urdf.loops, urdf.couplings),
+        where=where,
     )
 
 
@@ -77,36 +93,60 @@ def _read_machine(path: Path) -> MachineSpec:
     chains, tree, friction, couplings = _chains(top, path)
     loops = _loops(top, tree)
     couplings += _couplings(top, tree)
-    active = top.names("active")
+    active: tuple[str, ...] = Anything()
+    with kept():
+        active = top.names("active") if "active" in top else ()
     for joint in active:
-        tree.check_joint(joint, top.where("active"))
-    if not active:
-        raise top.fail("active", "'active' is empty, name the driven joints")
+        with kept():
+            tree.check_joint(joint, top.where("active"))
+    if not all(joint in tree.joints for joint in active):
+        active = Anything()
     where = {key: top.where(key) for key in top} | tree.where
     where |= _places(loops, couplings)
     home = {}
-    if (section := top.section("home", "'home'")) is not None:
-        for joint in section:
+    section = None
+    with kept():
+        section = top.section("home", "'home'")
+    for joint in section or ():
+        assert section is not None
+        with kept():
             tree.check_joint(joint, section.where(joint))
             home[joint] = section.number(joint)
             where[f"home {joint}"] = section.where(joint)
-    friction |= _friction(top, tree)
-    forces = _forces(top, tree)
-    gas_springs = _gas_springs(top, tree)
-    end_stops = _end_stops(top, tree)
+    friction |= _part(_friction, {}, top, tree)
+    forces = _part(_forces, (), top, tree)
+    gas_springs = _part(_gas_springs, (), top, tree)
+    end_stops = _part(_end_stops, (), top, tree)
     tip = top.text("tip", None)
-    if tip is not None and tip not in tree.links:
-        raise top.fail("tip", f"the tip frame '{tip}' is unknown, {known(tree.links, tip)}")
-    if tip is not None and not tree.moves(tip):
-        raise top.fail("tip", f"the tip frame '{tip}' does not move, choose another")
-    payload = _payload(top, tree, tip)
-    hydraulics = read_hydraulics(top, tree, active)
-    tasks = read_tasks(top, active, tip, hydraulics.joints if hydraulics else ())
-    control = _control(top, active)
+    with kept(harmless=True):
+        if tip is not None:
+            tree.check_link(tip, top.where("tip"), "the tip frame")
+            if not tree.moves(tip):
+                raise top.fail("tip", f"the tip frame '{tip}' does not move, choose another")
+    payload = _part(_payload, None, top, tree, tip)
+    # a machine whose active joints are not named is not driven either: `load` proposes some
+    hydraulics = None
+    tasks: dict[str, Task] = {}
+    control: dict[str, PIGains] = {}
+    if active:
+        valves: tuple[str, ...] = Anything() if "hydraulics" in top else ()
+        with kept(harmless=True):
+            hydraulics = read_hydraulics(top, tree, active)
+            if hydraulics is not None and not isinstance(active, Anything):
+                valves = hydraulics.joints
+        tasks = _part(read_tasks, tasks, top, active, tip, valves)
+        control = _part(_control, control, top, active)
     return MachineSpec(
         name, source, path, chains, tree.robot, loops, active, home, friction, forces,
         gas_springs, end_stops, tip, tasks, control, hydraulics, couplings, where, payload,
     )  # fmt: skip
+
+
+def _part(read: Callable[..., Part], nothing: Any, *arguments: object) -> Part:
+    """A part that the machine can be assembled without, `nothing` where it is refused."""
+    with kept(harmless=True):
+        return read(*arguments)
+    return nothing
 
 
 def _chains(
@@ -117,62 +157,72 @@ def _chains(
     friction: dict[str, Friction] = {}
     couplings: tuple[Coupling, ...] = ()
     for item in top.sections("chains", "chain", "name", "urdf", "parent"):
-        name, parent, file = item.text("name"), item.text("parent", None), item.file("urdf")
-        if any(chain.name == name for chain in chains):
-            raise item.fail("name", f"two chains are named '{name}', rename one")
-        if chains and parent is None:
-            raise item.fail(None, f"chain '{name}' has no 'parent', name the frame it hangs from")
-        if not chains and parent is not None:
-            raise item.fail(
-                "parent", f"chain '{name}' is first and stands on the world, remove its 'parent'"
-            )
-        urdf = read_urdf(file)
-        chain = Chain(name, file, parent, item.where("parent"), urdf.moving)
-        if urdf.loops:
-            raise DescriptionError(
-                f"{urdf.loops[0].where}: a sub-chain has no <loop>, write it under 'loops' of "
-                f"{path.name}"
-            )
-        tree.add(chain, urdf)
-        chains.append(chain)
-        friction |= urdf.friction
-        couplings += urdf.couplings
-    if not chains:
-        raise top.fail("chains", "there are no chains, add one under 'chains:'")
-    if not tree.joints:
-        raise top.fail("chains", "no joint of these chains moves, add one")
+        tree.complete &= top.complete
+        so_far = tree.complete
+        tree.complete = False
+        with kept():
+            name, parent = item.text("name"), item.text("parent", None)
+            file = item.file("urdf")
+            if any(chain.name == name for chain in chains):
+                note(item.fail("name", f"two chains are named '{name}', rename one"))
+            elif (chains or not so_far) and parent is None:
+                problem = f"chain '{name}' has no 'parent', name the frame it hangs from"
+                note(item.fail(None, problem))
+            elif not chains and so_far and parent is not None:
+                problem = f"chain '{name}' is first and stands on the world, remove its 'parent'"
+                note(item.fail("parent", problem))
+                parent = None
+            urdf = read_urdf(file)
+            chain = Chain(name, file, parent, item.where("parent"), urdf.moving)
+            for loop in urdf.loops[:1]:
+                problem = f"a sub-chain has no <loop>, write it under 'loops' of {path.name}"
+                note(DescriptionError(f"{loop.where}: {problem}"))
+            tree.complete = so_far
+            tree.add(chain, urdf)
+            chains.append(chain)
+            friction |= urdf.friction
+            couplings += urdf.couplings
+    tree.complete &= top.complete
+    if not chains and tree.complete:
+        note(top.fail("chains", "there are no chains, add one under 'chains:'"))
+        tree.complete = False
+    if not tree.joints and tree.complete:
+        note(top.fail("chains", "no joint of these chains moves, add one"))
     return tuple(chains), tree, friction, couplings
 
 
 def _loops(top: Section, tree: Tree) -> tuple[LoopSpec, ...]:
     loops: dict[str, LoopSpec] = {}
     for item in top.sections("loops", "loop", "name", "type", "predecessor", "successor", "axis"):
-        loop = _loop(item, tree)
-        if loop.name in loops:
-            raise item.fail("name", f"two loops are named '{loop.name}', rename one")
-        loops[loop.name] = loop
+        with kept():
+            loop = _loop(item, tree)
+            if loop.name in loops:
+                raise item.fail("name", f"two loops are named '{loop.name}', rename one")
+            loops[loop.name] = loop
     return tuple(loops.values())
 
 
 def _loop(section: Section, tree: Tree) -> LoopSpec:
     name, kind = section.text("name"), section.text("type")
-    if kind not in LOOP_TYPES:
-        raise section.fail(
-            "type", f"loop '{name}' has the unknown type '{kind}', {known(LOOP_TYPES, kind)}"
-        )
+    what = f"loop '{name}'" if name else "a loop"
+    if kind and kind not in LOOP_TYPES:
+        problem = f"{what} has the unknown type '{kind}', {known(LOOP_TYPES, kind)}"
+        note(section.fail("type", problem))
     ends = []
     for end in ("predecessor", "successor"):
         frame = section.text(end)
-        if frame not in tree.links:
-            raise section.fail(
-                end, f"loop '{name}' has the unknown {end} '{frame}', {known(tree.links, frame)}"
-            )
+        if frame and frame not in tree.links and tree.complete:
+            problem = f"{what} has the unknown {end} '{frame}', {known(tree.links, frame)}"
+            note(section.fail(end, problem))
         ends.append(frame)
-    axis = unit_vector(section.numbers("axis", (0.0, 0.0, 1.0)))
-    if axis is None:
-        raise section.fail(
-            "axis", f"the axis of loop '{name}' is no direction, give three numbers, not all zero"
-        )
+    axis = None
+    with kept():
+        axis = unit_vector(section.numbers("axis", (0.0, 0.0, 1.0)))
+        if axis is None:
+            problem = f"the axis of {what} is no direction"
+            raise section.fail("axis", f"{problem}, give three numbers, not all zero")
+    if axis is None or kind not in LOOP_TYPES or not all(end in tree.links for end in ends):
+        raise FollowUpError(f"{what} is not complete")
     loop = LoopSpec(name, kind, ends[0], ends[1], axis, section.where())
     tree.check_loop(loop)
     return loop
@@ -187,18 +237,22 @@ def _places(loops: tuple[LoopSpec, ...], couplings: tuple[Coupling, ...]) -> dic
 def _couplings(top: Section, tree: Tree) -> tuple[Coupling, ...]:
     found: dict[str, Coupling] = {}
     for item in top.sections("couplings", "coupling", "name", "joints", "offset"):
-        name, joints = item.text("name"), item.section("joints", "'joints'")
-        if name in found:
-            raise item.fail("name", f"two couplings are named '{name}', rename one")
-        if joints is None or len(list(joints)) < 2:
-            raise item.fail("joints", f"coupling '{name}' joins less than two joints, add some")
-        factors = {}
-        for joint in joints:
-            tree.check_joint(joint, joints.where(joint))
-            factors[joint] = joints.number(joint)
-            if factors[joint] == 0:
-                raise joints.fail(joint, f"the factor of '{joint}' is 0, leave it out")
-        found[name] = Coupling(name, factors, item.number("offset", 0.0), item.where())
+        with kept():
+            name, joints = item.text("name"), item.section("joints", "'joints'")
+            if name in found:
+                raise item.fail("name", f"two couplings are named '{name}', rename one")
+            if joints is None or len(list(joints)) < 2:
+                problem = f"coupling '{name}' joins less than two joints, add some"
+                raise item.fail("joints", problem)
+            factors = {}
+            for joint in joints:
+                with kept():
+                    tree.check_joint(joint, joints.where(joint))
+                    factors[joint] = joints.number(joint)
+                    if factors[joint] == 0:
+                        problem = f"the factor of '{joint}' is 0, leave it out"
+                        raise joints.fail(joint, problem)
+            found[name] = Coupling(name, factors, item.number("offset", 0.0), item.where())
     return tuple(found.values())
 
 
@@ -209,32 +263,33 @@ def _friction(top: Section, tree: Tree) -> dict[str, Friction]:
         "stribeck",
     )  # fmt: skip
     for joint, item in top.mappings("friction", "friction of", *keys):
-        tree.check_joint(joint, item.where())
-        stribeck = item.number("stribeck", Friction.stribeck, minimum=0.0)
-        if stribeck == 0:
-            raise item.fail(
-                "stribeck", f"'stribeck' of friction of '{joint}' is 0, give a velocity"
-            )
-        friction = Friction(
-            coulomb=item.number("coulomb", 0.0, minimum=0.0),
-            coulomb_offset=item.number("coulomb_offset", 0.0),
-            viscous=item.number("viscous", 0.0, minimum=0.0),
-            viscous_offset=item.number("viscous_offset", 0.0),
-            smoothing=item.number("smoothing", Friction.smoothing, minimum=0.0),
-            stiction=item.number("stiction", 0.0, minimum=0.0),
-            stribeck=stribeck,
-        )
-        for kind in ("coulomb", "viscous"):
-            mean, offset = getattr(friction, kind), getattr(friction, f"{kind}_offset")
-            if abs(offset) > mean:
-                warnings.warn(
-                    f"{item.where()}: friction of '{joint}' drives the joint in one "
-                    f"direction (|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), "
-                    "a constant force may hide in it",
-                    CraneWarning,
-                    stacklevel=2,
+        with kept():
+            tree.check_joint(joint, item.where())
+            stribeck = item.number("stribeck", Friction.stribeck, minimum=0.0)
+            if stribeck == 0:
+                raise item.fail(
+                    "stribeck", f"'stribeck' of friction of '{joint}' is 0, give a velocity"
                 )
-        found[joint] = friction
+            friction = Friction(
+                coulomb=item.number("coulomb", 0.0, minimum=0.0),
+                coulomb_offset=item.number("coulomb_offset", 0.0),
+                viscous=item.number("viscous", 0.0, minimum=0.0),
+                viscous_offset=item.number("viscous_offset", 0.0),
+                smoothing=item.number("smoothing", Friction.smoothing, minimum=0.0),
+                stiction=item.number("stiction", 0.0, minimum=0.0),
+                stribeck=stribeck,
+            )
+            for kind in ("coulomb", "viscous"):
+                mean, offset = getattr(friction, kind), getattr(friction, f"{kind}_offset")
+                if abs(offset) > mean:
+                    warnings.warn(
+                        f"{item.where()}: friction of '{joint}' drives the joint in one "
+                        f"direction (|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), "
+                        "a constant force may hide in it",
+                        CraneWarning,
+                        stacklevel=2,
+                    )
+            found[joint] = friction
     return found
 
 
@@ -242,20 +297,21 @@ def _forces(top: Section, tree: Tree) -> tuple[ForceElement, ...]:
     forces = []
     keys = ("joint", "stiffness", "rest", "damping", "force")
     for item in top.sections("forces", "force element of", *keys):
-        element = ForceElement(
-            tree.joint(item),
-            stiffness=item.number("stiffness", 0.0, minimum=0.0),
-            rest=item.number("rest", 0.0),
-            damping=item.number("damping", 0.0, minimum=0.0),
-            force=item.number("force", 0.0),
-        )
-        if not (element.stiffness or element.damping or element.force):
-            raise item.fail(
-                None,
-                f"the element on '{element.joint}' does nothing, give it stiffness, damping "
-                "or force",
+        with kept():
+            element = ForceElement(
+                tree.joint(item),
+                stiffness=item.number("stiffness", 0.0, minimum=0.0),
+                rest=item.number("rest", 0.0),
+                damping=item.number("damping", 0.0, minimum=0.0),
+                force=item.number("force", 0.0),
             )
-        forces.append(element)
+            if not (element.stiffness or element.damping or element.force):
+                raise item.fail(
+                    None,
+                    f"the element on '{element.joint}' does nothing, give it stiffness, damping "
+                    "or force",
+                )
+            forces.append(element)
     return tuple(forces)
 
 
@@ -263,30 +319,34 @@ def _gas_springs(top: Section, tree: Tree) -> tuple[GasSpring, ...]:
     springs = []
     keys = ("area", "pressure", "volume", "rest", "exponent")
     for joint, item in top.mappings("gas_springs", "gas spring of", *keys):
-        tree.check_joint(joint, item.where())
-        area = item.number("area")
-        volume = item.number("volume", minimum=0.0)
-        exponent = item.number("exponent", GasSpring.exponent, minimum=0.0)
-        for key, value in (("area", area), ("volume", volume), ("exponent", exponent)):
-            if value == 0:
-                raise item.fail(key, f"'{key}' of gas spring of '{joint}' is 0, give one")
-        pressure, rest = item.number("pressure", minimum=0.0), item.number("rest", 0.0)
-        springs.append(GasSpring(joint, area, pressure, volume, rest, exponent))
+        with kept():
+            tree.check_joint(joint, item.where())
+            area = item.number("area")
+            volume = item.number("volume", minimum=0.0)
+            exponent = item.number("exponent", GasSpring.exponent, minimum=0.0)
+            for key, value in (("area", area), ("volume", volume), ("exponent", exponent)):
+                if value == 0:
+                    raise item.fail(key, f"'{key}' of gas spring of '{joint}' is 0, give one")
+            pressure, rest = item.number("pressure", minimum=0.0), item.number("rest", 0.0)
+            springs.append(GasSpring(joint, area, pressure, volume, rest, exponent))
     return tuple(springs)
 
 
 def _end_stops(top: Section, tree: Tree) -> tuple[EndStop, ...]:
     stops = []
     for joint, item in top.mappings("end_stops", "end stop of", "stiffness", "damping"):
-        tree.check_joint(joint, item.where())
-        if not tree.has_limits(joint):
-            raise item.fail(
-                None, f"joint '{joint}' is continuous, a stop needs limits: make it revolute"
-            )
-        stiffness = item.number("stiffness", minimum=0.0)
-        if stiffness == 0:
-            raise item.fail("stiffness", f"the end stop of '{joint}' has no stiffness, give one")
-        stops.append(EndStop(joint, stiffness, item.number("damping", 0.0, minimum=0.0)))
+        with kept():
+            tree.check_joint(joint, item.where())
+            if not tree.has_limits(joint):
+                raise item.fail(
+                    None, f"joint '{joint}' is continuous, a stop needs limits: make it revolute"
+                )
+            stiffness = item.number("stiffness", minimum=0.0)
+            if stiffness == 0:
+                raise item.fail(
+                    "stiffness", f"the end stop of '{joint}' has no stiffness, give one"
+                )
+            stops.append(EndStop(joint, stiffness, item.number("damping", 0.0, minimum=0.0)))
     return tuple(stops)
 
 
@@ -300,12 +360,10 @@ def _payload(top: Section, tree: Tree, tip: str | None) -> Chain | None:
         raise section.fail(None, "a payload hangs on the tip, name its frame under 'tip:'")
     urdf = read_urdf(section.file("urdf"))
     for joint in urdf.moving:
-        raise DescriptionError(
-            f"{urdf.lines['joint', joint]}: joint '{joint}' moves, a payload is rigid: "
-            "make it fixed"
-        )
+        problem = f"joint '{joint}' moves, a payload is rigid: make it fixed"
+        note(DescriptionError(f"{urdf.lines['joint', joint]}: {problem}"))
     for loop in urdf.loops:
-        raise DescriptionError(f"{loop.where}: a payload has no <loop>, remove it")
+        note(DescriptionError(f"{loop.where}: a payload has no <loop>, remove it"))
     if not sum(float(mass.get("value")) for mass in urdf.robot.iter("mass")):
         raise section.fail(
             "urdf", f"no link of {urdf.file.name} has a mass, give one an <inertial>"
@@ -316,12 +374,16 @@ def _payload(top: Section, tree: Tree, tip: str | None) -> Chain | None:
 
 
 def _control(top: Section, active: tuple[str, ...]) -> dict[str, PIGains]:
-    gains = {}
+    gains, named = {}, []
     for joint, item in top.mappings("control", "control of", "kp", "ki"):
-        if joint not in active:
-            raise item.fail(None, f"'{joint}' is not an active joint, {known(active, joint)}")
-        gains[joint] = PIGains(item.number("kp", minimum=0.0), item.number("ki", minimum=0.0))
-    missing = [joint for joint in active if gains and joint not in gains]
+        named.append(joint)
+        with kept():
+            if joint not in active:
+                raise item.fail(None, f"'{joint}' is not an active joint, {known(active, joint)}")
+        with kept():
+            kp, ki = (item.number(key, minimum=0.0) for key in ("kp", "ki"))
+            gains[joint] = PIGains(kp, ki)
+    missing = [joint for joint in active if named and joint not in named]
     if missing:
         raise top.fail("control", f"no gains for {', '.join(missing)}, give kp and ki of each")
     return gains

@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Iterable, Iterator
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, overload
 
 import yaml
 
+from crane.description.findings import kept, note
 from crane.errors import DescriptionError, known
 
 
@@ -37,19 +39,20 @@ def _construct_map(loader: _Loader, node: yaml.MappingNode) -> _Map:
         line = key_node.start_mark.line + 1
         where = f"{Path(loader.name).name}:{line}"
         if key_node.tag == "tag:yaml.org,2002:merge":
-            raise DescriptionError(f"{where}: '<<' is not supported, write the keys out")
+            note(DescriptionError(f"{where}: '<<' is not supported, write the keys out"))
+            continue
         key = loader.construct_object(key_node, deep=True)
         if not isinstance(key, str):
             number = isinstance(key, int) and not isinstance(key, bool)
             hint = ", and decimals with a point" if number else ""
-            raise DescriptionError(
-                f"{where}: key {_shown(key)} is not a name, write names in quotes{hint}"
-            )
+            problem = f"key {_shown(key)} is not a name, write names in quotes{hint}"
+            note(DescriptionError(f"{where}: {problem}"))
+            continue
         if key in data:
             first = data.lines[key]
-            raise DescriptionError(
-                f"{where}: key '{key}' is there twice (first in line {first}), keep one"
-            )
+            problem = f"key '{key}' is there twice (first in line {first}), keep one"
+            note(DescriptionError(f"{where}: {problem}"))
+            continue
         data[key] = loader.construct_object(value_node, deep=True)
         data.lines[key] = line
     return data
@@ -58,6 +61,7 @@ def _construct_map(loader: _Loader, node: yaml.MappingNode) -> _Map:
 _Loader.add_constructor("tag:yaml.org,2002:map", _construct_map)
 
 _MISSING: Any = object()
+_LARGEST = 2_000_000  # bytes of a file; the reader takes a minute for ten million
 
 
 def _shown(value: Any) -> str:
@@ -80,10 +84,14 @@ class Section:
         title: What it is, for errors ("loop 'A1_eye'").
         file: The file it stands in.
         line: Its line, if not the mapping's own.
+
+    Attributes:
+        complete: Whether no item of its lists had to be left out.
     """
 
     def __init__(self, data: _Map, title: str, file: Path, line: int | None = None):
         self._data, self._title, self._file = data, title, file
+        self.complete = True
         self._line = data.line if line is None else line
 
     @classmethod
@@ -94,6 +102,9 @@ class Section:
             DescriptionError: The file is missing, not YAML, or not a mapping of these keys.
         """
         try:
+            if file.stat().st_size > _LARGEST:
+                size = f"{file.stat().st_size / 1e6:.3g} MB, more than {_LARGEST / 1e6:g}"
+                raise DescriptionError(f"{file.name}: {size}, which takes too long, shorten it")
             with file.open(encoding="utf-8") as stream:
                 data = yaml.load(stream, _Loader)  # noqa: S506 (a SafeLoader)
         except UnicodeDecodeError:
@@ -124,11 +135,18 @@ class Section:
         """Raise for any other key.
 
         Raises:
-            DescriptionError: There is an unknown key; the nearest known one is named.
+            DescriptionError: There is an unknown key; the nearest known one is named. Where
+                findings are collected, what stands there is read as if it had that name.
         """
-        for key in self._data:
-            if key not in keys:
-                raise self.fail(key, f"unknown key '{key}' in {self._title}, {known(keys, key)}")
+        for key in [key for key in self._data if key not in keys]:
+            near = get_close_matches(key, keys, 1, 0.75)
+            near = near or [known for known in keys if known.lower() == key.lower()]
+            meant = bool(near) and near[0] not in self._data
+            problem = f"unknown key '{key}' in {self._title}, {known(keys, key)}"
+            note(self.fail(key, problem), harmless=True)
+            if meant:
+                self._data[near[0]] = self._data[key]
+                self._data.lines[near[0]] = self._data.lines[key]
 
     def where(self, key: str | None = None) -> str:
         """File and line of the section or of one of its keys."""
@@ -152,7 +170,14 @@ class Section:
     @overload
     def text(self, key: str, default: None) -> str | None: ...
     def text(self, key: str, default: str | None = _MISSING) -> str | None:
-        """A non-empty string."""
+        """A non-empty string; empty where it has been noted as wrong."""
+        try:
+            return self._text(key, default)
+        except DescriptionError as error:
+            note(error)
+            return ""
+
+    def _text(self, key: str, default: str | None) -> str | None:
         value = self._take(key, default)
         if value is default:
             return value
@@ -165,13 +190,17 @@ class Section:
         return value
 
     def number(self, key: str, default: float = _MISSING, minimum: float = -math.inf) -> float:
-        """A finite number, at least `minimum`."""
-        number = self._number(key, self._take(key, default))
-        if number < minimum:
-            raise self.fail(
-                key, f"'{key}' of {self._title} is {number:g}, give at least {minimum:g}"
-            )
-        return number
+        """A finite number, at least `minimum`; NaN where it has been noted as wrong."""
+        try:
+            number = self._number(key, self._take(key, default))
+            if number < minimum:
+                raise self.fail(
+                    key, f"'{key}' of {self._title} is {number:g}, give at least {minimum:g}"
+                )
+            return number
+        except DescriptionError as error:
+            note(error)
+            return math.nan
 
     def _number(self, key: str, value: Any) -> float:
         hint = "give a number"
@@ -215,6 +244,35 @@ class Section:
                 raise self.fail(key, f"'{key}' lists '{item}' twice, list it once")
         return tuple(value)
 
+    def texts(self, key: str) -> tuple[str, ...]:
+        """A list of texts, the same ones perhaps several times."""
+        value = self._take(key, _MISSING)
+        if not isinstance(value, list):
+            raise self.fail(
+                key, f"'{key}' of {self._title} is {_shown(value)}, give a list such as [a, b]"
+            )
+        for item in value:
+            if not isinstance(item, str) or not item.isprintable():
+                raise self.fail(key, f"'{key}' lists {_shown(item)}, which is no text, quote it")
+        return tuple(value)
+
+    def pairs(self, key: str) -> list[tuple[str, str]]:
+        """A list of pairs of names."""
+        value = self._take(key, _MISSING)
+        if not isinstance(value, list):
+            raise self.fail(
+                key, f"'{key}' of {self._title} is {_shown(value)}, give a list of pairs [[a, b]]"
+            )
+        for item in value:
+            if not (isinstance(item, list) and len(item) == 2):
+                raise self.fail(key, f"'{key}' lists {_shown(item)}, write pairs as [a, b]")
+            for name in item:
+                if not isinstance(name, str) or not name.isprintable():
+                    raise self.fail(
+                        key, f"'{key}' lists {_shown(name)}, which is not a name, quote it"
+                    )
+        return [(one, two) for one, two in value]
+
     def file(self, key: str) -> Path:
         """A file, named by its path from the folder of the machine file."""
         text = self.text(key)
@@ -242,16 +300,22 @@ class Section:
 
     def mappings(self, key: str, title: str, *keys: str) -> "Iterator[tuple[str, Section]]":
         """Names and mappings of a mapping of mappings with these keys."""
-        outer = self.section(key, f"'{key}'")
+        outer = None
+        with kept():
+            outer = self.section(key, f"'{key}'")
         for name in outer._data if outer is not None else ():
             assert outer is not None
-            inner = outer.section(name, f"{title} '{name}'")
-            if inner is None or not inner._data:
-                raise outer.fail(
-                    name, f"{title} '{name}' is empty, its keys are {', '.join(keys)}"
-                )
-            inner.only(*keys)
-            yield name, inner
+            inner = None
+            with kept():
+                inner = outer.section(name, f"{title} '{name}'")
+                if inner is None or not inner._data:
+                    inner = None
+                    raise outer.fail(
+                        name, f"{title} '{name}' is empty, its keys are {', '.join(keys)}"
+                    )
+            if inner is not None:
+                inner.only(*keys)
+                yield name, inner
 
     def sections(self, key: str, title: str, *keys: str) -> "Iterator[Section]":
         """The mappings of a list, with these keys; none where the list is absent."""
@@ -259,12 +323,16 @@ class Section:
         if value is None:
             return
         if not isinstance(value, list):
-            raise self.fail(key, f"'{key}' is {_shown(value)}, give a list, its items with '- '")
+            problem = f"'{key}' is {_shown(value)}, give a list, its items with '- '"
+            note(self.fail(key, problem))
+            self.complete = False
+            return
         for item in value:
             if not isinstance(item, _Map):
-                raise self.fail(
-                    key, f"'{key}' lists {_shown(item)}, write each item as {{key: value}}"
-                )
+                problem = f"'{key}' lists {_shown(item)}, write each item as {{key: value}}"
+                note(self.fail(key, problem))
+                self.complete = False
+                continue
             name = item.get("name", item.get("joint"))
             section = Section(
                 item, f"{title} '{name}'" if isinstance(name, str) else f"a {title}", self._file

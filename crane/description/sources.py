@@ -6,6 +6,8 @@ from pathlib import Path
 
 from crane.errors import DescriptionError, known
 
+SUFFIXES = (".yaml", ".yml", ".urdf", ".xml", ".mjcf")
+
 
 def _models() -> Path:
     package = Path(__file__).resolve().parents[1]
@@ -48,7 +50,7 @@ def find(name: str | Path) -> Path:
 
     Args:
         name: A bundled machine, a robot of example-robot-data, or a path that ends in .yaml,
-            .yml or .urdf.
+            .yml, .urdf, .xml or .mjcf, or of a folder with a robot.yaml.
 
     Raises:
         DescriptionError: There is none.
@@ -60,7 +62,9 @@ def find(name: str | Path) -> Path:
         raise DescriptionError(
             f"{path}: cannot be read ({error.strerror}), check the path"
         ) from None
-    if path.suffix.lower() in {".yaml", ".yml", ".urdf"}:
+    if is_folder and (path / "robot.yaml").is_file():  # as in example-parallel-robots
+        return (path / "robot.yaml").resolve()
+    if path.suffix.lower() in SUFFIXES:
         if is_file:
             return path.resolve()
         problem = "is a folder, give a file" if is_folder else "no such file, check the path"
@@ -72,7 +76,7 @@ def find(name: str | Path) -> Path:
         return robots[text]
     if is_file or is_folder:
         raise DescriptionError(
-            f"{path}: not a machine, give a machine file (.yaml) or a URDF (.urdf)"
+            f"{path}: not a machine, give a machine file (.yaml), a URDF (.urdf) or a MJCF (.xml)"
         )
     hint = known([*machines, *robots], text)
     if hint.startswith("known"):

@@ -256,7 +256,7 @@ class MachineSpec:
     chains: tuple[Chain, ...]
     tree: etree._Element  # all chains merged into one <robot>
     loops: tuple[LoopSpec, ...] = ()
-    active: tuple[str, ...] | None = None  # None: every joint of the tree
+    active: tuple[str, ...] | None = None  # None: every joint of the tree; (): not named
     home: Mapping[str, float] = field(default_factory=dict)
     friction: Mapping[str, Friction] = field(default_factory=dict)
     forces: tuple[ForceElement, ...] = ()

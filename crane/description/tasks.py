@@ -1,5 +1,6 @@
 """The section `tasks` of a machine file."""
 
+from crane.description.findings import Anything, kept, note
 from crane.description.section import Section
 from crane.description.spec import Task
 
@@ -15,31 +16,39 @@ def read_tasks(
     tasks = {}
     keys = ("description", "duration", "tip", "active", "joystick")
     for name, item in top.mappings("tasks", "task", *keys):
-        duration = item.number("duration", minimum=0.0)
-        if duration == 0:
-            raise item.fail("duration", f"task '{name}' takes no time, give a duration")
-        spaces = {"tip": ("x", "y", "z"), "active": active, "joystick": valves}
-        given = [
-            (space, section)
-            for space in spaces
-            if (section := item.section(space, f"'{space}' of task '{name}'")) is not None
-        ]
-        if len(given) != 1:
-            count = "more than one" if given else "none"
-            raise item.fail(
-                None, f"task '{name}' has {count} of 'tip', 'active', 'joystick', give one"
-            )
-        space, polynomials = given[0]
-        if space == "tip" and tip is None:
-            raise item.fail("tip", f"task '{name}' moves the tip, name its frame under 'tip:'")
-        polynomials.only(*spaces[space])
-        description = item.text("description", "")
-        if space == "joystick":
-            levers = {joint: _lever(polynomials, joint, duration) for joint in polynomials}
-            tasks[name] = Task(name, description, duration, space, {}, levers)
-            continue
-        coefficients = {key: polynomials.numbers(key) for key in spaces[space]}
-        tasks[name] = Task(name, description, duration, space, coefficients)
+        with kept():
+            duration = item.number("duration", minimum=0.0)
+            if duration == 0:
+                note(item.fail("duration", f"task '{name}' takes no time, give a duration"))
+            spaces = {"tip": ("x", "y", "z"), "active": active, "joystick": valves}
+            given = [
+                (space, section)
+                for space in spaces
+                if (section := item.section(space, f"'{space}' of task '{name}'")) is not None
+            ]
+            if len(given) != 1:
+                count = "more than one" if given else "none"
+                raise item.fail(
+                    None, f"task '{name}' has {count} of 'tip', 'active', 'joystick', give one"
+                )
+            space, polynomials = given[0]
+            if space == "tip" and tip is None:
+                raise item.fail("tip", f"task '{name}' moves the tip, name its frame under 'tip:'")
+            if not isinstance(spaces[space], Anything):
+                polynomials.only(*spaces[space])
+            description = item.text("description", "")
+            if space == "joystick":
+                levers = {}
+                for joint in polynomials:
+                    with kept():
+                        levers[joint] = _lever(polynomials, joint, duration)
+                tasks[name] = Task(name, description, duration, space, {}, levers)
+                continue
+            coefficients = {}
+            for key in spaces[space]:
+                with kept():
+                    coefficients[key] = polynomials.numbers(key)
+            tasks[name] = Task(name, description, duration, space, coefficients)
     return tasks
 
 

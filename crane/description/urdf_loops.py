@@ -5,13 +5,16 @@ from dataclasses import dataclass
 
 from lxml import etree
 
+from crane.description.findings import FollowUpError, kept, note
 from crane.description.series import SEVERAL, names_of, parts_of
 from crane.description.spec import LoopSpec
 from crane.description.xml import XmlFile
-from crane.errors import known
+from crane.errors import CraneError, known
 
-# Those of URDF+, whose "continuous" is a revolute joint: a loop has no limits.
-_TYPES = ("fixed", "revolute", "continuous", "prismatic", "spherical", "planar")
+# Those of URDF+, whose "continuous" is a revolute joint (a loop has no limits), and cylindrical.
+_TYPES = (
+    "fixed", "revolute", "continuous", "prismatic", "spherical", "planar", "cylindrical",
+)  # fmt: skip
 _X = (1.0, 0.0, 0.0)  # axis of a URDF joint that names none
 
 Placement = tuple[tuple[float, ...], tuple[float, ...]]
@@ -49,50 +52,92 @@ def read_loops(
     """
     loops, frames = [], []
     for name, element in elements.items():
-        what, where = f"loop '{name}'", xml.where(element)
-        kind = element.get("type", "")
-        if kind not in _TYPES:
-            problem = f"the unknown type '{kind}'" if kind else "no type"
-            raise xml.fail(element, f"{what} has {problem}, {known(_TYPES, kind or None)}")
-        ends = []
-        for end in ("predecessor", "successor"):
-            tag = xml.only(element, end, what)
-            link = "" if tag is None else tag.get("link", "").strip()
-            if not link:
-                raise xml.fail(element, f'{what} has no {end}, add <{end} link="..."/>')
-            if link not in links:
-                raise xml.fail(tag, f"{what} has the unknown {end} '{link}', {known(links, link)}")
-            if f"{name}_{end}" in links:
-                raise xml.fail(
-                    links[f"{name}_{end}"],
-                    f"link '{name}_{end}' has the name of a frame of {what}, rename one",
-                )
-            placement = xml.placement(tag, f"the {end} of {what}")
-            ends.append(LoopFrame(f"{name}_{end}", link, placement, where))
-        axis = xml.direction(element, what, _X)
-        kind = "revolute" if kind == "continuous" else kind
-        loops.append(LoopSpec(name, kind, ends[0].name, ends[1].name, axis, where))
-        frames += ends
+        with kept():
+            loop, ends = _loop(xml, name, element, links)
+            loops.append(loop)
+            frames += ends
     return tuple(loops), tuple(frames)
+
+
+def _loop(
+    xml: XmlFile, name: str, element: etree._Element, links: Mapping[str, etree._Element]
+) -> tuple[LoopSpec, list[LoopFrame]]:
+    what, where = f"loop '{name}'", xml.where(element)
+    kind = element.get("type", "")
+    if kind not in _TYPES:
+        problem = f"the unknown type '{kind}'" if kind else "no type"
+        note(xml.fail(element, f"{what} has {problem}, {known(_TYPES, kind or None)}"))
+    ends = []
+    for end in ("predecessor", "successor"):
+        tag = xml.only(element, end, what)
+        link = "" if tag is None else tag.get("link", "").strip()
+        if not link:
+            note(xml.fail(element, f'{what} has no {end}, add <{end} link="..."/>'))
+            continue
+        if link not in links:
+            with kept():
+                raise unknown_link(xml, tag, f"{what} has the unknown {end}", link, links)
+        if f"{name}_{end}" in links:
+            named = links[f"{name}_{end}"]
+            problem = f"link '{name}_{end}' has the name of a frame of {what}, rename one"
+            note(xml.fail(named, problem))
+        placement = xml.placement(tag, f"the {end} of {what}")
+        ends.append(LoopFrame(f"{name}_{end}", link, placement, where))
+    axis = xml.direction(element, what, _X)
+    known_ends = [end for end in ends if end.link in links and end.name not in links]
+    if kind not in _TYPES or len(known_ends) < 2:
+        raise FollowUpError(f"{what} is not complete")
+    kind = "revolute" if kind == "continuous" else kind
+    return LoopSpec(name, kind, ends[0].name, ends[1].name, axis, where), ends
+
+
+def unknown_link(
+    xml: XmlFile,
+    tag: etree._Element,
+    what: str,
+    link: str,
+    links: Mapping[str, etree._Element],
+) -> CraneError:
+    """The error about a link that is not there, unless one has lost its name."""
+    if "link" in xml.nameless:
+        return FollowUpError(f"link '{link}' may be the one without a name")
+    return xml.fail(tag, f"{what} '{link}', {known(links, link)}")
 
 
 def independent(xml: XmlFile, joints: Mapping[str, etree._Element]) -> tuple[str, ...] | None:
     """Moving joints marked `independent="true"`; None where no joint has the attribute.
+
+    Where some are marked "false", those without a mark are independent, as in URDF+.
 
     Raises:
         DescriptionError: The attribute is neither true nor false, or stands on a fixed joint.
     """
     marked = {name: joint for name, joint in joints.items() if "independent" in joint.attrib}
     for name, joint in marked.items():
-        value = joint.get("independent")
+        value = joint.get("independent").lower()  # the authors' own files have "True"
+        joint.set("independent", value)
         if value not in ("true", "false"):
-            raise xml.fail(
-                joint, f"independent=\"{value}\" of joint '{name}' is neither true nor false"
-            )
+            problem = f"independent=\"{value}\" of joint '{name}' is neither true nor false"
+            note(xml.fail(joint, problem))
+            value = "true"
+            joint.set("independent", value)
         if value == "true" and joint.get("type") == "fixed":
-            raise xml.fail(joint, f"joint '{name}' is fixed and independent, keep one of the two")
+            note(xml.fail(joint, f"joint '{name}' is fixed and independent, keep one of the two"))
+            joint.set("independent", "false")
     if not marked:
         return None
+    values = {joint.get("independent") for joint in marked.values()}
+    if values == {"true", "false"} or (values == {"false"} and xml.root.find("loop") is None):
+        # as URDF+ has it: those without a mark are independent, too
+        passive = (
+            joint.find("mimic") is not None or joint.get("type") == "fixed"
+            for joint in joints.values()
+        )
+        marked = {
+            name: joint
+            for (name, joint), follows in zip(joints.items(), passive, strict=True)
+            if name in marked or not follows
+        }
     out: list[str] = []
     for name, joint in marked.items():
         kind = joint.get("type")

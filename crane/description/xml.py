@@ -7,8 +7,12 @@ from pathlib import Path
 
 from lxml import etree
 
+from crane.description.findings import note
 from crane.description.spec import unit_vector
 from crane.errors import DescriptionError, known
+
+_X = (1.0, 0.0, 0.0)
+_SEVERAL = {"link", "joint", "loop", "visual", "collision"}  # elements that there may be more of
 
 
 class XmlFile:
@@ -20,6 +24,7 @@ class XmlFile:
     Attributes:
         file: The file.
         root: Its root element, without comments.
+        nameless: Kinds of elements of which one has no name of its own.
 
     Raises:
         DescriptionError: The file cannot be read, is not XML, or has a document type.
@@ -27,6 +32,7 @@ class XmlFile:
 
     def __init__(self, file: Path):
         self.file = file
+        self.nameless: set[str] = set()
         try:
             data = file.read_bytes()
         except OSError as error:
@@ -75,7 +81,8 @@ class XmlFile:
         """Raise for tags and attributes that are slips of known ones, or in a wrong place.
 
         Foreign ones (sensors, settings of simulators) are common and ignored, apart from
-        attributes of the elements `exact`.
+        attributes of the elements `exact`. Where findings are collected, slips are mended, so
+        that what stands there is read, too.
 
         Args:
             element: Where to begin.
@@ -91,19 +98,29 @@ class XmlFile:
             if key in allowed:
                 continue
             near = get_close_matches(key.lower(), allowed, 1, 0.75)
-            if element.tag in exact or (near and element.get(near[0]) is None):
+            meant = bool(near) and element.get(near[0]) is None
+            if element.tag in exact or meant:
                 hint = known(allowed, key.lower())
-                raise self.fail(element, f'unknown {key}="..." in <{element.tag}>, {hint}')
+                problem = f'unknown {key}="..." in <{element.tag}>, {hint}'
+                note(self.fail(element, problem), harmless=meant)
+            if meant:
+                element.set(near[0], element.attrib.pop(key))
         tags = children.get(element.tag, set())
         for child in element:
             if not isinstance(child.tag, str):  # an entity, not expanded
                 continue
+            near = [] if child.tag in tags else get_close_matches(child.tag.lower(), tags, 1, 0.75)
+            if near:
+                hint = known(tags, child.tag.lower())
+                meant = near[0] in _SEVERAL or element.find(near[0]) is None
+                problem = f"unknown <{child.tag}> in <{element.tag}>, {hint}"
+                note(self.fail(child, problem), harmless=meant)
+                if meant:
+                    child.tag = near[0]
+            elif child.tag not in tags and any(child.tag in x for x in children.values() if tags):
+                note(self.fail(child, f"<{child.tag}> has no place in <{element.tag}>, move it"))
             if child.tag in tags:
                 self.check(child, children, attributes, exact)
-            elif (hint := known(tags, child.tag.lower())).startswith("did"):
-                raise self.fail(child, f"unknown <{child.tag}> in <{element.tag}>, {hint}")
-            elif tags and any(child.tag in others for others in children.values()):
-                raise self.fail(child, f"<{child.tag}> has no place in <{element.tag}>, move it")
 
     def only(self, element: etree._Element, tag: str, what: str) -> etree._Element | None:
         """The child with a tag, if there is one.
@@ -113,7 +130,7 @@ class XmlFile:
         """
         found = element.findall(tag)
         if len(found) > 1:
-            raise self.fail(found[1], f"{what} has {len(found)} <{tag}>, keep one")
+            note(self.fail(found[1], f"{what} has {len(found)} <{tag}>, keep one"))
         return found[0] if found else None
 
     def number(
@@ -128,7 +145,8 @@ class XmlFile:
             default: Value of a missing attribute; None if it must not be missing.
 
         Raises:
-            DescriptionError: Missing, not a number or not finite.
+            DescriptionError: Missing, not a number or not finite. Where findings are collected,
+                it is noted, and the number is NaN.
         """
         return self.vector(element, name, what, 1, None if default is None else (default,))[0]
 
@@ -141,6 +159,20 @@ class XmlFile:
         default: tuple[float, ...] | None = None,
     ) -> tuple[float, ...]:
         """Finite numbers, as `number`."""
+        try:
+            return self._vector(element, name, what, length, default)
+        except DescriptionError as error:
+            note(error)
+            return (math.nan,) * length
+
+    def _vector(
+        self,
+        element: etree._Element,
+        name: str,
+        what: str,
+        length: int,
+        default: tuple[float, ...] | None,
+    ) -> tuple[float, ...]:
         text = element.get(name)
         if text is None:
             if default is None:
@@ -174,7 +206,8 @@ class XmlFile:
         axis = self.only(element, "axis", what)
         xyz = default if axis is None else self.vector(axis, "xyz", f"the axis of {what}", 3)
         if (unit := unit_vector(xyz)) is None:
-            raise self.fail(axis, f"the axis of {what} is zero, give a direction")
+            note(self.fail(axis, f"the axis of {what} is zero, give a direction"))
+            return _X
         return unit
 
     def placement(

@@ -1,0 +1,242 @@
+"""A machine file with a URDF per sub-chain."""
+
+import dataclasses
+import math
+import shutil
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pinocchio as pin
+from lxml import etree
+
+from crane.description import Chain, Hydraulics, Task, Valve, read
+from crane.description.circuit_section import numbers_of
+from crane.description.clean import add_joint, add_link
+from crane.errors import CraneError, CraneWarning, InputError, OutputError
+from crane.formats.parts import Parts, finished, origin_of
+from crane.machine import Machine
+from crane.output import file_name, staging
+
+
+def write_machine(machine: Machine, folder: str | Path) -> Path:
+    """Write a machine as a machine file, with one URDF per sub-chain beside it.
+
+    Args:
+        machine: The machine, as it is: with its changes, locks and payload.
+        folder: Created where there is none; files of the same names are replaced.
+
+    Returns:
+        The machine file.
+
+    Raises:
+        InputError: A coupling holds a single joint.
+        OutputError: The folder cannot be written, or holds what the machine was read from.
+    """
+    chains = _Chains(machine)
+    name = file_name(machine.name)
+    file = f"{name}.yaml"
+    data = _content(machine, chains)
+    load = _payload(machine)
+    if load is not None:
+        data["payload"] = {"urdf": load.name}
+    originals = {machine.path, *(chain.urdf for chain in machine.chains)}
+    for written in (file, *chains.files.values()):
+        if (place := (Path(folder) / written).resolve()) in originals:
+            raise OutputError(
+                f"{place}: is what '{machine.name}' was read from, choose another folder"
+            )
+    with staging(folder) as part:
+        for chain in chains.names:
+            content = finished(chains.robot(chain), origin_of(machine))
+            (part / chains.files[chain]).write_bytes(content)
+        if load is not None:
+            shutil.copyfile(load, part / load.name)
+        (part / file).write_text(_yaml(data), encoding="utf-8")
+    return Path(folder) / file
+
+
+class _Chains:
+    """The sub-chains, cut at their attachments again.
+
+    Args:
+        machine: The machine.
+    """
+
+    def __init__(self, machine: Machine):
+        self.machine, self.parts = machine, Parts(machine)
+        self.chains = [chain for chain in machine.chains if chain.name != "payload"]
+        self.names = [chain.name for chain in self.chains]
+        self.files = {name: f"{i}_{file_name(name)}.urdf" for i, name in enumerate(self.names, 1)}
+        self.roots: dict[str, str] = {self.names[0]: self.parts.links[0]}
+        self.parents: dict[str, str] = {}
+        attached = {f"{chain.name}_attachment": chain for chain in self.chains[1:]}
+        for frame in self.parts.frames:
+            if (chain := attached.get(frame.fixed)) is not None:
+                self.roots[chain.name] = frame.name
+                self.parents[chain.name] = str(chain.parent)
+        self._frames = {frame.name: frame for frame in self.parts.frames}
+        self._chain_of: dict[str, str] = {root: name for name, root in self.roots.items()}
+        model = self.parts.model
+        for frame in model.frames:  # parents stand before their children
+            if frame.type != pin.FrameType.BODY or frame.name in self._chain_of:
+                continue
+            above = model.frames[model.frames[frame.parentFrame].parentFrame]
+            self._chain_of[frame.name] = self._chain_of.get(above.name, self.names[0])
+
+    def robot(self, chain: str) -> etree._Element:
+        """The URDF of a sub-chain."""
+        parts, model = self.parts, self.parts.model
+        robot = etree.Element("robot", name=chain)
+        root = self.roots[chain]
+        base = self._frames[root].place if root in self._frames else pin.SE3.Identity()
+        foot = self._frames[root].joint if root in self._frames else 0
+        if root in self._frames:
+            add_link(robot, root)
+        else:
+            parts.write_link(robot, 0)
+        joints = [i for i in parts.joints if self._chain_of[parts.links[i]] == chain]
+        for joint in joints:
+            parts.write_link(robot, joint)
+            parent, place = model.parents[joint], model.jointPlacements[joint]
+            if parent in joints:
+                parts.write_joint(robot, joint, parts.links[parent], place)
+            else:
+                parts.write_joint(robot, joint, root, base.actInv(place))
+        for frame in parts.frames:
+            if self._chain_of[frame.name] != chain or frame.name == root:
+                continue
+            add_link(robot, frame.name)
+            if frame.joint in joints:
+                parent, place = parts.links[frame.joint], frame.place
+            else:
+                assert frame.joint == foot, "a frame of the chain's root"
+                parent, place = root, base.actInv(frame.place)
+            add_joint(robot, frame.fixed, "fixed", place, (parent, frame.name))
+        parts.draw(robot, [chain])
+        return robot
+
+
+def _content(machine: Machine, chains: _Chains) -> dict[str, Any]:
+    """The machine file, without the payload."""
+    data: dict[str, Any] = {"name": machine.name}
+    if machine.source:
+        data["source"] = machine.source
+    data["chains"] = []
+    for name in chains.names:
+        parent = {"parent": chains.parents[name]} if name in chains.parents else {}
+        data["chains"].append({"name": name, "urdf": chains.files[name], **parent})
+    equations = machine.closure.equations
+    data["loops"] = [
+        {
+            "name": loop.name, "type": loop.type, "predecessor": loop.predecessor,
+            "successor": loop.successor, "axis": [float(x) for x in loop.axis],
+        }
+        for loop in equations.loops
+    ]  # fmt: skip
+    data["couplings"] = []
+    for coupling in equations.couplings:
+        if len(coupling.factors) < 2:
+            raise InputError(
+                f"coupling '{coupling.name}' holds {next(iter(coupling.factors))} alone, lock "
+                "that joint instead (--lock)"
+            )
+        item = {"name": coupling.name, "joints": dict(coupling.factors)}
+        data["couplings"].append(item | ({"offset": coupling.offset} if coupling.offset else {}))
+    data["active"] = list(machine.active)
+    data["home"] = dict(zip(machine.joints, machine.home.tolist(), strict=True))
+    data["friction"] = {
+        joint: _numbers(law) or {"viscous": 0.0} for joint, law in machine.friction.items()
+    }
+    data["forces"] = [_numbers(item) for item in machine.forces]
+    data["gas_springs"] = {item.joint: _numbers(item, "joint") for item in machine.gas_springs}
+    data["end_stops"] = {item.joint: _numbers(item, "joint") for item in machine.end_stops}
+    data["tip"] = machine.tip
+    data["tasks"] = {name: _task(task) for name, task in machine.tasks.items()}
+    data["control"] = {joint: _numbers(gains) for joint, gains in machine.control.items()}
+    if machine.hydraulics is not None:
+        data["hydraulics"] = _hydraulics(machine.hydraulics)
+    return {key: value for key, value in data.items() if value not in (None, [], {})}
+
+
+def _numbers(item: Any, *without: str) -> dict[str, Any]:
+    """What of a dataclass is not as by default."""
+    return {
+        field.name: getattr(item, field.name)
+        for field in dataclasses.fields(item)
+        if field.name not in without and getattr(item, field.name) != field.default
+    }
+
+
+def _task(task: Task) -> dict[str, Any]:
+    data: dict[str, Any] = {"description": task.description} if task.description else {}
+    data["duration"] = task.duration
+    if task.space == "joystick":
+        levers = {
+            joint: [x for point in polygon for x in point]
+            for joint, polygon in task.levers.items()
+        }
+        return data | {"joystick": levers}
+    return data | {task.space: {key: list(row) for key, row in task.coefficients.items()}}
+
+
+def _hydraulics(circuit: Hydraulics) -> dict[str, Any]:
+    def numbers(part: Any) -> dict[str, Any]:
+        return {name: getattr(part, name) for name in numbers_of(type(part))}
+
+    cylinders = {}
+    for joint, cylinder in circuit.cylinders.items():
+        cylinders[joint] = numbers(cylinder)
+        for key in ("counterbalance_a", "counterbalance_b"):
+            if (holding := getattr(cylinder, key)) is not None:
+                cylinders[joint][key] = numbers(holding)
+    data = {
+        "supply": numbers(circuit.supply),
+        "oil": numbers(circuit.oil),
+        "cylinders": cylinders,
+        "valves": {joint: _valve(valve) for joint, valve in circuit.valves.items()},
+    }
+    if circuit.control:
+        data["control"] = {joint: numbers(gains) for joint, gains in circuit.control.items()}
+    return data
+
+
+def _valve(valve: Valve) -> dict[str, Any]:
+    edges = ("c1", "c2", "c3", "c4")
+    rest = {
+        name: getattr(valve, name) for name in numbers_of(Valve) if name not in (*edges, "margin")
+    }
+    if not valve.margin:
+        return {"type": "orifice", **{name: getattr(valve, name) for name in edges}, **rest}
+    if (valve.c1, valve.c2) != (valve.c4, valve.c3):
+        raise InputError(
+            f"the compensated valve of '{valve.joint}' has other numbers for either direction, "
+            "for which a machine file has no place"
+        )
+    flow = valve.c1 * math.sqrt(valve.margin)
+    given = {"flow": flow, "margin": valve.margin, "meter_out": valve.c2}
+    return {"type": "compensated", **given, **rest}
+
+
+def _payload(machine: Machine) -> Path | None:
+    """The file of the load that the machine can carry, None where there is none, or it does."""
+    if machine.path.suffix.lower() not in (".yaml", ".yml") or "payload.mass" in machine.changes:
+        return None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CraneWarning)
+            load: Chain | None = read(machine.path).payload
+    except CraneError:  # its files are gone
+        return None
+    return None if load is None else load.urdf
+
+
+def _yaml(data: Mapping[str, Any]) -> str:
+    import yaml
+
+    return str(
+        yaml.safe_dump(
+            dict(data), sort_keys=False, allow_unicode=True, width=100, default_flow_style=None
+        )
+    )

@@ -1,0 +1,44 @@
+"""Valid files with bytes changed, by the thousand: read, or refused in one line.
+
+What counts as well is in fuzz.py: an error of the package or a closed machine, within 5 s, that is
+the same as before exactly if another parser finds the same words and numbers in the file.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FORMATS = ("machine", "urdf", "urdf+", "parallel", "mjcf")
+
+
+def run(kind, first, count):
+    """Judge changed files in a process of its own, which some of them may end."""
+    if kind == "mjcf":
+        pytest.importorskip("mujoco")
+    program = Path(__file__).with_name("fuzz.py")
+    done = subprocess.run(
+        [sys.executable, str(program), kind, str(first), str(count)],
+        capture_output=True, text=True, timeout=1800,
+        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+    )  # fmt: skip
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    wrong = [line for line in lines if "wrong" in line]
+    assert not wrong, wrong[:5]
+    assert done.returncode == 0, f"ended at {lines[-1:]}: {done.stderr[-600:]}"
+    assert lines[-1] == {"done": count}
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_some_changed_files(kind):
+    run(kind, 0, 150)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(2))
+@pytest.mark.parametrize("kind", FORMATS)
+def test_five_thousand_changed_files(kind, part):
+    run(kind, 2500 * part, 2500)
