@@ -16,7 +16,7 @@ MACHINES = {  # file, degrees of freedom, how far the tests go from home [m], [r
     "four_bar": ("four_bar_loop.urdf", 1, 0.3),
     "five_bar": ("five_bar.urdf", 2, 0.3),
     "six_bar": ("six_bar.urdf", 1, 0.3),
-    "planar_leg": ("planar_leg.urdf", 2, 0.2),
+    "planar_leg": ("planar_leg.urdf", 2, 0.12),
     "delta": ("delta", 3, 0.3),
     "stewart": ("stewart.xml", 6, 0.05),
     "sarrus": ("sarrus.urdf", 1, 0.2),

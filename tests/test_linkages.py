@@ -37,7 +37,7 @@ def test_accelerations_are_those_of_the_tree_with_multipliers(case):
         tau[closure.active] = tau_a
         a = multipliers(machine, q, closure.gamma(q) @ v_a, tau)[closure.active]
         ours = dynamics.forward(q_a, v_a, tau_a)
-        np.testing.assert_allclose(ours, a, rtol=0, atol=1e-8 * np.abs(a).max())
+        np.testing.assert_allclose(ours, a, rtol=0, atol=1e-10 * np.abs(a).max())
 
 
 def test_accelerations_are_those_of_constraint_dynamics(case):
@@ -51,7 +51,7 @@ def test_accelerations_are_those_of_constraint_dynamics(case):
         tau[closure.active] = tau_a
         a = constraint_dynamics(machine, q, closure.gamma(q) @ v_a, tau, mu=1e-6)[closure.active]
         ours = dynamics.forward(q_a, v_a, tau_a)
-        np.testing.assert_allclose(ours, a, rtol=0, atol=1e-5 * np.abs(a).max())
+        np.testing.assert_allclose(ours, a, rtol=0, atol=1e-10 * np.abs(a).max())
 
 
 def energy_is_kept(name):

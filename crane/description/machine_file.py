@@ -1,13 +1,18 @@
 """Machine files and single URDFs, read and checked into a `MachineSpec`."""
 
 import copy
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
 from crane.description.circuit_section import read_hydraulics
 from crane.description.findings import Anything, FollowUpError, kept, note
+from crane.description.forces_section import (
+    read_end_stops,
+    read_forces,
+    read_friction,
+    read_gas_springs,
+)
 from crane.description.parallel_robots import is_parallel_robot, read_parallel_robot
 from crane.description.section import Section
 from crane.description.sources import find
@@ -15,10 +20,7 @@ from crane.description.spec import (
     LOOP_TYPES,
     Chain,
     Coupling,
-    EndStop,
-    ForceElement,
     Friction,
-    GasSpring,
     LoopSpec,
     MachineSpec,
     PIGains,
@@ -28,7 +30,7 @@ from crane.description.spec import (
 from crane.description.tasks import read_tasks
 from crane.description.tree import Tree
 from crane.description.urdf import is_urdf, read_urdf
-from crane.errors import CraneWarning, DescriptionError, known
+from crane.errors import DescriptionError, known
 
 Part = TypeVar("Part")
 
@@ -113,10 +115,10 @@ def _read_machine(path: Path) -> MachineSpec:
             tree.check_joint(joint, section.where(joint))
             home[joint] = section.number(joint)
             where[f"home {joint}"] = section.where(joint)
-    friction |= _part(_friction, {}, top, tree)
-    forces = _part(_forces, (), top, tree)
-    gas_springs = _part(_gas_springs, (), top, tree)
-    end_stops = _part(_end_stops, (), top, tree)
+    friction |= _part(read_friction, {}, top, tree)
+    forces = _part(read_forces, (), top, tree)
+    gas_springs = _part(read_gas_springs, (), top, tree)
+    end_stops = _part(read_end_stops, (), top, tree)
     tip = top.text("tip", None)
     with kept(harmless=True):
         if tip is not None:
@@ -254,100 +256,6 @@ def _couplings(top: Section, tree: Tree) -> tuple[Coupling, ...]:
                         raise joints.fail(joint, problem)
             found[name] = Coupling(name, factors, item.number("offset", 0.0), item.where())
     return tuple(found.values())
-
-
-def _friction(top: Section, tree: Tree) -> dict[str, Friction]:
-    found: dict[str, Friction] = {}
-    keys = (
-        "coulomb", "coulomb_offset", "viscous", "viscous_offset", "smoothing", "stiction",
-        "stribeck",
-    )  # fmt: skip
-    for joint, item in top.mappings("friction", "friction of", *keys):
-        with kept():
-            tree.check_joint(joint, item.where())
-            stribeck = item.number("stribeck", Friction.stribeck, minimum=0.0)
-            if stribeck == 0:
-                raise item.fail(
-                    "stribeck", f"'stribeck' of friction of '{joint}' is 0, give a velocity"
-                )
-            friction = Friction(
-                coulomb=item.number("coulomb", 0.0, minimum=0.0),
-                coulomb_offset=item.number("coulomb_offset", 0.0),
-                viscous=item.number("viscous", 0.0, minimum=0.0),
-                viscous_offset=item.number("viscous_offset", 0.0),
-                smoothing=item.number("smoothing", Friction.smoothing, minimum=0.0),
-                stiction=item.number("stiction", 0.0, minimum=0.0),
-                stribeck=stribeck,
-            )
-            for kind in ("coulomb", "viscous"):
-                mean, offset = getattr(friction, kind), getattr(friction, f"{kind}_offset")
-                if abs(offset) > mean:
-                    warnings.warn(
-                        f"{item.where()}: friction of '{joint}' drives the joint in one "
-                        f"direction (|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), "
-                        "a constant force may hide in it",
-                        CraneWarning,
-                        stacklevel=2,
-                    )
-            found[joint] = friction
-    return found
-
-
-def _forces(top: Section, tree: Tree) -> tuple[ForceElement, ...]:
-    forces = []
-    keys = ("joint", "stiffness", "rest", "damping", "force")
-    for item in top.sections("forces", "force element of", *keys):
-        with kept():
-            element = ForceElement(
-                tree.joint(item),
-                stiffness=item.number("stiffness", 0.0, minimum=0.0),
-                rest=item.number("rest", 0.0),
-                damping=item.number("damping", 0.0, minimum=0.0),
-                force=item.number("force", 0.0),
-            )
-            if not (element.stiffness or element.damping or element.force):
-                raise item.fail(
-                    None,
-                    f"the element on '{element.joint}' does nothing, give it stiffness, damping "
-                    "or force",
-                )
-            forces.append(element)
-    return tuple(forces)
-
-
-def _gas_springs(top: Section, tree: Tree) -> tuple[GasSpring, ...]:
-    springs = []
-    keys = ("area", "pressure", "volume", "rest", "exponent")
-    for joint, item in top.mappings("gas_springs", "gas spring of", *keys):
-        with kept():
-            tree.check_joint(joint, item.where())
-            area = item.number("area")
-            volume = item.number("volume", minimum=0.0)
-            exponent = item.number("exponent", GasSpring.exponent, minimum=0.0)
-            for key, value in (("area", area), ("volume", volume), ("exponent", exponent)):
-                if value == 0:
-                    raise item.fail(key, f"'{key}' of gas spring of '{joint}' is 0, give one")
-            pressure, rest = item.number("pressure", minimum=0.0), item.number("rest", 0.0)
-            springs.append(GasSpring(joint, area, pressure, volume, rest, exponent))
-    return tuple(springs)
-
-
-def _end_stops(top: Section, tree: Tree) -> tuple[EndStop, ...]:
-    stops = []
-    for joint, item in top.mappings("end_stops", "end stop of", "stiffness", "damping"):
-        with kept():
-            tree.check_joint(joint, item.where())
-            if not tree.has_limits(joint):
-                raise item.fail(
-                    None, f"joint '{joint}' is continuous, a stop needs limits: make it revolute"
-                )
-            stiffness = item.number("stiffness", minimum=0.0)
-            if stiffness == 0:
-                raise item.fail(
-                    "stiffness", f"the end stop of '{joint}' has no stiffness, give one"
-                )
-            stops.append(EndStop(joint, stiffness, item.number("damping", 0.0, minimum=0.0)))
-    return tuple(stops)
 
 
 def _payload(top: Section, tree: Tree, tip: str | None) -> Chain | None:
