@@ -73,10 +73,10 @@ def _completed(machine: Machine, table: Table) -> Table:
     """The table with coordinates, velocities and forces of all active joints."""
     # before anything is computed from them, to name the column as it is in the file
     check_finite(dict(zip(table.units, table.values.T, strict=True)))
-    _check_pressures(machine, table)
+    check_pressures(machine, table)
     forces = [_force(machine, joint, table) for joint in machine.active]
     q, v = motion_of(machine, table)
-    columns = {TIME: _column(table, TIME)} | dict(zip(machine.active, q.T, strict=True))
+    columns = {TIME: column(table, TIME)} | dict(zip(machine.active, q.T, strict=True))
     columns |= {x + VELOCITY: v[:, i] for i, x in enumerate(machine.active)}
     columns |= {x + FORCE: force for x, force in zip(machine.active, forces, strict=True)}
     kinds = {x: machine.unit(x) for x in machine.active}
@@ -85,12 +85,12 @@ def _completed(machine: Machine, table: Table) -> Table:
     units |= {x + FORCE: FORCE_UNITS[kind] for x, kind in kinds.items()}
     for name, unit in table.units.items():
         if name not in units:
-            units[name], columns[name] = unit, _column(table, name)
+            units[name], columns[name] = unit, column(table, name)
     notes = table.notes | {"machine": machine.call}
     return Table(units, np.column_stack([columns[name] for name in units]), notes)
 
 
-def _column(table: Table, name: str, unit: str | None = None) -> Array:
+def column(table: Table, name: str, unit: str | None = None) -> Array:
     """A column (N,), in a unit.
 
     Raises:
@@ -101,7 +101,7 @@ def _column(table: Table, name: str, unit: str | None = None) -> Array:
     return table.values[:, list(table.units).index(name)]
 
 
-def _check_pressures(machine: Machine, table: Table) -> None:
+def check_pressures(machine: Machine, table: Table) -> None:
     """See that pressures are in units of pressure, per chamber, and count from a vacuum."""
     for name in table.units:
         joint = name.removeprefix(_PRESSURE)
@@ -111,7 +111,7 @@ def _check_pressures(machine: Machine, table: Table) -> None:
             raise RecordingError(
                 f"column '{name}' does not say in which chamber, give '{name}_a' and '{name}_b'"
             )
-        pressure = _column(table, name, "Pa")
+        pressure = column(table, name, "Pa")
         if (pressure < 0).any():
             sample = int(np.argmax(pressure < 0))
             raise RecordingError(
@@ -124,7 +124,7 @@ def _force(machine: Machine, joint: str, table: Table) -> Array:
     """A joint's force (N,): as recorded, or by equation (20)."""
     unit = FORCE_UNITS[machine.unit(joint)]
     if joint + FORCE in table.units:
-        return _column(table, joint + FORCE, unit)
+        return column(table, joint + FORCE, unit)
     a, b = (f"{_PRESSURE}{joint}_{chamber}" for chamber in "ab")
     there = [name for name in (a, b) if name in table.units]
     cylinder = None if machine.hydraulics is None else machine.hydraulics.cylinders.get(joint)
@@ -145,7 +145,7 @@ def _force(machine: Machine, joint: str, table: Table) -> Array:
             f"column '{missing}' is missing beside '{there[0]}', give it, or "
             f"'{joint}{FORCE} [{unit}]'"
         )
-    return cylinder.area_a * _column(table, a, "Pa") - cylinder.area_b * _column(table, b, "Pa")
+    return cylinder.area_a * column(table, a, "Pa") - cylinder.area_b * column(table, b, "Pa")
 
 
 def _drives(machine: Machine, names: Sequence[str]) -> tuple[str, ...]:
@@ -199,8 +199,8 @@ def motion_of(machine: Machine, table: Table) -> tuple[Array, Array]:
 
 def _motion(machine: Machine, drives: tuple[str, ...], table: Table) -> tuple[Array, Array]:
     """Active coordinates and velocities (N, n) from those of the joints that were measured."""
-    time = _column(table, TIME)
-    q_b = np.column_stack([_column(table, x, machine.unit(x)) for x in drives])
+    time = column(table, TIME)
+    q_b = np.column_stack([column(table, x, machine.unit(x)) for x in drives])
     v_b = np.column_stack([derivative(x, time) for x in q_b.T])
     _fill_in_velocities(v_b, drives, machine, table)
     if set(drives) == set(machine.active):
@@ -240,4 +240,4 @@ def _fill_in_velocities(v: Array, joints: Sequence[str], machine: Machine, table
     """Put those that are recorded in the place of computed ones (N, joints)."""
     for i, joint in enumerate(joints):
         if joint + VELOCITY in table.units:
-            v[:, i] = _column(table, joint + VELOCITY, VELOCITY_UNITS[machine.unit(joint)])
+            v[:, i] = column(table, joint + VELOCITY, VELOCITY_UNITS[machine.unit(joint)])

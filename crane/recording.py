@@ -5,6 +5,7 @@ As a file it is a CSV of SI units (see crane.timeseries):
     # crane recording
     # machine: mini_forwarder
     # task: loading
+    # controller: PI
     time [s],q1 [rad],X1 [m],q1_velocity [rad/s],X1_velocity [m/s],q1_force [N m],X1_force [N],...
 
 A column X is an active joint if X_force exists; X_velocity may be missing and is the derivative of
@@ -52,6 +53,7 @@ class Recording:
         channel_units: Their units; "" where none is given.
         machine: Name of the bundled machine or path of the machine file, "" if not known.
         task: What it was doing, "" if not known.
+        controller: What drove it, "" if not known.
     """
 
     time: Array
@@ -64,6 +66,7 @@ class Recording:
     channel_units: dict[str, str] = field(default_factory=dict)
     machine: str = ""
     task: str = ""
+    controller: str = ""
 
     def __post_init__(self) -> None:
         joints = tuple(self.joints)
@@ -105,7 +108,7 @@ class Recording:
         units = self._units()
         for name, unit in units.items():
             timeseries.check_column(name, unit)
-        for name in ("machine", "task"):
+        for name in ("machine", "task", "controller"):
             text = getattr(self, name)
             if text != text.strip() or not text.isprintable():
                 raise RecordingError(f"{name} {text!r} is not one line of text, give one")
@@ -158,6 +161,8 @@ class Recording:
             OutputError: It cannot be written there.
         """
         notes = {"crane recording": "", "machine": self.machine, "task": self.task}
+        if self.controller:
+            notes["controller"] = self.controller
         timeseries.write(path, Table(self._units(), self._values(), notes))
 
     @classmethod
@@ -219,6 +224,7 @@ class Recording:
             channel_units={x: units[x] for x in channels},
             machine=table.notes.get("machine", ""),
             task=table.notes.get("task", ""),
+            controller=table.notes.get("controller", ""),
         )
 
 

@@ -9,15 +9,16 @@ from crane import timeseries
 from crane.control import Signals, ValveDrive
 from crane.errors import InputError, RecordingError, known
 from crane.machine import Machine
-from crane.measured import motion_of
-from crane.recording import Recording
-from crane.samples import Array
+from crane.measured import check_pressures, column, motion_of
+from crane.recording import FORCE, FORCE_UNITS, VELOCITY, VELOCITY_UNITS, Recording
+from crane.samples import Array, as_number
 from crane.simulation import Progress, simulate
-from crane.timeseries import TIME, Table
+from crane.timeseries import TIME, Table, check_unit, spellings
 
 _SIGNAL, _SUPPLY, _TANK = "voltage_", "pressure_supply", "pressure_tank"
 _FIRST = 0.1  # over which the velocity at the start is fitted [s]
 _FEWEST = 5  # samples of that fit
+_RESTS = 1e-12  # variation of a channel that is rounding, per its size
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +46,8 @@ class Channel:
     def relative(self) -> float:
         """The same over that of the measured channel about its mean; infinite if that rests."""
         spread = float(np.std(self.measured))
+        if spread < _RESTS * float(np.abs(self.measured).max()):
+            spread = 0.0
         return self.rms / spread if spread > 0 else (0.0 if self.rms == 0 else np.inf)
 
 
@@ -97,6 +100,7 @@ def replay(
         RecordingError: The file is malformed, or has no signals.
         InputError: The machine has no valves.
     """
+    step = as_number(step, "the step", "s", above=0)
     table = timeseries.read(path)
     try:
         time, drive, initial = _prepare(machine, table)
@@ -107,7 +111,10 @@ def replay(
         raise RecordingError(f"{path}: is shorter than a step of {step:g} s, shorten the step")
     task = Path(path).stem
     recording = simulate(machine, drive, initial, steps * step, step, task=task, progress=progress)
-    return recording, compare(table, recording)
+    try:
+        return recording, compare(table, recording)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
 
 
 def compare(table: Table, recording: Recording) -> Comparison:
@@ -116,16 +123,25 @@ def compare(table: Table, recording: Recording) -> Comparison:
     Args:
         table: What was measured.
         recording: What was simulated from the same instant on.
+
+    Raises:
+        RecordingError: A channel of the file is in a unit of something else.
     """
-    time = _column(table, TIME)
+    time = column(table, TIME)
     time = time - time[0]
     inside = time <= recording.time[-1] * (1 + 1e-12)
     columns = recording.columns()
+    units = recording.units | recording.channel_units
+    units |= {x + VELOCITY: VELOCITY_UNITS[unit] for x, unit in recording.units.items()}
+    units |= {x + FORCE: FORCE_UNITS[unit] for x, unit in recording.units.items()}
+    for name, unit in table.units.items():
+        if name in units:
+            check_unit(name, unit, spellings(units[name]))
     found = [
         Channel(
             name,
             table.units[name],
-            _column(table, name)[inside],
+            column(table, name)[inside],
             np.interp(time[inside], recording.time, columns[name]),
         )
         for name in table.units
@@ -144,7 +160,7 @@ def _prepare(
             f"machine '{machine.name}' has no valves, describe its circuit under 'hydraulics' of "
             "the machine file"
         )
-    time = _column(table, TIME)
+    time = column(table, TIME)
     time = time - time[0]
     if len(time) < 2:
         raise RecordingError("has one sample, give at least two")
@@ -152,20 +168,27 @@ def _prepare(
     for name in table.units:
         if name.startswith(_SIGNAL):
             joint = name.removeprefix(_SIGNAL)
+            if joint in machine.locks:
+                continue  # the valve of a joint that is held moves nothing
             if joint not in joints:
                 raise RecordingError(f"column '{name}' is of no valve, {known(joints, joint)}")
-            signals[joint] = _column(table, name)
+            signals[joint] = column(table, name, "V")
     if not signals:
         names = ", ".join(f"'{_SIGNAL}{joint} [V]'" for joint in joints)
         raise RecordingError(f"no signal of a valve, give at least one of {names}")
+    check_pressures(machine, table)
     supply, tank = (
-        _column(table, name) if name in table.units else None for name in (_SUPPLY, _TANK)
+        column(table, name, "Pa") if name in table.units else None for name in (_SUPPLY, _TANK)
     )
     pressures: dict[str, tuple[float, float]] = {}
     for joint in joints:
         pair = [f"pressure_{joint}_{side}" for side in "ab"]
-        if all(name in table.units for name in pair):
-            a, b = (float(_column(table, name)[0]) for name in pair)
+        there = [name for name in pair if name in table.units]
+        if len(there) == 1:
+            missing = pair[pair[0] in there]
+            raise RecordingError(f"'{missing}' is missing beside '{there[0]}', add or remove one")
+        if there:
+            a, b = (float(column(table, name)[0]) for name in pair)
             pressures[joint] = a, b
     drive = ValveDrive(machine, Signals(machine, time, signals, supply, tank), pressures)
     initial = None
@@ -178,7 +201,3 @@ def _prepare(
             slope = np.polyfit(time[first], q_a[first], 1)[0] if first.sum() > 2 else v_a[0]
             initial = q_a[0], slope
     return time, drive, initial
-
-
-def _column(table: Table, name: str) -> Array:
-    return table.values[:, list(table.units).index(name)]

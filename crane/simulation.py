@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -134,6 +135,10 @@ def trajectory(
     )
     if method is None:
         method = "rosenbrock" if isinstance(control, StiffController) else "rk4"
+    if method != "rosenbrock" and isinstance(control, StiffController) and control.period:
+        raise InputError(
+            f"method '{method}' does not call the valves' program, leave the method out"
+        )
     if method == "rosenbrock" and isinstance(control, StiffController):
         rows = _integrate_stiff(dynamics, control, state, steps, step, progress)
     elif method == "rk4":
@@ -208,11 +213,14 @@ def _integrate_stiff(
             f"the period {control.period:g} s of the valves' program is no whole number of steps "
             f"of {step:g} s, change one"
         )
-    if dynamics.path != "compiled":
+    fast = None
+    if dynamics.path == "compiled":
+        with suppress(TooLongError):
+            fast = StiffStepper(dynamics, control)
+    if fast is None:
         if period:
             raise InputError("a program with a period runs on the compiled path alone")
         return integrate_adaptively(dynamics, control, state, steps, step, "BDF", progress)
-    fast = StiffStepper(dynamics, control)
     times = step * np.arange(steps + 1, dtype=np.float64)
     rows = np.empty((steps + 1, len(state) + fast.seen))
     nq, n = dynamics.machine.model.nq, len(dynamics.machine.active)
@@ -370,7 +378,15 @@ def _recording(
         channel_units=units,
         machine=machine.call,
         task=task,
+        controller=_name_of(control),
     )
+
+
+def _name_of(control: Controller) -> str:
+    """What drives the machine, by the name of its class."""
+    if isinstance(control, ValveDrive):
+        return type(control.command).__name__
+    return "" if isinstance(control, Free) else type(control).__name__
 
 
 def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:

@@ -216,6 +216,28 @@ def test_a_program_sees_what_the_machine_does(patu):
     assert recording.q[-1, LIFT] == pytest.approx(0.13, abs=2e-3)
 
 
+def test_a_program_starts_anew_in_each_simulation(patu):
+    """Spools begin at neutral, not where the last simulation left them."""
+    program = Sampled(lambda *_: [5.8, 5.0, 5.8, 5.8], patu)
+    first, again = (crane.simulate(patu, program, duration=0.2) for _ in range(2))
+    np.testing.assert_array_equal(first.q, again.q)
+    assert again.channels["spool_X_lift"][0] == 0.0
+
+
+@pytest.mark.parametrize("method", ["rk4", "BDF"])
+def test_methods_that_call_no_program_are_refused(patu, method):
+    program = Sampled(lambda *_: [5.8, 5.0, 5.8, 5.8], patu)
+    with pytest.raises(crane.CraneError, match=f"'{method}' does not call the valves' program"):
+        crane.simulate(patu, program, duration=0.1, method=method)
+
+
+def test_circuit_follows_the_active_joints(patu):
+    """Cylinders, valves and gains of joints that are driven no more go together."""
+    left = patu.driven_by(["slew", "q2", "X_tilt", "X_ext"]).hydraulics
+    for parts in (left.cylinders, left.valves, left.control):
+        assert list(parts) == ["slew", "X_tilt", "X_ext"]
+
+
 # What goes wrong on real machines
 
 
@@ -273,6 +295,18 @@ def test_locked_slewing_has_no_valve():
     check_balances(machine, recording)
 
 
+def test_numbers_too_small_to_divide_by_are_refused():
+    with pytest.raises(crane.CraneError, match="must be at least 1e-50"):
+        crane.load("patu655", changes={"cylinder.X_lift.cushion_coefficient": 1e-200})
+
+
+def test_a_cylinder_needs_limits(patu):
+    endless = patu.driven_by(patu.active)
+    object.__setattr__(endless, "upper", np.where(np.arange(4) == 0, np.inf, patu.upper))
+    with pytest.raises(crane.CraneError, match="'slew' has no limits, a cylinder needs"):
+        endless.replace(hydraulics=patu.hydraulics)
+
+
 def test_signals_that_cannot_be_are_refused(patu):
     with pytest.raises(crane.CraneError, match="no valve for 'q2'"):
         Signals(patu, [0.0, 1.0], {"q2": [5.8, 5.8]})
@@ -282,6 +316,16 @@ def test_signals_that_cannot_be_are_refused(patu):
         Signals(patu, [0.0, 1.0], {"X_lift": [5.8, np.nan]})
     with pytest.raises(crane.CraneError, match="-1 to 1"):
         joystick(patu, {"X_lift": [(0, 1.5)]})
+    for pairs in ([], [(0, 0), (1,)], [("a", "b")]):
+        with pytest.raises(crane.CraneError, match="give pairs of time and position"):
+            joystick(patu, {"X_lift": pairs})
+    for pairs in ([(-2, 0), (-1, 1)], [(0, 0), (1e9, 1)]):
+        with pytest.raises(crane.CraneError, match="give times up to 4000 s"):
+            joystick(patu, {"X_lift": pairs})
+    with pytest.raises(crane.CraneError, match="real numbers"):
+        Signals(patu, ["a", "b"], {})
+    with pytest.raises(crane.CraneError, match=r"pressure of the tank is -50000 Pa"):
+        Signals(patu, [0.0], {}, tank=[-5e4])
     with pytest.raises(crane.CraneError, match="period"):
         crane.simulate(patu, Sampled(lambda *_: [5.8] * 4, patu, 0.0015), duration=0.1)
     with pytest.raises(crane.CraneError, match="has no valves"):

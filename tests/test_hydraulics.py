@@ -277,9 +277,30 @@ def test_series_spring_gives_way_by_force_over_stiffness(tmp_path):
     # at rest: the chamber's volume is that of the stroke and of what the spring gives way
     circuit = Circuit(machine.hydraulics, [STROKE])
     weight = 2000 * G
-    start = circuit.start(np.array([0.2]), np.array([weight]), {}, np.array([0.0]), 0.0)
+    start = circuit.start(np.array([0.2]), np.array([weight]), {}, np.array([0.0]), 0.0, 1e5)
     assert start[2] == pytest.approx(weight / 5e6, rel=1e-12)
     assert recording.q[-1] == pytest.approx(0.2, abs=1e-9)
+
+
+def test_oil_balances_over_a_series_spring(tmp_path):
+    """What the spring gives way is stored: the documented balance holds to rounding."""
+    machine = rig(tmp_path, cylinder={"stiffness": 5e6, "damping": 2e4})
+    signals = Signals(machine, [0.0, 0.5, 1.0], {"x": [0.0, 0.8, 0.0]})
+    recording = crane.simulate(machine, signals, duration=1.5)
+    channels, x = recording.channels, recording.q[:, 0]
+    swept = (AREA_A - AREA_B) * (x - x[0])
+    gap = channels["oil_pumped"] - channels["oil_returned"] - channels["oil_stored"] - swept
+    assert np.abs(gap).max() < 1e-12 * channels["oil_pumped"][-1]
+    assert np.ptp(x) > 0.04
+
+
+def test_no_void_is_measured(tmp_path):
+    """A measured pressure below that of vapour is vapour's, as one at it is."""
+    machine = rig(tmp_path)
+    circuit = Circuit(machine.hydraulics, [STROKE])
+    one, none = np.array([0.2]), np.array([0.0])
+    start = circuit.start(one, none, {"x": (0.0, 1e3)}, none, 9e6, 1e5)
+    np.testing.assert_array_equal(start[:2], [0.0, 0.0])
 
 
 def test_frequency_of_a_load_on_oil_and_spring(tmp_path):
@@ -300,6 +321,17 @@ def test_frequency_of_a_load_on_oil_and_spring(tmp_path):
         crossings = up + v[up] / (v[up] - v[up + 1])
         period = np.mean(np.diff(crossings)) * 1e-3
         assert period == pytest.approx(2 * np.pi / np.sqrt(k / 2000), rel=2e-3)
+
+
+def test_a_machine_too_large_to_compile_is_integrated_by_scipy(tmp_path, monkeypatch):
+    machine = rig(tmp_path, COMPENSATED)
+    signals = Signals(machine, [0.0, 0.01, 0.02], {"x": [5.8, 5.8, 5.0]})
+    with monkeypatch.context() as patch:
+        patch.setattr("crane.straight.machine_code.MOST", 300)
+        large = crane.simulate(rig(tmp_path, COMPENSATED), signals, duration=0.1)
+    whole = crane.simulate(machine, signals, duration=0.1)
+    assert np.abs(large.q - whole.q).max() < 1e-7
+    assert np.ptp(whole.q) > 5e-4
 
 
 def test_pump_shares_its_flow(tmp_path):

@@ -8,7 +8,7 @@ import crane
 from crane import timeseries
 from crane.control import Signals
 from crane.errors import CraneError, RecordingError
-from crane.replays import replay
+from crane.replays import Channel, replay
 from crane.timeseries import Table
 
 
@@ -107,10 +107,11 @@ def test_angles_serve_as_well_as_strokes(tmp_path):
         "q2": np.degrees(recording.channels["q2"]),
         "X_tilt": recording.q[:, 1],
         "X_ext": recording.q[:, 2],
+        "voltage_slew": np.full(len(recording.time), 5.8),
         "voltage_X_lift": recording.channels["voltage_X_lift"],
         "voltage_X_ext": recording.channels["voltage_X_ext"],
     }
-    units = dict(zip(columns, ("s", "deg", "m", "m", "V", "V"), strict=True))
+    units = dict(zip(columns, ("s", "deg", "m", "m", "V", "V", "V"), strict=True))
     _, comparison = replay(machine, write(tmp_path / "file.csv", columns, units))
     rows = {channel.name: channel.rms for channel in comparison.channels}
     assert set(rows) == {"q2", "X_tilt", "X_ext"}
@@ -123,8 +124,18 @@ def test_angles_serve_as_well_as_strokes(tmp_path):
         (lambda c, u: c.pop("voltage_x"), "no signal of a valve, give at least one of 'voltage_x"),
         (lambda c, u: c.update(voltage_y=c.pop("voltage_x")), "'voltage_y' is of no valve"),
         (lambda c, u: c["voltage_x"].__setitem__(3, np.nan), "'nan' is not a finite number"),
-        (lambda c, u: c["pressure_x_a"].__setitem__(0, -3.0), "cannot be negative: add 1e5"),
+        (lambda c, u: c["pressure_x_a"].__setitem__(0, -3.0), "count from a vacuum: to gauge"),
+        (lambda c, u: c["pressure_x_b"].__setitem__(5, -3.0), "is -300000 Pa at sample 5, but"),
+        (lambda c, u: c.update(pressure_tank=c["x"] - 1e3), "'pressure_tank' has no unit"),
+        (lambda c, u: c["pressure_supply"].__setitem__(7, -1.0), "'pressure_supply' is -1 Pa at"),
+        (lambda c, u: u.update(voltage_x="bar"), "'voltage_x' is in [Pa], give 'voltage_x [V]'"),
+        (
+            lambda c, u: u.update(pressure_x_a="m"),
+            "'pressure_x_a' is in [m], give 'pressure_x_a [Pa",
+        ),
+        (lambda c, u: (c.update(kinetic=c["x"]), u.update(kinetic="V")), "give 'kinetic [J]'"),
         (lambda c, u: c["x"].__setitem__(0, 9e3), "outside of its limits"),
+        (lambda c, u: c.pop("pressure_x_b"), "'pressure_x_b' is missing beside 'pressure_x_a'"),
     ],
 )
 def test_bad_files_are_refused_in_one_line(tmp_path, measured, change, line):
@@ -132,12 +143,27 @@ def test_bad_files_are_refused_in_one_line(tmp_path, measured, change, line):
     columns, units = columns_of(recording, every=100)
     columns = {name: values.copy() for name, values in columns.items()}
     change(columns, units)
-    units = {name: units.get(name, "V") for name in columns}
+    units = {name: units.get(name, "V" if name == "voltage_y" else "") for name in columns}
     path = write(tmp_path / "file.csv", columns, units)
     with pytest.raises(CraneError) as caught:
         replay(machine, path)
     assert line in str(caught.value)
     assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(str(path)) or "limits" in line
+
+
+@pytest.mark.parametrize("step", [0.0, -1.0, np.nan])
+def test_steps_that_cannot_be_are_refused(tmp_path, measured, step):
+    machine, recording = measured
+    path = write(tmp_path / "file.csv", *columns_of(recording, every=100))
+    with pytest.raises(CraneError, match="the step is .* s, give a number above 0"):
+        replay(machine, path, step)
+
+
+def test_rounding_of_a_channel_at_rest_is_no_variation():
+    """-45 deg in rad vary by 1e-16: the error is not 1e14 times that."""
+    resting = np.full(101, np.radians(-45.0))
+    assert Channel("q3", "rad", resting, resting + 1e-3).relative == np.inf
 
 
 def test_one_sample_and_other_machines_are_refused(tmp_path, measured):

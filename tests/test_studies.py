@@ -162,6 +162,12 @@ def test_what_cannot_be_studied(arguments, text):
     assert text in str(caught.value)
 
 
+@pytest.mark.parametrize("name", ["supply.pressure", "oil.bulk_modulus", "valve.slew.dead_band"])
+def test_hydraulics_change_no_forces_of_a_given_motion(name):
+    with pytest.raises(InputError, match=f"'{name}' changes nothing"):
+        crane.study("patu655", {name: [0.1, 0.2]}, ["swing"])
+
+
 @pytest.mark.parametrize(
     ("text", "draws", "message"),
     [

@@ -74,14 +74,19 @@ class ValveDrive:
         once = Dynamics(self.machine, path="pinocchio")
         weight = once.inverse(q_a, rest, rest)[self._which]
         x = q_a[self._which] - self._lower
-        reference = self.command.references(np.zeros(1))[0].tolist()
-        signals = self.command.signals(
-            q_a.tolist(), rest.tolist(), self.command.settings.tolist(), reference
-        )
-        supply = self.circuit.hydraulics.supply.pressure
-        return self.circuit.start(
-            x, weight, self._pressures, np.array(signals, dtype=np.float64), supply
-        )
+        hydraulics = self.circuit.hydraulics
+        # a program has not been asked yet, and may remember an earlier simulation
+        signals: list[Number] = [valve.neutral for valve in hydraulics.valves.values()]
+        if not self.period:
+            reference = self.command.references(np.zeros(1))[0].tolist()
+            signals = self.command.signals(
+                q_a.tolist(), rest.tolist(), self.command.settings.tolist(), reference
+            )
+        supply, tank = hydraulics.supply.pressure, hydraulics.supply.tank
+        if self.command.measured:
+            supply, tank = self.command.references(np.zeros(1))[0, -2:].tolist()
+        levels = np.array(signals, dtype=np.float64)
+        return self.circuit.start(x, weight, self._pressures, levels, supply, tank)
 
     def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
         """See `Controller`."""

@@ -14,6 +14,7 @@ from crane.samples import Array, as_number, as_sample
 from crane.straight import Number
 from crane.straight.scalar import apply
 
+_LONGEST = 4000.0  # of levers [s], what a simulation can have of milliseconds
 _JUMP = 0.01  # of the spool's stroke, over which the feedforward jumps the dead band
 
 
@@ -92,10 +93,11 @@ class Signals:
         tank: ArrayLike | None = None,
     ):
         circuit = circuit_of(machine)
-        self._time = np.array(time, dtype=np.float64)
-        if self._time.ndim != 1 or not len(self._time):
-            raise InputError(f"time has the shape {self._time.shape}, give (N,) instants")
-        if not (np.diff(self._time) > 0).all() or not np.isfinite(self._time).all():
+        shape = np.shape(time)
+        if len(shape) != 1 or not shape[0]:
+            raise InputError(f"time has the shape {shape}, give (N,) instants")
+        self._time = as_sample(time, shape[0], "time of the signals").copy()
+        if not (np.diff(self._time) > 0).all():
             raise InputError("time of the signals does not increase, sort it")
         for joint in signals:
             if joint not in circuit.joints:
@@ -114,6 +116,11 @@ class Signals:
             ):
                 full = np.full(len(self._time), usual) if given is None else given
                 columns.append(self._column(full, f"pressure of the {what}"))
+                if columns[-1].min() < 0:
+                    raise InputError(
+                        f"pressure of the {what} is {columns[-1].min():g} Pa, it counts from a "
+                        "vacuum and cannot be negative: add 1e5 to gauge pressures"
+                    )
         self._values = np.column_stack(columns)
         self._count = len(circuit.joints)
         self.columns = len(columns)
@@ -167,7 +174,10 @@ def joystick(
     for joint, polygon in points.items():
         if joint not in circuit.joints:
             raise InputError(f"no valve for '{joint}', {known(circuit.joints, joint)}")
-        table = np.array(polygon, dtype=np.float64).reshape(len(polygon), -1)
+        try:
+            table = np.array(polygon, dtype=np.float64)
+        except (TypeError, ValueError):
+            table = np.zeros(0)
         if table.shape[1:] != (2,) or not len(table):
             raise InputError(f"lever of '{joint}': give pairs of time and position")
         if not (np.diff(table[:, 0]) > 0).all() or not (np.abs(table[:, 1]) <= 1).all():
@@ -177,6 +187,8 @@ def joystick(
         corners[joint] = table[:, 0], table[:, 1]
     # between corners the dead band is jumped where a lever passes zero: fine steps, not corners
     last = max([last, *(times[-1] for times, _ in corners.values())])
+    if not 0 < last <= _LONGEST:
+        raise InputError(f"the levers end at {last:g} s, give times up to {_LONGEST:g} s")
     fine = np.linspace(0.0, last, max(2, round(last / 1e-3) + 1))
     signals = {}
     for joint, (times, levers) in corners.items():

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, fields
 from crane.errors import InputError
 from crane.samples import as_number
 
+_LEAST = 1e-50  # of what must be positive: one over its square is still a number
+
 
 def check_numbers(item: object, what: str) -> None:
     """Raise for numbers of a part that are not finite, negative, or zero where that cannot be.
@@ -19,8 +21,10 @@ def check_numbers(item: object, what: str) -> None:
             number = as_number(value, f"{entry.name} of {what}", "")
             if entry.metadata.get("signed"):
                 continue
-            if number < 0 or (number == 0 and entry.metadata.get("positive")):
+            if number < 0 or (number < _LEAST and entry.metadata.get("positive")):
                 least = "must be positive" if entry.metadata.get("positive") else "must not be < 0"
+                if number > 0:
+                    least = f"must be at least {_LEAST:g}"
                 raise InputError(f"{entry.name} of {what} is {number:g}, it {least}")
 
 

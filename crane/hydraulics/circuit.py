@@ -12,8 +12,9 @@ from crane.samples import Array
 from crane.straight import Number, maximum
 
 _PRESSURE, _OIL = 1.0, 5e-13  # accuracy that matters [Pa], [m3]
-# Integrals that balance: pumped = returned + stored + volume swept, and pump_work = work of the
-# cylinders + hydraulic_loss + oil_energy.
+# Integrals that balance: pumped = returned + stored + volume that the joints sweep, and
+# pump_work = work of the cylinders + hydraulic_loss + oil_energy. What series springs give way is
+# stored, too.
 BALANCES = {
     "oil_pumped": "m3", "oil_returned": "m3", "oil_stored": "m3",
     "pump_work": "J", "hydraulic_loss": "J", "oil_energy": "J",
@@ -126,6 +127,7 @@ class Circuit:
         pressures: dict[str, tuple[float, float]],
         signals: Array,
         supply: float,
+        tank: float,
     ) -> Array:
         """States (size,) at rest.
 
@@ -136,9 +138,10 @@ class Circuit:
             pressures: Those of A and B [Pa] where they are known, by joint.
             signals: (m,) of the valves [V], to which the spools have come.
             supply: Pressure of the supply line [Pa].
+            tank: Of the tank's [Pa].
         """
         state = np.zeros(self.size)
-        least, vapour = self.hydraulics.supply.tank, self.hydraulics.oil.vapour_pressure
+        least, vapour = tank, self.hydraulics.oil.vapour_pressure
         for i, (cylinder, valve) in enumerate(
             zip(self.hydraulics.cylinders.values(), self.hydraulics.valves.values(), strict=True)
         ):
@@ -147,7 +150,7 @@ class Circuit:
             b = least + max(-held, 0.0) / cylinder.area_b
             a, b = pressures.get(cylinder.joint, (a, b))
             at = self._offsets[i]
-            state[at : at + 2] = a - vapour, b - vapour
+            state[at : at + 2] = max(a - vapour, 0.0), max(b - vapour, 0.0)
             if self._compliant[i]:
                 force = cylinder.area_a * a - cylinder.area_b * b
                 state[at + 2] = force / cylinder.stiffness
@@ -210,7 +213,7 @@ class Circuit:
             lost = lost + function.lost
             for side in function.chambers:
                 stored, kept = stored + side.net, kept + side.pressure * side.net
-            kept = kept + function.spring_power
+            stored, kept = stored + function.spring_flow, kept + function.spring_power
         pumped = drawn
         if self._limited:
             pumped = common["pump_flow"] * clipped(

@@ -63,6 +63,7 @@ class Function:
         lost: Power that throttles, leaks and the series damper turn into heat [W].
         spring_rate: Rate of the series spring's compression, if there is one.
         spring_power: What goes into it [W].
+        spring_flow: What both chambers grow by as it gives way [m3/s].
     """
 
     def __init__(
@@ -90,6 +91,7 @@ class Function:
         self.force = areas[0] * pressures[0] - areas[1] * pressures[1]
         self.spring_rate: list[Number] = []
         self.spring_power: Number = 0.0
+        self.spring_flow: Number = 0.0
         damped: Number = 0.0
         if compliant:
             # massless: the spring and its damper carry the cylinder's force
@@ -98,6 +100,7 @@ class Function:
             x, v = x + own[2], v + squeezed
             self.spring_rate = [squeezed]
             self.spring_power = pressing * squeezed
+            self.spring_flow = (areas[0] - areas[1]) * squeezed
             damped = part["damping"] * squeezed * squeezed
         open_positive = clipped((spool - part["dead_band"]) * part["per_stroke"], 0.0, 1.0)
         open_negative = clipped((-spool - part["dead_band"]) * part["per_stroke"], 0.0, 1.0)

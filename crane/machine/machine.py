@@ -185,8 +185,8 @@ class Machine:
         """The same machine with other friction, forces, gas springs, end stops or hydraulics.
 
         Raises:
-            InputError: A joint is unknown, has two gas springs, an end stop but no limits, or a
-                cylinder without being active.
+            InputError: A joint is unknown, has two gas springs, an end stop or a cylinder but no
+                limits, or a cylinder without being active.
         """
         for joint in friction or {}:
             self.column(joint)
@@ -205,6 +205,11 @@ class Machine:
             if joint not in self.active:
                 raise InputError(
                     f"'{joint}' has a cylinder and is not active, {known(self.active, joint)}"
+                )
+            i = self.active.index(joint)
+            if not np.isfinite([self.lower[i], self.upper[i]]).all():
+                raise InputError(
+                    f"joint '{joint}' has no limits, a cylinder needs those of its stroke"
                 )
         return dataclasses.replace(
             self,
@@ -303,4 +308,5 @@ def _driving(circuit: Hydraulics | None, names: Sequence[str]) -> Hydraulics | N
         circuit,
         cylinders={name: circuit.cylinders[name] for name in kept},
         valves={name: circuit.valves[name] for name in kept},
+        control={name: circuit.control[name] for name in kept if circuit.control},
     )

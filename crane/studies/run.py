@@ -21,6 +21,8 @@ from crane.studies.measures import of_strokes, of_task, stroke_measures, task_me
 from crane.studies.table import Study
 
 _MOST = 100_000  # variants
+# Parameters that inverse dynamics does not know, by their first word.
+_IDLE = ("control", "supply", "oil", "cylinder", "valve", "valve_control")
 
 Progress = Callable[[float], None]
 
@@ -188,10 +190,10 @@ def _parameter_units(name: str | Path, machine: Machine, vary: Mapping[str, obje
         if wanted not in names:
             raise InputError(f"parameter '{wanted}' is unknown, {known(names, wanted)}")
         head, *rest = wanted.split(".")
-        if head == "control":
+        if head in _IDLE and rest[-1] not in ("lower", "upper"):
             raise InputError(
                 f"'{wanted}' changes nothing: the forces are those of the reference motion, "
-                "without a controller; vary something else"
+                "without controller and hydraulics; vary something else"
             )
         units[wanted] = _unit(machine, head, rest)
     return units

@@ -33,6 +33,8 @@ def run_summary(machine: Machine, recording: "Recording | None") -> dict[str, An
     if recording is None:
         return {"facts": facts, "forces": [], "limits": []}
     summary = summarize(recording)
+    if recording.controller:
+        facts.insert(0, ("controller", recording.controller))
     count = len(recording.time)
     rate = f", {(count - 1) / summary.duration:.4g} per second" if count > 1 else ""
     facts.insert(0, ("samples", f"{count}{rate}"))
