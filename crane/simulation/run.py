@@ -19,7 +19,6 @@ from crane.control import (
 )
 from crane.dynamics import Dynamics
 from crane.errors import ClosureError, CraneWarning, InputError, SimulationError, known
-from crane.hydraulics.circuit import BALANCES
 from crane.integration import (
     ADAPTIVE,
     CompiledStepper,
@@ -27,16 +26,13 @@ from crane.integration import (
     StiffStepper,
     integrate_adaptively,
 )
-from crane.kinematics import Kinematics
 from crane.machine import Machine
 from crane.paths import Path
 from crane.recording import Recording
 from crane.samples import Array, as_number, as_sample
+from crane.simulation.recorded import ENERGIES, imbalance, recorded
 from crane.straight import TooLongError
 
-_IMBALANCE = 5e-3  # share of the energy that went through
-
-_ENERGIES = 2  # of the state: work, dissipated; of the observations: kinetic, potential
 _MOST = 4_000_000  # steps of one recording
 _CHUNK = 1000  # steps between reports of progress
 
@@ -104,7 +100,7 @@ def simulate(
     text = imbalance(states[:, -2], seen[:, 2 * n : 2 * n + 2], states[:, -1], step)
     if text and formulation == "exact":
         warnings.warn(text, CraneWarning, stacklevel=2)
-    return _recording(machine, control, step, states, seen, task)
+    return recorded(machine, control, step, states, seen, task)
 
 
 def trajectory(
@@ -131,7 +127,7 @@ def trajectory(
     steps = _count(duration, step)
     q_a, v_a = _start(machine, initial, control.path)
     state = np.concatenate(
-        [machine.closure.solve(q_a), v_a, control.start(q_a), np.zeros(_ENERGIES)]
+        [machine.closure.solve(q_a), v_a, control.start(q_a), np.zeros(ENERGIES)]
     )
     if method is None:
         method = "rosenbrock" if isinstance(control, StiffController) else "rk4"
@@ -162,7 +158,7 @@ def _integrate(
     """States and observations [tau, friction, kinetic, potential] at all instants."""
     n = len(dynamics.machine.active)
     size, times = len(state), step * np.arange(steps + 1, dtype=np.float64)
-    width = 2 * n + _ENERGIES + len(getattr(control, "channels", ()))
+    width = 2 * n + ENERGIES + len(getattr(control, "channels", ()))
     rows = np.empty((steps + 1, size + width))
     slow = PythonStepper(dynamics, control)
     fast = None
@@ -172,7 +168,7 @@ def _integrate(
         and not isinstance(control, StiffController)
     ):
         try:
-            own = size - dynamics.machine.model.nq - n - _ENERGIES
+            own = size - dynamics.machine.model.nq - n - ENERGIES
             fast = CompiledStepper(dynamics, control, own)
         except TooLongError:
             fast = None
@@ -314,110 +310,3 @@ def _start(
             f"initial is a stack, give one sample ({size},) or a pair as a tuple (q_a, v_a)"
         )
     return q_a, v_a
-
-
-def _recording(
-    machine: Machine,
-    control: Controller,
-    step: float,
-    states: Array,
-    seen: Array,
-    task: str,
-) -> Recording:
-    n, path = len(machine.active), control.path
-    forces, friction = seen[:, :n], seen[:, n : 2 * n]
-    energies, more = seen[:, 2 * n : 2 * n + _ENERGIES], seen[:, 2 * n + _ENERGIES :]
-    time = step * np.arange(len(states), dtype=np.float64)
-    nq = machine.model.nq
-    postures, v_a = states[:, :nq], states[:, nq : nq + len(machine.active)]
-    q_a = postures[:, machine.closure.active]
-    _warn_of_limits(machine, time, q_a)
-    channels: dict[str, Array] = {}
-    units: dict[str, str] = {}
-
-    def add(name: str, values: Array, unit: str) -> None:
-        channels[name], units[name] = values, unit
-
-    for column in machine.closure.passive:
-        joint = machine.joints[column]
-        add(joint, postures[:, column], machine.unit(joint))
-    if machine.tip is not None:
-        kinematics = Kinematics(machine)
-        tip = np.array([kinematics.position_at(q) for q in postures])
-        for axis, values in zip("xyz", tip.T, strict=True):
-            add(f"tip_{axis}", values, "m")
-    if path is not None:
-        reference, reference_rate, _ = path(time)
-        for i, joint in enumerate(machine.active):
-            add(f"reference_{joint}", reference[:, i], machine.unit(joint))
-            rate_unit = machine.unit(joint) + "/s"
-            add(f"reference_velocity_{joint}", reference_rate[:, i], rate_unit)
-        if path.tip is not None:
-            for axis, values in zip("xyz", path.tip(time)[0].T, strict=True):
-                add(f"reference_tip_{axis}", values, "m")
-    for i, joint in enumerate(machine.active):
-        add(f"friction_{joint}", friction[:, i], "N" if machine.unit(joint) == "m" else "N m")
-    add("kinetic", energies[:, 0], "J")
-    add("potential", energies[:, 1], "J")
-    add("work", states[:, -2], "J")
-    add("dissipated", states[:, -1], "J")
-    if isinstance(control, StiffController):
-        for (name, unit), values in zip(control.channels, more.T, strict=True):
-            add(name, values, unit)
-        integrals = states[:, -_ENERGIES - len(BALANCES) : -_ENERGIES]
-        for (name, unit), values in zip(BALANCES.items(), integrals.T, strict=True):
-            add(name, values, unit)
-    return Recording(
-        time=time,
-        joints=machine.active,
-        q=q_a,
-        v=v_a,
-        tau=forces,
-        units={joint: machine.unit(joint) for joint in machine.active},
-        channels=channels,
-        channel_units=units,
-        machine=machine.call,
-        task=task,
-        controller=_name_of(control),
-    )
-
-
-def _name_of(control: Controller) -> str:
-    """What drives the machine, by the name of its class."""
-    if isinstance(control, ValveDrive):
-        return type(control.command).__name__
-    return "" if isinstance(control, Free) else type(control).__name__
-
-
-def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
-    stopped = {stop.joint for stop in machine.end_stops}
-    for i, joint in enumerate(machine.active):
-        outside = (q_a[:, i] < machine.lower[i]) | (q_a[:, i] > machine.upper[i])
-        if outside.any() and joint not in stopped:
-            warnings.warn(
-                f"'{joint}' leaves its limits {machine.lower[i]:g} to {machine.upper[i]:g} at "
-                f"t = {time[outside.argmax()]:.4g} s, it has no end stop",
-                CraneWarning,
-                stacklevel=4,
-            )
-
-
-def imbalance(work: Array, energies: Array, dissipated: Array, step: float) -> str:
-    """What to say if a simulation does not keep its energy, else nothing.
-
-    Args:
-        work: (N,) of the active forces [J].
-        energies: (N, 2) kinetic, potential [J].
-        dissipated: (N,) [J].
-        step: [s].
-    """
-    change = (energies - energies[0]).sum(axis=1)
-    gap = float(np.abs(work - change - dissipated).max())
-    throughput = float(max(np.ptp(part) for part in (work, dissipated, *energies.T)))
-    rounding = 1e-12 * float(np.abs(energies).max())
-    if gap <= _IMBALANCE * throughput + rounding:
-        return ""
-    return (
-        f"work, energy and dissipation differ by {gap:.2g} J of {throughput:.2g} J, so the "
-        f"step of {step:g} s is too long: shorten it, or smooth the friction more"
-    )
