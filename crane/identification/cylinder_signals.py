@@ -8,10 +8,11 @@ from crane.description.hydraulics import Cylinder, Valve
 from crane.errors import InputError, RecordingError, known
 from crane.identification.signals import average_periods, differentiate, sampling
 from crane.machine import Machine
-from crane.recording import Recording, derivative
+from crane.recording import Recording
 from crane.samples import Array
 
 _SLACK = 1e-3  # of the stroke by which a noisy sensor may leave it
+_NOISY = 0.03  # of the fastest speed, noise that is worth smoothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,14 +74,13 @@ def column(recording: Recording, joint: str) -> int:
 
 
 def speed(recording: Recording, joint: str) -> Array:
-    """A joint's velocity (N,) as measured, or from a Kalman smoother of its coordinate.
+    """A joint's velocity (N,) as recorded, or from a Kalman smoother of its coordinate.
 
-    The latter where the recording's velocity is no more than the differences of its coordinate:
-    of a measured one they are mostly noise.
+    The latter where the recorded one is noisy, as differences of a measured coordinate are.
     """
     i = column(recording, joint)
-    q, v = recording.q[:, i], recording.v[:, i]
-    if np.allclose(v, derivative(q, recording.time), rtol=1e-9, atol=1e-12):
+    v = recording.v[:, i]
+    if noise_level(v) > _NOISY * np.abs(v).max():
         return differentiate(recording.time, recording.q[:, [i]]).v[:, 0]
     return v
 

@@ -139,7 +139,7 @@ def identify_valve(
         machine: With hydraulics; of its valve `neutral`, `full` and `margin` are used, the first
             two for direction and range only.
         recording: With the joint and `voltage_<joint>`; pressures as in `cylinder_signals`.
-            A velocity that is no more than differences of the coordinate is smoothed.
+            A noisy velocity is replaced by a smoother's of the coordinate.
         joint: The cylinder's.
         settle: [s], several times the spool's and the load's answer.
 
