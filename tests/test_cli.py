@@ -315,3 +315,10 @@ def test_wrong_studies_are_one_line_and_write_nothing(arguments, text, tmp_path)
         run("study", "mini_forwarder", "--out", "s", *arguments, cwd=tmp_path)
     )
     assert list(tmp_path.iterdir()) == []
+
+
+def test_help_keeps_its_units():
+    """What stands in square brackets is markup to the help, and disappears."""
+    for file in (Path(crane.__file__).parent / "cli").glob("*.py"):
+        for text in re.findall(r'help="([^"]*)"', file.read_text()):
+            assert "[" not in text, text

@@ -134,7 +134,7 @@ def identify(
         list[str] | None,
         typer.Option(
             metavar="JOINT=VALUE",
-            help="Velocity below which its rows are left out [m/s], [rad/s].",
+            help="Velocity below which its rows are left out, in m/s or rad/s.",
         ),
     ] = None,
     lock: Lock = None,

@@ -29,7 +29,7 @@ def sketch(
         str | None,
         typer.Option(
             metavar="JOINT=VALUE,...",
-            help="Active coordinates [m], [rad]; home for those that are not named.",
+            help="Active coordinates in m or rad; home for those that are not named.",
         ),
     ] = None,
     plane: Annotated[

@@ -57,7 +57,7 @@ Change = Annotated[
 ]
 Lock = Annotated[
     list[str] | None,
-    typer.Option(metavar="JOINT=VALUE", help="A joint that is held, and where [m], [rad]."),
+    typer.Option(metavar="JOINT=VALUE", help="A joint that is held, and where, in m or rad."),
 ]
 NoOpen = Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")]
 

@@ -187,7 +187,7 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
         friction={joint: value for joint, value in spec.friction.items() if joint not in lock},
         control={joint: value for joint, value in spec.control.items() if joint not in lock},
         forces=tuple(item for item in spec.forces if item.joint not in lock),
-        hydraulics=spec.hydraulics and spec.hydraulics.without(lock),
+        hydraulics=spec.hydraulics and spec.hydraulics.only(active or ()),
         gas_springs=tuple(item for item in spec.gas_springs if item.joint not in lock),
         end_stops=tuple(item for item in spec.end_stops if item.joint not in lock),
         tasks={

@@ -1,7 +1,7 @@
 """The hydraulic circuit of a machine as its file describes it."""
 
 import math
-from collections.abc import Container, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 
 from crane.errors import InputError
@@ -268,15 +268,15 @@ class Hydraulics:
         """The joints that it drives."""
         return tuple(self.cylinders)
 
-    def without(self, joints: Container[str]) -> "Hydraulics | None":
-        """The circuit without the cylinders and valves of some joints, None if none is left."""
-        rest = [joint for joint in self.cylinders if joint not in joints]
-        if not rest:
+    def only(self, joints: Iterable[str]) -> "Hydraulics | None":
+        """The circuit of some joints, in their order; None if it drives none of them."""
+        kept = [joint for joint in joints if joint in self.cylinders]
+        if not kept:
             return None
         return Hydraulics(
             self.supply,
             self.oil,
-            {joint: self.cylinders[joint] for joint in rest},
-            {joint: self.valves[joint] for joint in rest},
-            {joint: self.control[joint] for joint in rest if self.control},
+            {joint: self.cylinders[joint] for joint in kept},
+            {joint: self.valves[joint] for joint in kept},
+            {joint: self.control[joint] for joint in kept if self.control},
         )

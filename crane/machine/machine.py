@@ -267,7 +267,7 @@ class Machine:
                 {key: task for key, task in self.tasks.items() if same or task.space == "tip"}
             ),
             control=self.control if same else MappingProxyType({}),
-            hydraulics=_driving(self.hydraulics, names),
+            hydraulics=self.hydraulics and self.hydraulics.only(names),
         )
 
     def with_payload(self, payload: Payload) -> "Machine":
@@ -297,16 +297,3 @@ def fixed(array: Array) -> Array:
     out = array.copy()
     out.flags.writeable = False
     return out
-
-
-def _driving(circuit: Hydraulics | None, names: Sequence[str]) -> Hydraulics | None:
-    """The part of a circuit that drives some joints, in their order."""
-    kept = [name for name in names if circuit and name in circuit.cylinders]
-    if circuit is None or not kept:
-        return None
-    return dataclasses.replace(
-        circuit,
-        cylinders={name: circuit.cylinders[name] for name in kept},
-        valves={name: circuit.valves[name] for name in kept},
-        control={name: circuit.control[name] for name in kept if circuit.control},
-    )
