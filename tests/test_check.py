@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from broken import (
     whole,
     with_line,
 )
+from work import at_most
 
 import crane
 from crane.check import Report, check
@@ -161,7 +161,7 @@ GRAPH = [
         "two links without a parent and a ring",
         [
             "ground.urdf:45: error: 2 links have no parent (ground, lost): join all but one",
-            "ground.urdf:47: error: link 'a' is its own ancestor: cut the ring of joints at"
+            "ground.urdf:47: error: link 'a' is its own ancestor: cut the ring of joints ab, ba at"
             " 'ba' and close it as a loop",
         ],
         swap(
@@ -871,11 +871,11 @@ ODD = {
     "kinds.yaml": (
         b"name: 1\nchains: 5\nloops: 3\nactive: {a: 1}\ntip: [1]\ntasks: 4\nhome: 1e999\n"
     ),
-    "nested.yaml": b"[" * 100_000,
+    "nested.yaml": b"[" * 3_000,
     "nested.urdf": b'<robot name="r">' + b"<a>" * 100_000 + b"</a>" * 100_000 + b"</robot>",
-    "deep.urdf": tree(10_000, lambda i: i - 1).encode(),
-    "wide.urdf": tree(10_000, lambda i: 0, "1,5").encode(),
-    "strangers.urdf": tree(10_000, lambda i: f"x{i}").encode(),
+    "deep.urdf": tree(3_000, lambda i: i - 1).encode(),
+    "wide.urdf": tree(3_000, lambda i: 0, "1,5").encode(),
+    "strangers.urdf": tree(3_000, lambda i: f"x{i}").encode(),
     "large.yaml": b"name: x\n" + b"# comment\n" * 1_000_000,
 }
 
@@ -884,9 +884,8 @@ ODD = {
 def test_odd_files_are_findings_soon(name, tmp_path):
     path = tmp_path / name
     path.write_bytes(ODD[name])
-    begin = time.perf_counter()
-    report = check(path)
-    assert time.perf_counter() - begin < 20
+    with at_most(5000 + 5 * len(ODD[name])):  # work that grows as the file does
+        report = check(path)
     assert report.status == 2
     assert all(finding.file in (name, "") for finding in report.findings)
     assert all(str(finding).isprintable() for finding in report.findings)
@@ -902,7 +901,7 @@ def test_many_findings_end_somewhere(tmp_path):
 
 def test_a_tree_deeper_than_the_stack_is_refused(tmp_path):
     path = tmp_path / "deep.urdf"
-    path.write_text(tree(10_000, lambda i: i - 1).replace("continuous", "fixed", 9_500))
+    path.write_text(tree(3_000, lambda i: i - 1).replace("continuous", "fixed", 2_900))
     with pytest.raises(crane.CraneError, match="th in a row, join links to have at most 2000"):
         crane.load(path)
 

@@ -118,6 +118,7 @@ def massless(spec: MachineSpec) -> Iterator[DescriptionError]:
             joint.find("parent").get("link"), joint.find("child").get("link"), joint.get("type"),
         )
         for joint in spec.tree.iter("joint")
+        if joint.get("cut") is None
     }  # fmt: skip
     if not all(parent and child for parent, child, _ in ends.values()):
         return  # what has no place may be the mass that seems to be missing
