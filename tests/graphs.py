@@ -142,9 +142,7 @@ def chains(rng, folder):
         lines.append("loops:")
     for i, (one, two) in enumerate(zip(ends[::2], ends[1::2], strict=True)):
         kind = rng.choice(("revolute", "spherical"))
-        lines.append(
-            f"  - {{name: x{i}, type: {kind}, predecessor: l{one}, successor: l{two}}}"
-        )
+        lines.append(f"  - {{name: x{i}, type: {kind}, predecessor: l{one}, successor: l{two}}}")
     if rng.random() < 0.3 and len(joints) > 1:
         one, two = rng.sample(range(len(joints)), 2)
         lines += ["couplings:", f"  - {{name: y, joints: {{j{one}: 1, j{two}: -1}}}}"]
@@ -206,7 +204,7 @@ def mujoco(rng, folder):
         f'<mujoco model="odd">{more}<worldbody>{body(0)}</worldbody>'
         f"<equality>{''.join(lines)}</equality></mujoco>"
     )
-    return folder / "odd.xml", 0.2 <= odd
+    return folder / "odd.xml", odd >= 0.2
 
 
 def judge(kind, seed, folder):

@@ -21,7 +21,7 @@ from broken import (
     whole,
     with_line,
 )
-from work import at_most
+from work import TooMuchWorkError, at_most
 
 import crane
 from crane.check import Report, check
@@ -797,7 +797,7 @@ def run(*arguments, cwd=None):
         capture_output=True,
         text=True,
         cwd=cwd,
-        timeout=120,
+        timeout=300,
     )
 
 
@@ -871,7 +871,7 @@ ODD = {
     "kinds.yaml": (
         b"name: 1\nchains: 5\nloops: 3\nactive: {a: 1}\ntip: [1]\ntasks: 4\nhome: 1e999\n"
     ),
-    "nested.yaml": b"[" * 3_000,
+    "nested.yaml": b"[" * 1_200,
     "nested.urdf": b'<robot name="r">' + b"<a>" * 100_000 + b"</a>" * 100_000 + b"</robot>",
     "deep.urdf": tree(3_000, lambda i: i - 1).encode(),
     "wide.urdf": tree(3_000, lambda i: 0, "1,5").encode(),
@@ -889,6 +889,17 @@ def test_odd_files_are_findings_soon(name, tmp_path):
     assert report.status == 2
     assert all(finding.file in (name, "") for finding in report.findings)
     assert all(str(finding).isprintable() for finding in report.findings)
+
+
+def test_a_bound_on_work_ends_what_exceeds_it(tmp_path):
+    path = tmp_path / "wide.urdf"
+    path.write_bytes(ODD["wide.urdf"])
+    with at_most(10**9) as work:
+        check(path)
+    with pytest.raises(TooMuchWorkError, match="more than"), at_most(work.lines - 1):
+        check(path)
+    with at_most(work.lines):  # the same each time
+        check(path)
 
 
 def test_many_findings_end_somewhere(tmp_path):

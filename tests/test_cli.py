@@ -123,7 +123,7 @@ def test_interrupt_is_one_line_and_leaves_nothing(tmp_path, delay):
             process.wait(delay)
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGINT)
-        out, rest = process.communicate(timeout=60)
+        out, rest = process.communicate(timeout=300)
     assert (process.returncode, out) == (130, "")
     assert rest == "error: interrupted, nothing was written\n"
     assert list(tmp_path.iterdir()) == []

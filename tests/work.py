@@ -1,4 +1,4 @@
-"""How much a call computes: lines of the package that it runs, which no load on the machine changes."""
+"""How much a call computes: lines of the package that it runs, whatever else the machine does."""
 
 import sys
 from contextlib import contextmanager
