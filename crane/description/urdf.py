@@ -20,6 +20,7 @@ from crane.description.urdf_elements import (
 from crane.description.urdf_graph import MOVING, read_graph
 from crane.description.urdf_home import read_home, read_tip
 from crane.description.urdf_loops import independent, read_loops
+from crane.description.urdf_strangers import warn_of_strangers
 from crane.description.xml import XmlFile
 from crane.errors import DescriptionError, known
 
@@ -128,6 +129,7 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         for element in xml.root.iterfind(tag):
             note(xml.fail(element, f"<{tag}> is not read, URDF+ has <{now}> for it: write one"))
     links, joints = _named(xml, "link"), _named(xml, "joint")
+    warn_of_strangers(xml, _CHILDREN, _ATTRIBUTES, joints)
     if not links:
         raise xml.fail(xml.root, "no <link> in this file, add one")
     robot = etree.Element("robot", name=xml.root.get("name") or file.stem)
