@@ -483,6 +483,10 @@ UNITS = [
     seen(
         "degrees",
         [
+            "four_bar.yaml:14: warning: loop 'pin' can be assembled another way at home, and the "
+            "file does not say which is meant; under 'home:' write coupler: 1.045, rocker: "
+            "-0.5914 for the other (rocker 2.09 rad off) or coupler: -0.5875, rocker: 3.031 to "
+            "keep this one (rocker 1.53 rad off what it says)",
             "four_bar.yaml:15: warning: home of 'crank' is 69 rad, many turns, write "
             "radians if these are degrees",
             'ground.urdf:5: warning: rpy="0 0 90" turns more than once, write radians if '
@@ -594,7 +598,11 @@ MECHANISM = [
             "closed at home, outside of its limits 0 to 0.5, widen them or correct the home",
         ],
         swap('name="rocker" type="continuous"', 'name="rocker" type="revolute"', ROCKER),
-        swap('<axis xyz="0 0 1"/>', '<axis xyz="0 0 1"/><limit lower="0" upper="0.5"/>', ROCKER),
+        swap(
+            '<axis xyz="0 0 1"/>',
+            '<axis xyz="0 0 1"/><limit lower="0" upper="0.5" effort="1" velocity="1"/>',
+            ROCKER,
+        ),
     ),
     seen(
         "two loops stay open",

@@ -1,7 +1,10 @@
 """Every line that a user sees for well described parts that make no machine."""
 
 import pytest
-from broken import GROUND, MINI, ROCKER, assert_refused, case, swap
+from broken import GROUND, MINI, ROCKER, assert_refused, case, copy_machine, swap
+
+import crane
+from crane.errors import CraneError
 
 CHAIN_B1 = "urdf/mini_forwarder/chain_b1.urdf"
 CHAIN_C = "urdf/mini_forwarder/chain_c.urdf"
@@ -73,6 +76,20 @@ MECHANISM = [
         "four_bar.yaml:12: the loops leave crank no freedom to move: check the "
         "types and axes of the loops, and the axes of the joints",
         swap('<axis xyz="0 0 1"/>\n    <limit', '<axis xyz="0 1 0"/>\n    <limit', GROUND),
+        swap("type: revolute", "type: spherical"),
+    ),
+    case(
+        "joint about a wrong axis",
+        "ground.urdf:10: joint 'crank': its axis is 90 degrees off those of its neighbours "
+        "coupler, rocker, loop pin, so that it cannot move with them: turn it to "
+        '<axis xyz="0 0 1"/>',
+        swap('<axis xyz="0 0 1"/>\n    <limit', '<axis xyz="0 1 0"/>\n    <limit', GROUND),
+    ),
+    case(
+        "loop about an axis that is a little off",
+        "four_bar.yaml:10: loop 'pin': its axis is 5.71 degrees off those of its neighbours "
+        "crank, coupler, rocker, so that it cannot move with them: turn it to axis: [0, 0, 1]",
+        swap("successor: rocker_pin}", "successor: rocker_pin, axis: [0.1, 0, 1]}"),
     ),
     case(
         "loop that locks nothing",
@@ -217,8 +234,9 @@ MINI_FORWARDER = [
     ),
     case(
         "loop about a wrong axis",
-        "mini_forwarder.yaml:{line of active:}: 3 active joints (q1, X1, X2) for 2 "
-        "degrees of freedom: name only 2 of them, such as [q1, X2] (condition 2.75)",
+        "mini_forwarder.yaml:{line of - {name: A1}: loop 'A1_eye': its axis is 90 degrees off "
+        "those of its neighbours q4, q9, so that it cannot move with them: turn it to axis: "
+        "[0, 0, 1]",
         swap("successor: A1_eye, axis: [0, 0, 1]", "successor: A1_eye, axis: [0, 1, 0]", MINI),
         machine=MINI,
     ),
@@ -336,8 +354,9 @@ MINI_FORWARDER = [
     ),
     case(
         "joint axis out of the plane",
-        "mini_forwarder.yaml:{line of active:}: 3 active joints (q1, X1, X2) for 2 "
-        "degrees of freedom: name only 2 of them, such as [q1, X2] (condition 2.23)",
+        "chain_c.urdf:{line of <joint name=\"q9}: joint 'q9': its axis is 90 degrees off those "
+        "of its neighbours q4, loop A1_eye, so that it cannot move with them: turn it to "
+        '<axis xyz="0 0 1"/>',
         swap(
             '    <child link="link2"/>\n    <axis xyz="0 0 1"/>',
             '    <child link="link2"/>\n    <axis xyz="0 1 0"/>',
@@ -351,3 +370,18 @@ MINI_FORWARDER = [
 @pytest.mark.parametrize("broken", [*MECHANISM, *MINI_FORWARDER])
 def test_is_refused(broken, tmp_path):
     assert_refused(broken, tmp_path)
+
+
+@pytest.mark.parametrize("loop", ["A1_eye", "A2_eye", "J", "K"])
+@pytest.mark.parametrize(("axis", "angle"), [("0, 1, 0", "90"), ("0.3, 0, 0.4", "36.9")])
+def test_any_loop_about_a_wrong_axis_is_suspected_first(loop, axis, angle, tmp_path):
+    path = copy_machine(MINI, tmp_path)
+    lines = path.read_text().splitlines(keepends=True)
+    number = next(i for i, line in enumerate(lines) if f"name: {loop}, type" in line)
+    lines[number] = lines[number].replace("axis: [0, 0, 1]", f"axis: [{axis}]")
+    path.write_text("".join(lines))
+    with pytest.raises(CraneError) as caught:
+        crane.load(path)
+    start = f"mini_forwarder.yaml:{number + 1}: loop '{loop}': its axis is {angle} degrees off "
+    assert str(caught.value).startswith(start)
+    assert str(caught.value).endswith("turn it to axis: [0, 0, 1]")

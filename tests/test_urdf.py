@@ -802,8 +802,8 @@ LOOPS = [
     ),
     case(
         "loop about a wrong axis",
-        "four_bar_loop.urdf:45: loop 'pin' cannot be closed from the home guess "
-        "(crank = 0): it stays 0.101 m open, correct the frames or the guess",
+        "four_bar_loop.urdf:45: loop 'pin': its axis is 90 degrees off those of its neighbours "
+        'crank, coupler, rocker, so that it cannot move with them: turn it to <axis xyz="0 0 1"/>',
         swap('    <axis xyz="0 0 2"/>\n', "", LOOPED),
         machine=LOOPED,
     ),

@@ -50,13 +50,14 @@ def warn_of_strangers(
         joints: The `<joint>` elements by name.
     """
     found: dict[tuple[str, str], list[etree._Element]] = {}
-    for parent, tags in children.items():
+    elsewhere = set().union(*children.values())  # what has a place is an error in another
+    for parent in children:
         for element in [xml.root] if parent == xml.root.tag else xml.root.iter(parent):
             if not _is_read(element, children):
                 continue
             for child in element:
                 tag = child.tag
-                if not isinstance(tag, str) or tag in tags or tag in _FOREIGN.get(parent, ()):
+                if not isinstance(tag, str) or tag in elsewhere or tag in _FOREIGN.get(parent, ()):
                     continue
                 if not tag.startswith("{"):
                     found.setdefault((parent, tag), []).append(child)

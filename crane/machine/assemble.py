@@ -11,6 +11,7 @@ from crane.closure import Closure, frame_id
 from crane.description import LoopSpec, MachineSpec, inertia_problem
 from crane.description.findings import kept, note
 from crane.errors import DescriptionError, MechanismError
+from crane.machine.axes import wrong_axis
 from crane.samples import Array
 
 _NO_LIMIT = 1e9  # stands for infinity in the text handed to Pinocchio
@@ -61,17 +62,29 @@ def closed(
     Raises:
         MechanismError: The parts do not make a machine that can be driven; with file and line.
     """
-    active = active_joints(spec, model)
+    loops = spec.loops if loops is None else loops
     try:
-        return Closure(
-            model, spec.loops if loops is None else loops, active, guess, spec.couplings
-        )
+        return _closure(spec, model, guess, loops)
     except MechanismError as error:
+        if spec.active != () and (error.about == "active" or error.about.startswith("loop ")):
+
+            def close(changed: MachineSpec, some: Sequence[LoopSpec]) -> object:
+                tree = model if changed is spec else assemble(changed)
+                return _closure(changed, tree, guess, some)
+
+            if (suspect := wrong_axis(spec, model, loops, close)) is not None:
+                raise suspect from None
         where = spec.where.get(error.about, spec.path.name)
         hint = ""
         if spec.active == () and spec.path.suffix.lower() == ".urdf":
             hint = ', and mark what you choose with independent="true"'
         raise MechanismError(f"{where}: {error}{hint}", error.about) from None
+
+
+def _closure(
+    spec: MachineSpec, model: pin.Model, guess: Array, loops: Sequence[LoopSpec]
+) -> Closure:
+    return Closure(model, loops, active_joints(spec, model), guess, spec.couplings)
 
 
 def assemble(spec: MachineSpec) -> pin.Model:
