@@ -17,6 +17,7 @@ array per column, named like those of the CSV. What a crane's sensors tell inste
 displacements and forces, crane.measured turns into them.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -33,6 +34,7 @@ VELOCITY_UNITS = {"rad": "rad/s", "m": "m/s"}
 FORCE_UNITS = {"rad": "N m", "m": "N"}
 
 VELOCITY, FORCE = "_velocity", "_force"
+_LISTED = 40  # names in a message
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +99,8 @@ class Recording:
 
     def _check_names(self) -> None:
         names = self._names()
-        for name in names:
-            if names.count(name) > 1:
+        for name, count in Counter(names).items():
+            if count > 1:
                 raise RecordingError(f"column '{name}' is there twice, rename or remove one")
         if _some_joints(names) != self.joints:
             raise RecordingError(
@@ -264,7 +266,9 @@ def _array(
 
 
 def _listed(names: Iterable[str]) -> str:
-    return ", ".join(f"'{name}'" for name in names) or "none"
+    names = list(names)
+    more = [f"{len(names) - _LISTED} more"] if len(names) > _LISTED else []
+    return ", ".join([f"'{name}'" for name in names[:_LISTED]] + more) or "none"
 
 
 def find_joints(names: Sequence[str]) -> tuple[str, ...]:

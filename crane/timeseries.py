@@ -2,16 +2,16 @@
 
 Comment lines `# key: value`, then one header row `time [s],name [unit],...`, then one row per
 sample. A unit may be left out, for all columns but time. What is read is in SI units: columns in
-bar, deg, mm and others of `_TO_SI` are converted, those in units that are not there stay as they
-are. Numbers are written with the fewest digits that give the same float64 again.
+bar, deg, mm and others of `_TO_SI` are converted, those in other units stay as they are. Numbers
+are written with the fewest digits that give the same float64 again.
 """
 
 import csv
 import io
 import math
 import re
+import stat
 import warnings
-import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +19,15 @@ from pathlib import Path
 import numpy as np
 
 from crane.errors import RecordingError
+from crane.npz import MOST, MOST_COLUMNS, read_columns
 from crane.output import replacing
 from crane.samples import Array
 
 TIME = "time"
 _WORD = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
-_HEADING = re.compile(r"\s*([^\[\]]*?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*")
 _ROWS_AT_ONCE = 4096
+_BLOCK = 1 << 20  # bytes, and so many at most in a line
+_LONG_HEADING, _LONG_NAME = 1 << 16, 200  # characters
 
 # unit: (SI unit, a, b) with x a / b in SI units; two factors, so that 12.3 mm is 0.0123 m exactly
 _TO_SI = {
@@ -121,8 +123,14 @@ def read_csv(path: str | Path) -> Table:
     """
     path = Path(path)
     try:
+        check_plain(path)
+        lines = _count_lines(path)
         notes, heading, line = _head(path)
         units = _units(heading)
+        if (lines - line) * len(units) > MOST:
+            raise RecordingError(
+                f"holds {lines - line} lines of {len(units)} columns, give at most {MOST} numbers"
+            )
         return _in_si(Table(units, _values(path, line, units), notes))
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
@@ -137,30 +145,55 @@ def read_npz(path: Path) -> Table:
     """Read a table from arrays (N,) of equal length, named like the columns of a CSV.
 
     Raises:
-        RecordingError: The file does not exist or is not such a table.
+        RecordingError: The file does not exist, or as `crane.npz.read_columns`.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            columns = {name: np.asarray(file[name]) for name in file.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        reason = getattr(error, "strerror", None) or "is no npz file of arrays"
-        raise RecordingError(f"{path}: {reason.lower()}, give one") from None
-    count = max((len(x) for x in columns.values() if x.ndim == 1), default=0)
-    for name, column in columns.items():
-        if column.shape != (count,) or column.dtype.kind not in "biuf":
-            raise RecordingError(
-                f"{path}: '{name}' has the shape {column.shape} of {column.dtype}, give "
-                f"({count},) numbers per column"
-            )
-    if not count:
-        raise RecordingError(f"{path}: holds no samples, give an array per column")
+        check_plain(path)
+        names, values = read_columns(path)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(f"{path}: {reason}, give the path of an npz file") from None
     heading = io.StringIO()
-    csv.writer(heading).writerow(columns)
+    csv.writer(heading).writerow(names)
     try:
         units = _units(heading.getvalue().rstrip())
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
-    return _in_si(Table(units, np.column_stack(list(columns.values())).astype(np.float64), {}))
+    return _in_si(Table(units, values, {}))
+
+
+def check_plain(path: Path) -> None:
+    """See that a file ends, as devices and pipes need not.
+
+    Raises:
+        OSError: It is not there.
+        RecordingError: It is no plain file.
+    """
+    if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
+        raise RecordingError("is no plain file, copy it into one")
+
+
+def _count_lines(path: Path) -> int:
+    """Number of lines of a text.
+
+    Raises:
+        RecordingError: One of them is none, by its length.
+    """
+    ended, since = 0, 0  # lines, bytes of the one that has not ended
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            ends = block.replace(b"\r", b"\n")
+            first, last = ends.find(b"\n"), ends.rfind(b"\n")
+            since += first if first >= 0 else len(block)
+            if since > _BLOCK:
+                what = f"line {ended + 1} has more than {_BLOCK} bytes"
+                raise RecordingError(f"{what}, write one line per sample")
+            ended += block.count(b"\n") or block.count(b"\r")
+            if last >= 0:
+                since = len(block) - last - 1
+    return ended + (since > 0)
 
 
 def _in_si(table: Table) -> Table:
@@ -176,14 +209,25 @@ def _in_si(table: Table) -> Table:
 def _head(path: Path) -> tuple[dict[str, str], str, int]:
     """Notes, the header row, and its line number."""
     notes: dict[str, str] = {}
+    passed = 0  # characters
     with path.open(encoding="utf-8-sig") as file:
         for line, text in enumerate(file, start=1):
+            passed += len(text)
             text = text.strip()
             if text.startswith("#"):
                 key, _, value = text.removeprefix("#").partition(":")
                 notes[key.strip()] = value.strip()
             elif text:
+                if len(text) > _LONG_HEADING:
+                    raise RecordingError(
+                        f"line {line}, the header row, has {len(text)} characters, give at most "
+                        f"{_LONG_HEADING}"
+                    )
                 return notes, text, line
+            if passed > _BLOCK:
+                raise RecordingError(
+                    f"has no header row within {_BLOCK} characters, name the columns before"
+                )
     raise RecordingError("is empty, write a header row and one row per sample")
 
 
@@ -192,7 +236,12 @@ def _units(heading: str) -> dict[str, str]:
     for other in (";", "\t"):
         if other in heading and "," not in heading:
             raise RecordingError(f"separates columns by {other!r}, use commas")
-    cells = next(csv.reader([heading]))
+    try:
+        cells = next(csv.reader([heading]))
+    except csv.Error as error:
+        raise RecordingError(f"has a header row that is none ({error}), correct it") from None
+    if len(cells) > MOST_COLUMNS:
+        raise RecordingError(f"has {len(cells)} columns, give at most {MOST_COLUMNS}")
     if all(_number(cell) is not None for cell in cells):
         raise RecordingError(
             "has no header, name the columns in the first row (without '#'), "
@@ -200,10 +249,12 @@ def _units(heading: str) -> dict[str, str]:
         )
     units: dict[str, str] = {}
     for position, cell in enumerate(cells, start=1):
-        match = _HEADING.fullmatch(cell)
-        if match is None or not match[1]:
-            raise RecordingError(f"column {position} is headed '{cell}', write 'name [unit]'")
-        name, unit = match[1], match[2] or ""
+        name, unit = _heading(cell)
+        if not name or len(cell) > _LONG_NAME:
+            hint = f", at most {_LONG_NAME} characters" if name else ""
+            raise RecordingError(
+                f"column {position} is headed '{_shown(cell)}', write 'name [unit]'{hint}"
+            )
         if name in units:
             raise RecordingError(f"column '{name}' is there twice, rename or remove one")
         check_column(name, unit)
@@ -212,6 +263,23 @@ def _units(heading: str) -> dict[str, str]:
         raise RecordingError(f"no column '{TIME}' in the header, add '{TIME} [s]'")
     check_unit(TIME, units[TIME], spellings("s"))
     return units
+
+
+def _heading(cell: str) -> tuple[str, str]:
+    """Name and unit in 'name [unit]'; no name where it is something else."""
+    name, bracket, unit = cell.strip().partition("[")
+    if bracket:
+        if not unit.endswith("]"):
+            return "", ""
+        unit = unit[:-1]
+    if any(mark in part for part in (name, unit) for mark in "[]"):
+        return "", ""
+    return name.strip(), unit.strip()
+
+
+def _shown(cell: str) -> str:
+    cell = cell.strip()
+    return cell if len(cell) < 60 else cell[:60] + "..."
 
 
 def check_unit(column: str, unit: str, allowed: Iterable[str]) -> None:
@@ -236,7 +304,8 @@ def _values(path: Path, header: int, units: Mapping[str, str]) -> Array:
             )
     except ValueError as error:
         _find_fault(path, header, units)
-        raise RecordingError(f"{error}, correct the file") from None
+        reason = " ".join(str(error).split())[:120]
+        raise RecordingError(f"{reason}, correct the file") from None
     if not values.size:
         raise RecordingError("has a header and no samples, write one row per sample")
     if (
@@ -271,8 +340,8 @@ def _find_fault(path: Path, header: int, units: Mapping[str, str]) -> None:
                 value = _number(cell)
                 if value is None or not np.isfinite(value):
                     raise RecordingError(
-                        f"line {line}, column '{name}': '{cell.strip()}' is not a finite number, "
-                        f"correct or remove the line"
+                        f"line {line}, column '{name}': '{_shown(cell)}' is not a finite "
+                        f"number, correct or remove the line"
                     )
             now = float(cells[names.index(TIME)])
             if now <= last:

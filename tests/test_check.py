@@ -519,7 +519,8 @@ MESHES = [
         [
             "rocker.urdf:9: warning: mesh file 'package://gone/link.stl' is not there, "
             "correct its path or install the package that has it; a box is drawn instead",
-            "rocker.urdf:10: warning: mesh file 'broken.stl' cannot be read, export it again",
+            "rocker.urdf:10: warning: mesh file 'broken.stl' cannot be read (no triangles in it), "
+            "export it again; a box is drawn instead",
             "rocker.urdf:11: warning: mesh 'big.obj' is 300 m large, give it scale=\"0.001 "
             '0.001 0.001" if it is in millimetres',
         ],

@@ -2,6 +2,8 @@
 
 import re
 import sys
+import warnings
+from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
@@ -10,6 +12,7 @@ from broken import DATA
 from linkages import WRITERS, assert_same, postures, rewritten
 
 import crane
+from crane.description.mjcf_left_out import touching
 from crane.errors import CraneError, CraneWarning
 
 TREE = """<mujoco model="tree">
@@ -155,13 +158,76 @@ def test_bad_mjcf_is_refused(old, new, line, tmp_path):
     assert str(caught.value).isprintable()
 
 
+OFF = '<option><flag {}="disable"/></option>'
+TENDON = (
+    '<tendon><fixed name="rope" stiffness="2" range="0 1" limited="true">'
+    '<joint joint="crank" coef="1"/></fixed></tendon>'
+)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
         ("<mujoco>", '<mujoco><option gravity="0 0 -1.62"/>', "gravity is 0 0 -1.62 m/s2"),
-        ('name="wheel" axis', 'name="wheel" armature="0.1" axis', "armature of wheel is left out"),
+        (
+            'name="wheel" axis',
+            'name="wheel" armature="0.1" axis',
+            "armature of wheel (0.1 kg m2) is left out, a machine has none",
+        ),
         ('<connect name="side"', '<connect name="side" active="false"', "'side' is switched off"),
         ('name="ball" type', 'name="ball" damping="1" type', "of the ball joint 'ball' are left"),
+        ("<mujoco>", '<mujoco><option density="1"/>', "forces of the air are left out"),
+        ("<mujoco>", f"<mujoco>{OFF.format('gravity')}", "gravity is 0 0 0 m/s2, a machine's is"),
+        (
+            "<mujoco>",
+            f"<mujoco>{OFF.format('equality')}",
+            "constraints off, loops are closed here",
+        ),
+        ("<mujoco>", f"<mujoco>{OFF.format('actuation')}", "switches its actuators off, the join"),
+        (
+            "<mujoco>",
+            f'<mujoco>{OFF.format("frictionloss")}<default><joint frictionloss="1"/></default>',
+            "the file switches off what it calls frictionloss, it acts here",
+        ),
+        (
+            'name="crank" axis',
+            'name="crank" range="-90 90" axis',
+            "the limits of crank stop nothing",
+        ),
+        ('name="ball" type', 'name="ball" range="0 90" type', "the limit of the angle of ball is"),
+        (
+            'name="crank" axis',
+            'name="crank" actuatorfrcrange="-3 3" axis',
+            "limits of the force of crank (actuatorfrcrange) are left out",
+        ),
+        (
+            'body name="wheel"',
+            'body name="wheel" gravcomp="1"',
+            "gravity compensation is left out",
+        ),
+        (
+            "<worldbody>",
+            '<worldbody><body name="hand" mocap="true"><site/></body>',
+            "hand stand still, which a program moves in MuJoCo (mocap)",
+        ),
+        ("<actuator>", f"{TENDON}<actuator>", "stiffness, limits of tendons (rope) are left out"),
+        *(
+            ('<motor name="drive"', f'<{kind} name="drive"', "limits of the actuators drive are")
+            for kind in (
+                'motor gear="2"',
+                'motor ctrlrange="-1 1"',
+                'motor forcerange="-1 1"',
+                'position kp="3"',
+                'velocity kv="3"',
+                'general dyntype="filter" dynprm="0.1"',
+            )
+        ),
+        (
+            "<worldbody>",
+            '<worldbody><geom name="floor" type="plane" size="1 1 1"/>',
+            "contacts of 6 geoms (floor, one of crank, one of rod, one of rocker, one of wheel, "
+            "one of plate) are left out, nothing stops the machine there",
+        ),
     ],
 )
 def test_what_is_left_out_of_mjcf_is_told(old, new, line, tmp_path):
@@ -173,6 +239,137 @@ def test_what_is_left_out_of_mjcf_is_told(old, new, line, tmp_path):
     (tmp_path / "odd.xml").write_text(text)
     with pytest.warns(CraneWarning, match=re.escape(line)):
         crane.load(tmp_path / "odd.xml")
+
+
+def test_a_motor_alone_and_shapes_that_do_not_touch_are_no_news(tmp_path):
+    pytest.importorskip("mujoco")
+    text = LOOPED.replace("<worldbody>", '<default><geom contype="0"/></default><worldbody>')
+    (tmp_path / "plain.xml").write_text(text)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CraneWarning)
+        crane.load(tmp_path / "plain.xml")
+    (tmp_path / "off.xml").write_text(
+        LOOPED.replace("<mujoco>", "<mujoco>" + OFF.format("contact"))
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CraneWarning)
+        crane.load(tmp_path / "off.xml")
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_shapes_that_can_touch_are_those_that_mujoco_finds(seed):
+    """Balls in one place touch wherever MuJoCo lets them."""
+    mujoco = pytest.importorskip("mujoco")
+    rng = np.random.default_rng(seed)
+    root = ElementTree.Element("mujoco")
+    bodies = [ElementTree.SubElement(root, "worldbody")]
+    names = ["world"]
+    if rng.random() < 0.3:
+        flag = ElementTree.SubElement(ElementTree.SubElement(root, "option"), "flag")
+        flag.set("filterparent", "disable")
+    for i in range(rng.integers(2, 7)):
+        names.append(f"b{i}")
+        bodies.append(
+            ElementTree.SubElement(bodies[rng.integers(len(bodies))], "body", name=names[-1])
+        )
+        if i == 0 or rng.random() < 0.7:
+            ElementTree.SubElement(bodies[-1], "joint")
+        masks = {"contype": str(rng.integers(0, 4)), "conaffinity": str(rng.integers(0, 4))}
+        ElementTree.SubElement(bodies[-1], "geom", size="0.1", name=f"g{i}", **masks)
+    ElementTree.SubElement(bodies[0], "geom", size="0.1", conaffinity=str(rng.integers(0, 4)))
+    contact = ElementTree.SubElement(root, "contact")
+    for _ in range(rng.integers(0, 3)):
+        one, two = rng.choice(names, 2, replace=False)
+        ElementTree.SubElement(contact, "exclude", body1=one, body2=two)
+    if rng.random() < 0.3:
+        ElementTree.SubElement(contact, "pair", geom1="g0", geom2="g1")
+    model = mujoco.MjModel.from_xml_string(ElementTree.tostring(root, encoding="unicode"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    found = {int(geom) for contact in data.contact for geom in contact.geom}
+    off = {"FILTERPARENT"} if root.find("option") is not None else set()
+    assert set(touching(model, off)) == found
+
+
+MANY = [  # instead of the first body of a file, and what is told
+    (
+        '<replicate count="1000000000" offset="1 0 0">{}</replicate>',
+        "<replicate> stands for 4e+09 el",
+    ),
+    (
+        '<replicate count="1e300" offset="1 0 0">{}</replicate>',
+        "<replicate> stands for 4e+300 eleme",
+    ),
+    (
+        '<replicate count="90" offset="1 0 0"><frame><replicate count="90" offset="0 1 0">{}'
+        "</replicate></frame></replicate>",
+        "<replicate> stands for 32580 elements by its copies, make at most 10000",
+    ),
+    ('<composite type="cable" count="99999 1 1"/>{}', "<composite> stands for 99999 elements by"),
+    ('<flexcomp name="f" type="grid" count="999 999 999"/>{}', "flexible bodies are no machine's"),
+    (
+        '{}</worldbody><asset><hfield name="h" nrow="99999" ncol="99999" size="1 1 1 1"/></asset>'
+        "<worldbody>",
+        'nrow="99999" ncol="99999" of <hfield> is too large, make it at most 10000000',
+    ),
+    (
+        '{}</worldbody><asset><texture name="h" builtin="flat" width="99999" height="9999"/>'
+        "</asset><worldbody>",
+        "of <texture> is too large, make it at most",
+    ),
+    ('{}</worldbody><size nkey="99999999"/><worldbody>', 'nkey="99999999" of <size> is too large'),
+    ('{}</worldbody><size nuserdata="99999999"/><worldbody>', 'nuserdata="99999999" of <size> is'),
+    (
+        '{}</worldbody><sensor><user dim="99999999"/></sensor><worldbody>',
+        'dim="99999999" of <user>',
+    ),
+    (
+        '{}</worldbody><asset><mesh name="m" builtin="cone" params="99999 1"/></asset><worldbody>',
+        'params="99999 1" of <mesh> is too large, make it at most 1000',
+    ),
+]
+ONE = '<body><joint/><geom size="0.1"/></body>'
+
+
+@pytest.mark.parametrize(("around", "line"), MANY)
+def test_what_would_take_days_is_not_begun(around, line, tmp_path, monkeypatch):
+    mujoco = pytest.importorskip("mujoco")
+
+    def begun(_):
+        raise AssertionError("MuJoCo was asked to make it")
+
+    monkeypatch.setattr(mujoco.MjModel, "from_xml_path", begun)
+    text = f"<mujoco><worldbody>\n{around.format(ONE)}</worldbody></mujoco>"
+    (tmp_path / "many.xml").write_text(text)
+    with pytest.raises(CraneError, match=re.escape(line)) as caught:
+        crane.load(tmp_path / "many.xml")
+    assert str(caught.value).startswith("many.xml:2: ") and len(str(caught.value)) < 200
+
+
+def test_copies_of_other_files_are_counted(tmp_path, monkeypatch):
+    """A model that attaches another a hundred times, which attaches another a hundred times."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "m0.xml").write_text(f"<mujoco><worldbody>{ONE * 9}</worldbody></mujoco>")
+    for i in range(3):
+        attached = '<attach model="m" prefix="{}_"/>'
+        several = "".join(attached.format(k) for k in range(100))
+        asset = f'<asset><model name="m" file="m{i}.xml"/></asset>'
+        text = f"<mujoco>{asset}<worldbody>{several}</worldbody></mujoco>"
+        (tmp_path / f"m{i + 1}.xml").write_text(text)
+    with pytest.raises(
+        CraneError, match=r"m\d\.xml:1: <\w+> stands for \d+ elements by its copies"
+    ):
+        crane.load(tmp_path / "m3.xml")
+    (tmp_path / "parts.xml").write_text(f"<mujocoinclude>{ONE}</mujocoinclude>")
+    copied = '<replicate count="{}" offset="1 0 0"><include file="parts.xml"/></replicate>'
+    for count in (3, 3000):
+        text = f"<mujoco><worldbody>{copied.format(count)}</worldbody></mujoco>"
+        (tmp_path / "main.xml").write_text(text)
+        if count == 3:
+            assert len(crane.load(tmp_path / "main.xml").joints) == 3
+        else:
+            with pytest.raises(CraneError, match="<replicate> stands for 18000 elements"):
+                crane.load(tmp_path / "main.xml")
 
 
 def test_without_mujoco_the_error_says_how_to_install_it(tmp_path, monkeypatch):

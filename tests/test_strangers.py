@@ -8,7 +8,7 @@ from broken import DATA, LOOPED, copy_machine, swap
 import crane
 import crane.view.visuals
 from crane.check import check
-from crane.description.mesh_file import mesh_file
+from crane.description.meshes import mesh_file
 from crane.errors import CraneWarning
 from crane.formats import write_urdf_plus
 

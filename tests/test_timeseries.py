@@ -1,10 +1,12 @@
 import math
+import os
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from crane import timeseries
 from crane.errors import RecordingError
 from crane.timeseries import Table, read, read_csv, read_npz, spellings, write
 
@@ -164,3 +166,55 @@ def test_time_in_milliseconds(tmp_path):
     table = read_text(tmp_path, "a,time [ms]\n1,10\n2,30\n")
     assert table.units == {"a": "", "time": "s"}
     np.testing.assert_array_equal(table.values[:, 1], [0.01, 0.03])
+
+
+LONG = {  # bytes, and what is told
+    "heading": (b"time [s]," + b"a" * (1 << 17), "line 1, the header row, has 131081 characters"),
+    "name": (
+        b"time [s]," + b"a" * 300 + b"\n0,1\n",
+        "...', write 'name [unit]', at most 200 characters",
+    ),
+    "blanks": (b"time [s]," + b" " * 60_000 + b"]\n0,1\n", "column 2 is headed ']', write"),
+    "columns": (b"time [s]" + b",a" * 5000 + b"\n", "has 5001 columns, give at most 4096"),
+    "line": (GOOD.encode() + b"1" * (3 << 20), "line 4 has more than 1048576 bytes, write one"),
+    "lines of zeros": (b"\0" * (3 << 20), "line 1 has more than 1048576 bytes"),
+    "notes": (b"# note\n" * 200_000, "has no header row within 1048576 characters"),
+    "cell": (GOOD.encode() + b"1,2," + b"x" * 90_000, "'" + "x" * 60 + "...' is not a finite"),
+}
+
+
+@pytest.mark.parametrize(("data", "message"), LONG.values(), ids=LONG)
+def test_long_lines(tmp_path, data, message):
+    path = tmp_path / "table.csv"
+    path.write_bytes(data)
+    with pytest.raises(RecordingError) as caught:
+        read(path)
+    assert message in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize("end", ["\n", "\r", "\r\n"])
+def test_lines_across_blocks_are_counted(tmp_path, monkeypatch, end):
+    """Whatever the size of the blocks that are looked at, and however lines end."""
+    (tmp_path / "table.csv").write_text(GOOD.replace("\n", end), newline="")
+    for size in range(16, 40):  # the header row has 16 characters
+        monkeypatch.setattr("crane.timeseries._BLOCK", size)
+        assert timeseries._count_lines(tmp_path / "table.csv") in (3, 4)
+    monkeypatch.setattr("crane.timeseries._BLOCK", 15)
+    with pytest.raises(RecordingError, match="line 1 has more than 15 bytes"):
+        timeseries._count_lines(tmp_path / "table.csv")
+
+
+def test_more_numbers_than_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr("crane.timeseries.MOST", 8)
+    with pytest.raises(RecordingError, match="holds 3 lines of 3 columns, give at most 8 numbers"):
+        read_text(tmp_path, GOOD + "1,2,3\n")
+    assert len(read_text(tmp_path, GOOD).values) == 2
+
+
+def test_a_pipe_is_no_file(tmp_path):
+    """It would be waited for until somebody writes into it."""
+    for name in ("table.csv", "table.npz"):
+        os.mkfifo(tmp_path / name)
+        with pytest.raises(RecordingError, match="is no plain file, copy it into one"):
+            read(tmp_path / name)

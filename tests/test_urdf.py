@@ -331,16 +331,6 @@ BODIES = [
             GROUND,
         ),
     ),
-    case(
-        "origin of a visual",
-        "ground.urdf:3: xyz=\"1 2\" of the origin of a visual of link 'pin_B' has 2 "
-        "numbers, give 3",
-        swap(
-            '<link name="pin_B"/>',
-            '<link name="pin_B"><visual><origin xyz="1 2"/><geometry/></visual></link>',
-            GROUND,
-        ),
-    ),
 ]
 
 # Joints that cannot be.

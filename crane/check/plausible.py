@@ -11,9 +11,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from lxml import etree
 
-from crane.check.geometry import Bounds, extent, mesh_bounds, meshes, numbers
+from crane.check.geometry import Bounds, extents, numbers
 from crane.description import MachineSpec, inertia_problem
-from crane.description.mesh_file import mesh_file
+from crane.description.visuals import Drawn, Mesh, read_drawn
 from crane.description.xml import XmlFile
 from crane.errors import CraneWarning
 from crane.samples import Array
@@ -33,12 +33,16 @@ Large = list[tuple[etree._Element, str]]
 def implausible(files: Sequence[XmlFile], spec: MachineSpec | None) -> None:
     """Warn of what is hardly meant, in files that could be parsed and in the home posture."""
     for xml in {xml.file: xml for xml in files}.values():
-        _warn_meshes(xml)
+        drawn = read_drawn(xml, ("visual", "collision"))
+        _warn_drawn(drawn)
         _warn_angles(xml)
         if not _warn_lengths(xml):  # sizes in other units say nothing about inertias
             reaches = _reaches(xml)
+            # visuals count; where there are none, what a link collides with
+            bounds = extents(drawn.shapes["collision"]) | extents(drawn.shapes["visual"])
             for link in xml.root.iterfind("link"):
-                _warn_body(xml, link, reaches.get(link.get("name", ""), 0.0))
+                name = link.get("name", "").strip()
+                _warn_body(xml, link, reaches.get(name, 0.0), bounds.get(name))
     if spec is not None:
         _warn_home(spec)
 
@@ -115,34 +119,28 @@ def _warn_home(spec: MachineSpec) -> None:
             )
 
 
-def _warn_meshes(xml: XmlFile) -> None:
-    seen = set()
-    for mesh, name in meshes(xml):
-        if name in seen:
-            continue
-        seen.add(name)
-        shown = name if len(name) < 100 else f"...{name[-100:]}"
-        path = mesh_file(name, xml.file.parent)
-        if path is None:
+def _warn_drawn(drawn: Drawn) -> None:
+    for name, where in drawn.missing.items():
+        _warn(
+            f"{where}: mesh file '{name}' is not there, correct its path or "
+            "install the package that has it; a box is drawn instead"
+        )
+    for problem in drawn.problems:
+        _warn(problem)
+    sizes: dict[str, Array] = {}
+    for visual in (*drawn.shapes["visual"], *drawn.shapes["collision"]):
+        if isinstance(visual.shape, Mesh):
+            size = np.ptp(visual.shape.vertices, axis=0)
+            sizes[visual.mesh] = np.maximum(size, sizes.get(visual.mesh, 0.0))
+    for mesh, size in sizes.items():
+        if size.max() > _FAR:
             _warn(
-                f"{xml.where(mesh)}: mesh file '{shown}' is not there, correct its path or "
-                "install the package that has it; a box is drawn instead"
-            )
-            continue
-        bounds = mesh_bounds(path)
-        if bounds is None:
-            _warn(f"{xml.where(mesh)}: mesh file '{shown}' cannot be read, export it again")
-            continue
-        scale = numbers(mesh, "scale", 3)
-        size = np.abs((bounds[1] - bounds[0]) * (1.0 if scale is None else scale)).max()
-        if size > _FAR:
-            _warn(
-                f"{xml.where(mesh)}: mesh '{shown}' is {size:.3g} m large, give it "
+                f"{mesh} is {size.max():.3g} m large, give it "
                 'scale="0.001 0.001 0.001" if it is in millimetres'
             )
 
 
-def _warn_body(xml: XmlFile, link: etree._Element, reach: float) -> None:
+def _warn_body(xml: XmlFile, link: etree._Element, reach: float, bounds: Bounds | None) -> None:
     inertial = link.find("inertial")
     if inertial is None:
         return
@@ -159,7 +157,7 @@ def _warn_body(xml: XmlFile, link: etree._Element, reach: float) -> None:
     radius = math.sqrt(float(np.linalg.eigvalsh(tensor).max()) / float(mass[0]))
     reach = max(reach, 0.0 if com is None else float(np.linalg.norm(com)))
     name = link.get("name")
-    for where, problem in _misfits(extent(xml, link), reach, radius, com, float(mass[0])):
+    for where, problem in _misfits(bounds, reach, radius, com, float(mass[0])):
         place = {"mass": mass_tag, "origin": origin, "inertia": tensor_tag}[where]
         _warn(f"{xml.where(place)}: link '{name}' {problem}")
 

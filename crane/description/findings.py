@@ -144,6 +144,16 @@ def note(error: CraneError, harmless: bool = False) -> None:
         raise error
 
 
+@contextmanager
+def aside() -> Iterator[None]:
+    """Whatever is raised within is raised, and not written down."""
+    token = _current.set(None)
+    try:
+        yield
+    finally:
+        _current.reset(token)
+
+
 def noted(file: "XmlFile") -> None:
     """Keep a parsed file for further checks."""
     if (found := _current.get()) is not None:

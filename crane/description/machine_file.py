@@ -13,6 +13,7 @@ from crane.description.forces_section import (
     read_friction,
     read_gas_springs,
 )
+from crane.description.open_loops import warn_of_open_loops
 from crane.description.parallel_robots import is_parallel_robot, read_parallel_robot
 from crane.description.section import Section
 from crane.description.sources import find
@@ -48,6 +49,12 @@ def read(name: str | Path) -> MachineSpec:
         DescriptionError: With file, line, what is wrong, and the names that exist.
     """
     path = find(name)
+    spec = _read(path)
+    warn_of_open_loops(spec)
+    return spec
+
+
+def _read(path: Path) -> MachineSpec:
     suffix = path.suffix.lower()
     if suffix == ".urdf" or (suffix in (".xml", ".mjcf") and is_urdf(path)):
         return _read_single(path)

@@ -9,14 +9,13 @@ from lxml import etree
 
 from crane.description.clean import add_joint, add_link, text
 from crane.description.mjcf_equality import Frames, read_equality
+from crane.description.mjcf_left_out import warn_of_the_rest
 from crane.description.mujoco_file import MujocoFile
 from crane.description.series import names_of, parts_of
 from crane.description.spec import Chain, ForceElement, Friction, MachineSpec
 from crane.description.tree import Tree
 from crane.description.urdf import Urdf
 from crane.errors import DescriptionError
-
-_GRAVITY = (0.0, 0.0, -9.81)
 
 
 @dataclass(frozen=True)
@@ -63,10 +62,6 @@ class _Reader:
     def spec(self) -> MachineSpec:
         """The machine."""
         mjcf = self.mjcf
-        if self.model.nflex:
-            raise DescriptionError(
-                f"{mjcf.file.name}: flexible bodies are no machine's, leave out"
-            )
         joints = [self._name("JOINT", i) for i in range(self.model.njnt)]
         self.names = joints
         for body in range(self.model.nbody):
@@ -82,7 +77,7 @@ class _Reader:
             add_link(self.robot, link)
             add_joint(self.robot, fixed, "fixed", place, (self.bodies[body], link))
             self.lines["link", link] = self.lines["joint", fixed] = frames.where[link]
-        self._warn_of_the_rest()
+        warn_of_the_rest(mjcf, joints)
         urdf = Urdf(
             mjcf.file,
             self.robot,
@@ -123,11 +118,9 @@ class _Reader:
 
     def _name(self, kind: str, index: int) -> str:
         """Name of a body or joint, invented where it has none."""
-        if name := self.mjcf.name(kind, index).strip():
-            return name
         if kind == "BODY":
-            return f"body{index}"
-        return f"joint{index + 1}"
+            return self.mjcf.body(index)
+        return self.mjcf.name(kind, index).strip() or f"joint{index + 1}"
 
     def _link(self, wanted: str) -> str:
         """A name for a link that no body and no other link has."""
@@ -302,33 +295,6 @@ class _Reader:
         if tip:
             self.mjcf.warn(f"the text 'tip' names no moving body or site '{tip}', it is left out")
         return None if tip else tree.only_leaf()
-
-    def _warn_of_the_rest(self) -> None:
-        """What MuJoCo would compute with and a machine does not have."""
-        model, warn = self.model, self.mjcf.warn
-        if not np.allclose(model.opt.gravity, _GRAVITY, rtol=0, atol=1e-9):
-            given = " ".join(f"{x:g}" for x in model.opt.gravity)
-            warn(f"gravity is {given} m/s2, a machine's is 0 0 -9.81")
-        # newer versions of MuJoCo have more than older ones
-        for what, values in (
-            ("armature", model.dof_armature),
-            ("nonlinear damping", getattr(model, "dof_dampingpoly", np.zeros(model.nv))),
-        ):
-            dofs = np.flatnonzero(np.any(np.reshape(values, (model.nv, -1)), axis=1))
-            joints = dict.fromkeys(self.names[model.dof_jntid[dof]] for dof in dofs)
-            if joints:
-                warn(f"{what} of {', '.join(joints)} is left out, a machine has none")
-        if np.any(getattr(model, "jnt_stiffnesspoly", 0)):
-            warn("nonlinear stiffness of joints is left out, write gas_springs or forces")
-        if np.any(model.body_gravcomp):
-            warn("gravity compensation is left out, write constant forces")
-        if model.opt.density or model.opt.viscosity:
-            warn("forces of the air are left out")
-        acting = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss)
-        if any(np.any(values) for values in acting):
-            warn("stiffness, damping and friction of tendons are left out")
-        if model.nplugin:
-            warn("plugins are left out")
 
 
 def _rotation(quaternion: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import Any
 
 from lxml import etree
 
+from crane.description.mjcf_bounds import copies
 from crane.description.xml import XmlFile
 from crane.errors import CraneWarning, DescriptionError
 
@@ -33,6 +34,7 @@ class MujocoFile:
     def __init__(self, file: Path):
         self.file = file
         self._files: list[XmlFile] = []
+        self._sizes: dict[Path, int] = {}
         self._open(file, [])
         try:
             import mujoco
@@ -51,27 +53,38 @@ class MujocoFile:
         for text in told:
             self.warn(f"MuJoCo says {' '.join(text.split())}")
 
-    def _open(self, file: Path, above: list[Path]) -> None:
-        """Read a file and what it includes, strictly."""
+    def _open(self, file: Path, above: list[Path], wanted: str = "mujoco") -> int:
+        """Read a file and what it includes, strictly; the number of elements it stands for."""
         if file in above:
             raise DescriptionError(f"{above[-1].name}: includes {file.name} in a circle, break it")
+        if file in self._sizes:
+            return self._sizes[file]
         xml = XmlFile(file)
-        wanted = "mujocoinclude" if above else "mujoco"
         if xml.root.tag not in {wanted, "mujoco"}:
             raise xml.fail(
                 xml.root, f"a MJCF file starts with <{wanted}>, this file with <{xml.root.tag}>"
             )
         self._files.append(xml)
-        for include in xml.root.iter("include"):
-            name = include.get("file", "")
-            part = self._files[0].file.parent / name
+        included, models = {}, {}
+        for part in xml.root.iter("include", "model"):
+            name = part.get("file", "")
+            other = self._files[0].file.parent / name
             try:
-                is_there = bool(name) and part.is_file()
-            except OSError:  # a name longer than any file's
+                is_there = bool(name) and other.is_file()
+            except (OSError, ValueError):  # a name longer than any file's
                 is_there = False
             if not is_there:
-                raise xml.fail(include, f"there is no file '{name}' to include, check the path")
-            self._open(part, [*above, file])
+                raise xml.fail(
+                    part, f"there is no file '{name[:100]}' to {part.tag}, check the path"
+                )
+            above_it = [*above, file]
+            if part.tag == "include":
+                included[name] = self._open(other, above_it, "mujocoinclude")
+            else:
+                stem = part.get("name") or other.stem
+                models[stem] = self._open(other, above_it)
+        self._sizes[file], _ = copies(xml, included, models)
+        return self._sizes[file]
 
     def _refused(self, text: str) -> DescriptionError:
         """MuJoCo's words, which span lines, as one line with the place."""
@@ -99,6 +112,20 @@ class MujocoFile:
     def kind(self, family: str, value: int) -> str:
         """Name of a value of an enumeration of MuJoCo, such as HINGE of "Joint"."""
         return str(getattr(self._mujoco, f"mjt{family}")(value).name).partition("_")[2]
+
+    def body(self, index: int) -> str:
+        """Name of a body, invented where it has none."""
+        return self.name("BODY", index).strip() or f"body{index}"
+
+    @property
+    def switched_off(self) -> set[str]:
+        """What the file switches off of MuJoCo's computing, such as CONTACT."""
+        bits = self._mujoco.mjtDisableBit.__members__
+        return {
+            name.partition("_")[2]
+            for name, bit in bits.items()
+            if name.startswith("mjDSBL_") and self.model.opt.disableflags & int(bit)
+        }
 
     def where(self, name: str, *tags: str) -> str:
         """File and line of the element with a name, as far as it can be found."""

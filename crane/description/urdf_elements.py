@@ -47,9 +47,6 @@ def write_link(
         if any(map(any, xml.placement(link, what))):
             raise xml.fail(link, f"{what} has an <origin>, which is its joint's: move it there")
     with kept(harmless=True):
-        for drawn in (*link.iterfind("visual"), *link.iterfind("collision")):
-            xml.placement(drawn, f"a {drawn.tag} of {what}")
-    with kept(harmless=True):
         inertial = xml.only(link, "inertial", what)
         if inertial is not None:
             clean.set("refused", "inertial")

@@ -13,7 +13,7 @@ from lxml import etree
 
 from crane.description import Coupling
 from crane.description.clean import add_joint, add_link, text
-from crane.description.mesh_file import mesh_file
+from crane.description.meshes import mesh_file
 from crane.errors import CraneWarning
 from crane.machine import Machine
 from crane.samples import Array

@@ -6,7 +6,7 @@ from pathlib import Path
 import pinocchio as pin
 from lxml import etree
 
-from crane.description.mesh_file import mesh_file
+from crane.description.meshes import mesh_file
 from crane.samples import Array
 
 _TENSOR = {

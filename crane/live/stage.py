@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from crane.description.visuals import Box, Cylinder, Mesh, Sphere, Visual
 from crane.live.session import Session, round_up
 from crane.samples import Array
-from crane.view.visuals import Box, Cylinder, Mesh, Sphere, Visual, read_visuals
+from crane.view.visuals import read_visuals
 
 _VIEW = np.array([0.55, -1.0, 0.45])  # from what is looked at to the camera, over its size
 _FIELD = 40.0  # of view, upright [deg]

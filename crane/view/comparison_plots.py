@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from crane.recording import FORCE_UNITS
 from crane.replays import Channel, Comparison
 from crane.summary import READING_UNITS
+from crane.view.figure_text import plain
 from crane.view.plots import DASHED, RECORDED, write_figure
 
 _ACROSS = 3
@@ -43,9 +44,10 @@ def _figure(comparison: Comparison) -> Figure:
         axes.plot(time, scale * channel.measured[::every], color=RECORDED, label="measured")
         axes.plot(time, scale * channel.simulated[::every], label="simulated", **DASHED)
         label = f" [{unit}]" if unit else ""
-        axes.set_ylabel(f"{channel.name.replace('$', '')}{label}")
+        axes.set_ylabel(plain(f"{channel.name}{label}"))
         axes.set_title(
-            f"RMS {scale * channel.rms:.3g} {unit}, {100 * channel.relative:.3g} %", fontsize=8
+            plain(f"RMS {scale * channel.rms:.3g} {unit}, {100 * channel.relative:.3g} %"),
+            fontsize=8,
         )
         axes.margins(x=0.0)
     for axes in panels[count:]:

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from crane.description.visuals import Box, Cylinder, Mesh, Sphere, Visual
 from crane.samples import Array
-from crane.view.visuals import Box, Cylinder, Mesh, Sphere, Visual
 
 _SKY, _HAZE, _GRID = [0.80, 0.87, 0.93], [0.97, 0.97, 0.95], 0xB4BAC0
 _UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])

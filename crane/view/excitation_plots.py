@@ -10,6 +10,7 @@ from crane.identification.excitation import Excitation
 from crane.output import replacing
 from crane.recording import FORCE_UNITS
 from crane.summary import READING_UNITS
+from crane.view.figure_text import plain
 from crane.view.plots import DASHED, FAINT, RECORDED, STYLE
 
 _MOST = 2000  # instants that a line needs
@@ -48,6 +49,6 @@ def plot_excitation(excitation: Excitation, path: str | Path) -> None:
                 )
                 axes.set_ylabel(f"{what} [{label}]")
                 axes.margins(x=0.0)
-            grid[0, i].set_title(joint.replace("$", r"\$"))
+            grid[0, i].set_title(plain(joint))
             grid[2, i].set_xlabel("time [s]")
         figure.savefig(part, format="png", dpi=200)

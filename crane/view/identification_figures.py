@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from crane.identification.result import Comparison
 from crane.samples import Array
+from crane.view.figure_text import plain
 from crane.view.plots import DASHED, INK
 
 _SEGMENTS = 8  # of a recording, whose periodograms are averaged
@@ -66,6 +67,7 @@ def spectrum_figure(fits: list[tuple[str, Comparison, str]], i: int, unit: str) 
 
 def matrix_figure(R: Array, names: Sequence[str]) -> Figure:
     """A correlation matrix (r, r) in colours, columns in the order of the named rows."""
+    names = [plain(name) for name in names]
     size = float(np.clip(0.11 * len(names), 4.0, 9.0))
     letters = float(np.clip(60 * size / max(len(names), 1), 3.0, 7.5))
     beside = 0.0095 * letters * max(map(len, names)) + 0.1  # [inch]

@@ -20,6 +20,7 @@ from crane.output import replacing
 from crane.recording import FORCE_UNITS, Recording
 from crane.samples import Array
 from crane.summary import READING_UNITS, points
+from crane.view.figure_text import plain
 
 FORMATS: dict[str, dict[str, None] | None] = {  # with the date left out of what is written
     "png": None,
@@ -246,7 +247,7 @@ def _caption(figure: Figure, recording: Recording) -> None:
     machine = Path(recording.machine).stem.replace("_", " ")
     words = ": ".join(word for word in (machine, recording.task) if word)
     if words:
-        figure.suptitle(words, x=0.01, ha="left", fontsize=11, fontweight="bold")
+        figure.suptitle(plain(words), x=0.01, ha="left", fontsize=11, fontweight="bold")
     lines = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
     if "reference" in lines:
         shown = [lines["recording"], lines["reference"]]
@@ -257,4 +258,4 @@ def joint_symbol(name: str) -> str:
     """A joint's name as mathematics where it is a letter and a number, q1 as q with index 1."""
     if match := re.fullmatch(r"([A-Za-z])(\d+)", name):
         return f"${match[1]}_{{{match[2]}}}$"
-    return name.replace("$", r"\$")
+    return plain(name)

@@ -7,17 +7,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
+from crane.description.visuals import Visual
 from crane.errors import InputError
 from crane.machine import Machine
 from crane.samples import Array
 from crane.view.drawing import Recorder, draw_surroundings, draw_visuals
 from crane.view.page_motion import frame_rows, postures
-from crane.view.visuals import Visual, read_visuals
+from crane.view.visuals import read_visuals
 
 if TYPE_CHECKING:
     from crane.recording import Recording
 
 _LOOKED_AT = 300  # frames that tell how large the scene is
+_SMALLEST = 1e-3  # [m], of a scene in which everything is a point
 
 
 @dataclass(frozen=True)
@@ -126,4 +128,5 @@ def _bounds(visuals: Sequence[Visual], poses: Mapping[str, Array]) -> tuple[Arra
         moved = corners @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]
         points.append(moved.reshape(-1, 3))
     everything = np.concatenate(points)
-    return everything.min(axis=0), everything.max(axis=0)
+    lower, upper = everything.min(axis=0), everything.max(axis=0)
+    return lower, np.maximum(upper, lower + _SMALLEST)

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from crane.machine import Machine
 from crane.samples import Array
+from crane.view.figure_text import plain
 from crane.view.plots import STYLE, write_figure
 from crane.view.sketch_canvas import CENTRE, DOT, JOINT, QUARTERS, RING, Canvas, hull, mark
 from crane.view.sketch_labels import Label, clear_spot, place_labels
@@ -105,7 +106,7 @@ def _legend(machine: Machine, com: bool) -> list[tuple[Line2D, ...]]:
     entries: list[tuple[Line2D, ...]] = []
     for i, chain in enumerate(machine.chains):
         colour = CHAINS[i % len(CHAINS)]
-        entries.append((Line2D([], [], color=colour, linewidth=3.0, label=chain.name),))
+        entries.append((Line2D([], [], color=colour, linewidth=3.0, label=plain(chain.name)),))
     symbols: dict[str, list[Any]] = {"joint": [JOINT], "loop": [RING, DOT]}
     if com:
         symbols["centre of mass"] = [CENTRE, *QUARTERS]

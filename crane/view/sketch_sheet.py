@@ -12,6 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from crane.machine import Machine
 from crane.samples import Array
 from crane.summary import READING_UNITS
+from crane.view.figure_text import plain
 from crane.view.sketch_canvas import Canvas
 from crane.view.sketch_parts import Mechanism
 from crane.view.sketch_plane import Plane
@@ -26,7 +27,7 @@ def symbol(name: str) -> str:
     """A joint's name as it is set: q1 as q with index 1, X_lift as X with index lift."""
     if match := re.fullmatch(r"([A-Za-z])(\d+|_[A-Za-z]+)", name):
         return f"${match[1]}_{{\\mathrm{{{match[2].removeprefix('_')}}}}}$"
-    return name.replace("$", r"\$")
+    return plain(name)
 
 
 def lay_out(
@@ -63,7 +64,7 @@ def lay_out(
     for axis, length in ((axes.xaxis, wide), (axes.yaxis, tall)):
         axis.set_major_locator(MaxNLocator(max(int(length / 55), 2), steps=[1, 2, 5, 10]))
     left = 12 / width
-    name = machine.name.replace("_", " ").replace("$", r"\\$")
+    name = plain(machine.name.replace("_", " "))
     figure.text(left, 1 - 8 / height, name, va="top", fontsize=11, fontweight="bold")
     for row, line in enumerate(posture):
         below = 1 - (23 + _LINE * row) / height

@@ -11,6 +11,7 @@ from scipy.stats import rankdata
 
 from crane.samples import Array
 from crane.studies import Study
+from crane.view.figure_text import plain
 from crane.view.plots import DASHED, RECORDED, STYLE, write_figure
 
 _MOST_PANELS = 12  # measures of one picture
@@ -49,7 +50,7 @@ def study_figure(study: Study) -> Figure:
         machine = Path(study.machine).stem.replace("_", " ")
         words = ", ".join(study.tasks)
         title = f"{machine}: {words}" if words else machine
-        figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")
+        figure.suptitle(plain(title), x=0.01, ha="left", fontsize=11, fontweight="bold")
     return figure
 
 
@@ -60,7 +61,7 @@ def _changes(values: Array) -> bool:
 
 def _label(study: Study, name: str) -> str:
     unit = study.units[name]
-    return f"{name} [{unit}]" if unit else name
+    return plain(f"{name} [{unit}]" if unit else name)
 
 
 def _panels(study: Study, shown: list[str]) -> Figure:
@@ -98,7 +99,9 @@ def _curves(axes: Axes, study: Study, name: str) -> None:
         values = study.columns.get(f"{name} {task}")
         if values is not None:
             color = _TASK_COLORS[k % len(_TASK_COLORS)]
-            axes.plot(x, values[order], marker=marker, ms=2.5, lw=1.0, color=color, label=task)
+            axes.plot(
+                x, values[order], marker=marker, ms=2.5, lw=1.0, color=color, label=plain(task)
+            )
     able = study.columns[name][order]
     label = (
         "together" if f"{name} {study.tasks[0] if study.tasks else ''}" in study.columns else ""

@@ -15,6 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from crane.samples import Array
 from crane.summary import READING_UNITS
+from crane.view.figure_text import plain
 from crane.view.plots import DASHED, INK, RECORDED, STYLE, joint_symbol, write_figure
 from crane.workspaces import Workspace
 
@@ -106,7 +107,7 @@ def _draw_section(
     axes.set_ylim(limits[0][1] - margin, limits[1][1] + margin)
     axes.set_anchor("N")
     u, w = space.section.names
-    axes.set(xlabel=f"{u} [m]", ylabel=f"{w} [m]", title=f"reach of {space.frame}")
+    axes.set(xlabel=f"{u} [m]", ylabel=f"{w} [m]", title=f"reach of {plain(space.frame)}")
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(7, steps=[1, 2, 2.5, 5, 10]))
 
@@ -219,7 +220,7 @@ def _held(space: Workspace) -> str:
 
 
 def _caption(figure: Figure, space: Workspace) -> None:
-    title = f"{space.machine.name.replace('_', ' ')}: workspace"
+    title = f"{plain(space.machine.name.replace('_', ' '))}: workspace"
     if space.slew is not None:
         i = space.machine.active.index(space.slew)
         turn = np.rad2deg([space.low[i], space.high[i]])

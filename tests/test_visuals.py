@@ -1,0 +1,238 @@
+"""What URDFs draw: whatever stands there is drawn, or told and left out, and never needed."""
+
+import json
+import struct
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import crane
+from crane.check import check
+from crane.description import mesh_process, meshes
+from crane.description.visuals import PLAIN, Box, Cylinder, Mesh, Sphere, read_drawn
+from crane.description.xml import XmlFile
+from crane.errors import CraneWarning
+from crane.view import report
+from crane.view.visuals import read_visuals
+
+ARM = """<robot name="arm">
+  <link name="foot">
+{drawn}
+  </link>
+  <joint name="swing" type="revolute"><parent link="foot"/><child link="arm"/>
+    <axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint>
+  <link name="arm"><inertial><mass value="1"/>
+    <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+</robot>
+"""
+BALL = '<visual><geometry><sphere radius="0.2"/></geometry></visual>'
+
+
+def arm(folder, drawn):
+    (folder / "arm.urdf").write_text(ARM.format(drawn=drawn))
+    return folder / "arm.urdf"
+
+
+def stl(count, triangles=1):
+    """A binary STL that declares a number of triangles."""
+    corners = np.array([[0, 0, 1], [0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes() + b"\0\0"
+    return b"\0" * 80 + struct.pack("<I", count) + corners * triangles
+
+
+def glb(header):
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A) + text
+
+
+FAR_GLB = {
+    "asset": {"version": "2.0"},
+    "accessors": [
+        {"componentType": 5126, "count": 1 << 40, "type": "VEC3"},
+        {"componentType": 5125, "count": 1 << 40, "type": "SCALAR"},
+    ],
+    "bufferViews": [],
+    "buffers": [],
+    "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+    "nodes": [{"mesh": 0}],
+    "scenes": [{"nodes": [0]}],
+}
+FAR_PLY = (
+    b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nproperty float y\n"
+    b"property float z\nelement face 99999999999\nproperty list uchar int vertex_indices\n"
+    b"end_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+)
+
+BAD = [  # elements of a link, what is told in line 3, whether a box stands there
+    ("no shape", "<visual/>", "a visual of link 'foot' has no shape, give one of <box>, <cyl"),
+    ("empty geometry", "<visual><geometry/></visual>", "a visual of link 'foot' has no shape"),
+    ("cone", '<visual><geometry><cone radius="1"/></geometry></visual>', "has <cone>, give one"),
+    ("nan", '<visual><geometry><box size="1 nan 1"/></geometry></visual>', 'size="1 nan 1" of a'),
+    ("text", '<visual><geometry><sphere radius="r"/></geometry></visual>', "is not a number, wri"),
+    ("two", '<visual><geometry><box size="1 1"/></geometry></visual>', "has 2 numbers, give 3"),
+    ("flat", '<visual><geometry><box size="1 0 1"/></geometry></visual>', "is not positive, give"),
+    ("huge", '<visual><geometry><sphere radius="1e300"/></geometry></visual>', "of 1e+300 m"),
+    ("no radius", "<visual><geometry><capsule/></geometry></visual>", "has no radius, add radius"),
+    ("no file", "<visual><geometry><mesh/></geometry></visual>", "names no mesh, add filename"),
+    ("origin", '<visual><origin xyz="1 2"/></visual>', 'xyz="1 2" of the origin of a visual of'),
+    (
+        "scale",
+        '<visual><geometry><mesh filename="a.stl" scale="0.1"/></geometry></visual>',
+        "has 1 numbers, give 3",
+    ),
+    (
+        "package without a path",
+        '<visual><geometry><mesh filename="package://file.stl"/></geometry></visual>',
+        "mesh file 'package://file.stl' is not there",
+    ),
+]
+
+
+@pytest.mark.parametrize(("drawn", "line"), [x[1:] for x in BAD], ids=[x[0] for x in BAD])
+def test_what_cannot_be_drawn_is_told_and_left_out(drawn, line, tmp_path):
+    path = arm(tmp_path, BALL + "\n" + drawn)
+    found = check(path)
+    assert found.status == 1
+    told = [str(finding) for finding in found.findings]
+    assert all(one.startswith("arm.urdf:4: warning: ") for one in told)
+    assert sum(line in one for one in told) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CraneWarning)
+        machine = crane.load(path)  # a machine moves whatever is drawn
+    with pytest.warns(CraneWarning, match=r"arm\.urdf:4|package://file\.stl"):
+        report(machine, None, tmp_path / "arm.html")
+    with pytest.warns(CraneWarning):
+        shapes = [visual.shape for visual in read_visuals(machine)]
+    assert shapes[0] == Sphere(0.2)
+    assert all(isinstance(shape, Box) for shape in shapes[1:])
+
+
+@pytest.mark.parametrize("colour", ["255 0 0 1", "red", "nan 0 0 1", "1 0 0", ""])
+def test_a_bad_colour_is_grey(colour, tmp_path):
+    material = f'<material name="m"><color rgba="{colour}"/></material>'
+    path = arm(tmp_path, BALL.replace("</visual>", f"{material}</visual>"))
+    assert [f.line for f in check(path).findings] == [3]
+    with pytest.warns(CraneWarning, match="of a colour .*; grey is drawn"):
+        (visual,) = read_visuals(crane.load(path))
+    assert visual.colour == PLAIN
+
+
+def test_colours_go_by_name_wherever_they_stand(tmp_path):
+    """As other readers have it: a material may be written within the first visual that has it."""
+    named = BALL.replace("</visual>", '<material name="{}"/></visual>')
+    first = '<material name="red"><color rgba="1 0 0 0.5"/></material>'
+    path = arm(
+        tmp_path,
+        "\n".join([named.format("red"), BALL.replace("</visual>", f"{first}</visual>"),
+                   named.format("blue"), named.format("none")]),
+    )  # fmt: skip
+    blue = '<material name="blue"><color rgba="0 0 1 1"/></material>'
+    path.write_text(path.read_text().replace("</robot>", f"{blue}</robot>"))
+    drawn = read_drawn(XmlFile(path))
+    assert not drawn.problems
+    colours = [visual.colour for visual in drawn.shapes["visual"]]
+    assert colours == [(1, 0, 0, 0.5), (1, 0, 0, 0.5), (0, 0, 1, 1), PLAIN]
+
+
+def test_a_capsule_is_a_cylinder_between_two_balls(tmp_path):
+    """Volume by points that fall into it: pi r^2 l + 4/3 pi r^3."""
+    drawn = '<visual><origin xyz="0 0 1" rpy="0 1.5707963267948966 0"/><geometry>'
+    drawn += '<capsule radius="0.1" length="0.4"/></geometry></visual>'
+    found = read_drawn(XmlFile(arm(tmp_path, drawn))).shapes["visual"]
+    assert [type(visual.shape) for visual in found] == [Cylinder, Sphere, Sphere]
+    corners = np.concatenate([visual.corners() for visual in found])
+    np.testing.assert_allclose(corners.min(axis=0), [-0.3, -0.1, 0.9], atol=1e-12)
+    np.testing.assert_allclose(corners.max(axis=0), [0.3, 0.1, 1.1], atol=1e-12)
+    points = np.random.default_rng(1).uniform([-0.3, -0.1, 0.9], [0.3, 0.1, 1.1], (200_000, 3))
+    inside = np.zeros(len(points), dtype=bool)
+    for visual in found:
+        local = (points - visual.placement[:3, 3]) @ visual.placement[:3, :3]
+        if isinstance(visual.shape, Cylinder):
+            inside |= (np.hypot(*local[:, :2].T) < 0.1) & (np.abs(local[:, 2]) < 0.2)
+        else:
+            inside |= np.linalg.norm(local, axis=1) < 0.1
+    volume = np.pi * 0.1**2 * 0.4 + 4 / 3 * np.pi * 0.1**3
+    assert inside.mean() * 0.6 * 0.2 * 0.2 == pytest.approx(volume, rel=0.01)
+
+
+DAMAGED = {
+    "short.stl": stl(7),
+    "far.stl": stl(0xFFFFFFFF),
+    "nan.stl": stl(1).replace(np.float32(1).tobytes(), np.float32(np.nan).tobytes()),
+    "empty.stl": b"",
+    "text.stl": b"solid x\nfacet\nvertex 1 2\nendsolid\n",
+    "index.obj": b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 900000000\n",
+    "letters.obj": b"v a b c\nf 1 2 3\n",
+    "noise.glb": bytes(range(256)) * 9,
+    "far.glb": glb(FAR_GLB),
+    "ring.gltf": json.dumps(
+        {"asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}],
+         "nodes": [{"children": [1]}, {"children": [0]}]}
+    ).encode(),
+    "cut.dae": b"<?xml version='1.0'?><COLLADA><library_geometries>",
+    "far.ply": FAR_PLY,
+    "far.off": b"OFF\n99999999999 1 0\n0 0 0\n3 0 0 0\n",
+    "zip.zip": b"PK\x03\x04",
+    "picture.png": b"\x89PNG",
+}  # fmt: skip
+
+
+def test_damaged_meshes_are_boxes_with_one_line(tmp_path):
+    drawn = []
+    for name, data in DAMAGED.items():
+        (tmp_path / name).write_bytes(data)
+        drawn.append(f'<visual><geometry><mesh filename="{name}"/></geometry></visual>')
+    (tmp_path / "good.stl").write_bytes(stl(1))
+    drawn.append('<visual><geometry><mesh filename="good.stl"/></geometry></visual>')
+    path = arm(tmp_path, "\n".join(drawn))
+    lines = [str(finding) for finding in check(path).findings]
+    assert len(lines) == len(DAMAGED)
+    for line, (number, name) in zip(lines, enumerate(DAMAGED, start=3), strict=True):
+        assert line.startswith(f"arm.urdf:{number}: warning: mesh file '{name}' cannot be read (")
+        assert line.isprintable() and len(line) < 250
+    with pytest.warns(CraneWarning, match=f"short.stl.*\\({len(DAMAGED)} such, crane check"):
+        shapes = [visual.shape for visual in read_visuals(crane.load(path))]
+    assert [type(shape) for shape in shapes] == [Box] * len(DAMAGED) + [Mesh]
+    np.testing.assert_allclose(shapes[-1].vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+
+
+def test_too_large_a_mesh_is_not_opened(tmp_path):
+    with (tmp_path / "large.stl").open("wb") as file:
+        file.truncate(10**12)  # which takes no space
+    assert meshes.read_meshes([tmp_path / "large.stl"]) == {
+        tmp_path / "large.stl": "1000000 MB, more than 200"
+    }
+
+
+def test_a_reader_that_ends_costs_one_mesh(tmp_path, monkeypatch):
+    """It begins anew after the file at which it ended."""
+    source = Path(mesh_process.__file__).read_text()
+    opened, imported = (
+        "            parts, arrays = _read(file, left)\n",
+        "import trimesh  # noqa: F401",
+    )
+    assert opened in source and imported in source
+    ends = "            while 'long.stl' in file: pass\n"
+    ends += "            if 'end.stl' in file: os._exit(3)\n"
+    triangle = "np.eye(3), np.arange(3).reshape(1, 3)"
+    reads = f"            import numpy as np; arrays = [{triangle}]\n"
+    reads += "            parts = [{'vertices': 3, 'faces': 1, 'colour': None}]\n"
+    source = source.replace("SECONDS = 2 << 30, 20", "SECONDS = 2 << 30, 1")
+    program = tmp_path / "reader.py"
+    program.write_text(source.replace(opened, ends + reads).replace(imported, "pass  #"))
+    monkeypatch.setattr(mesh_process, "__file__", str(program))
+
+    def read(*names):
+        for name in names:
+            (tmp_path / name).write_bytes(stl(1))
+        return list(meshes.read_meshes(tmp_path / name for name in names).values())
+
+    first, second, third, fourth, fifth = read("1.stl", "end.stl", "2.stl", "long.stl", "3.stl")
+    assert second == "damaged" and fourth == "reading it takes more than 20 s"
+    for (part,) in (first, third, fifth):
+        assert part.vertices.tolist() == np.eye(3).tolist()
+        assert part.faces.tolist() == [[0, 1, 2]]
+    found = read(*(f"{i}end.stl" for i in range(5)))
+    assert found == ["damaged"] * 3 + ["not tried after 3 that ended the reader"] * 2
