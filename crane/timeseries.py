@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.errors import RecordingError
+from crane.errors import RecordingError, at
 from crane.output import replacing
-from crane.samples import Array
+from crane.samples import Array, Brief
 
 TIME = "time"
 _WORD = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
@@ -46,8 +46,8 @@ _TO_SI = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
+@dataclass(frozen=True, eq=False, repr=False)
+class Table(Brief):
     """Columns of a file.
 
     Attributes:
@@ -125,7 +125,7 @@ def read_csv(path: str | Path) -> Table:
         units = _units(heading)
         return _in_si(Table(units, _values(path, line, units), notes))
     except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
+        raise RecordingError(at(str(path), error)) from None
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: is not text, give a CSV in UTF-8") from None
     except OSError as error:
@@ -159,7 +159,7 @@ def read_npz(path: Path) -> Table:
     try:
         units = _units(heading.getvalue().rstrip())
     except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
+        raise RecordingError(at(str(path), error)) from None
     return _in_si(Table(units, np.column_stack(list(columns.values())).astype(np.float64), {}))
 
 

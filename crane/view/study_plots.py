@@ -11,6 +11,7 @@ from scipy.stats import rankdata
 
 from crane.samples import Array
 from crane.studies import Study
+from crane.summary import title
 from crane.view.plots import DASHED, RECORDED, STYLE, write_figure
 
 _MOST_PANELS = 12  # measures of one picture
@@ -46,10 +47,8 @@ def study_figure(study: Study) -> Figure:
             figure = _scatter(study, shown[:_MOST_SCATTERED])
         else:
             figure = _panels(study, shown)
-        machine = Path(study.machine).stem.replace("_", " ")
-        words = ", ".join(study.tasks)
-        title = f"{machine}: {words}" if words else machine
-        figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")
+        words = title(Path(study.machine).stem, ", ".join(study.tasks))
+        figure.suptitle(words, x=0.01, ha="left", fontsize=11, fontweight="bold")
     return figure
 
 
