@@ -12,12 +12,12 @@ from crane.control import Controller
 from crane.dynamics import Dynamics
 from crane.errors import CraneError, InputError
 from crane.machine import Machine
-from crane.samples import Array
+from crane.samples import Array, Brief
 from crane.simulation import Progress, imbalance, trajectory
 
 
-@dataclass(frozen=True, eq=False)
-class Batch:
+@dataclass(frozen=True, eq=False, repr=False)
+class Batch(Brief):
     """Results of B simulations of N instants with n active joints.
 
     Attributes:

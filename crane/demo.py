@@ -38,7 +38,7 @@ def run_demo(folder: Path, progress: Progress) -> str:
 
             control = PI(machine, task_path(machine, task))
             recording = simulate(machine, control, task=task, progress=report)
-            texts.append(write_run(part / task, recording, f"{machine.name}: {task}"))
+            texts.append(write_run(part / task, recording))
             write_views(part / task, machine, recording)
         text = "\n".join(texts)
         (part / SUMMARY).write_text(text, encoding="utf-8")

@@ -6,16 +6,40 @@ A message is one line that says what is wrong, where, and what to do about it.
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+_WORD, _LINE = 1000, 4000  # characters of a word and of a line that anybody reads
+
+
+def one_line(text: str) -> str:
+    """Text as one line that can be read.
+
+    What cannot be printed (a name may hold it) becomes a space; of words and lines without end
+    the middle is left out.
+    """
+    text = "".join(c if c.isprintable() else " " for c in text)
+    if len(text) > _WORD:
+        text = " ".join(_shortened(word, _WORD) for word in text.split(" "))
+    return _shortened(text, _LINE)
+
+
+def at(place: str, error: Exception) -> str:
+    """`place: message`, and the message alone where that begins with the place."""
+    text = str(error)
+    return text if text.startswith(place) else f"{place}: {text}"
+
+
+def _shortened(text: str, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 4 :]}"
+
 
 class CraneError(Exception):
     """Base class of everything this package raises on purpose.
 
     Args:
-        message: One line; what cannot be printed in it (a name may hold it) becomes a space.
+        message: One line, see `one_line`.
     """
 
     def __init__(self, message: str):
-        super().__init__("".join(c if c.isprintable() else " " for c in message))
+        super().__init__(one_line(message))
 
 
 class DescriptionError(CraneError):

@@ -68,6 +68,10 @@ class Kinematics:
         span = machine.upper - machine.lower
         self._scale = np.where(np.isfinite(span), span, 1.0)
 
+    def __repr__(self) -> str:
+        """What moves, of what."""
+        return f"Kinematics of '{self.frame}' of '{self.machine.name}'"
+
     def position(self, q_a: ArrayLike) -> Array:
         """Position in the world.
 
@@ -221,8 +225,8 @@ class Kinematics:
         """Jacobian dx/dq (3, nv) of the spanning tree at one posture (nq,)."""
         tree: Array = pin.computeFrameJacobian(
             self._model, self._data, q, self._frame, pin.LOCAL_WORLD_ALIGNED
-        )[:3]
-        return tree
+        )
+        return tree.reshape(6, -1)[:3]  # of a single joint it comes as a vector
 
     def _jacobian(self, q: Array) -> Array:
         reduced: Array = self.tree_jacobian(q) @ self.machine.closure.gamma(q)

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from crane import timeseries
-from crane.errors import ClosureError, MechanismError, RecordingError
+from crane.errors import ClosureError, MechanismError, RecordingError, at
 from crane.machine import Machine
 from crane.recording import (
     FORCE,
@@ -58,7 +58,7 @@ def read_measured(machine: Machine, path: str | Path) -> Recording:
         try:
             table = _completed(machine, table)
         except RecordingError as error:
-            raise RecordingError(f"{path}: {error}") from None
+            raise RecordingError(at(str(path), error)) from None
     return Recording.from_table(table, path)
 
 

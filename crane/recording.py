@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane import timeseries
-from crane.errors import RecordingError, known
+from crane.errors import RecordingError, at, known
 from crane.samples import Array
 from crane.timeseries import TIME, Table, check_unit
 
@@ -127,6 +127,15 @@ class Recording:
                 f"give strictly increasing times"
             )
 
+    def __repr__(self) -> str:
+        """What it is of, how long, and its joints."""
+        what = ": ".join(word for word in (self.machine, self.task) if word)
+        joints = ", ".join(f"{joint} [{self.units[joint]}]" for joint in self.joints)
+        return (
+            f"Recording of {what or 'a machine'}, {self.time[-1] - self.time[0]:.6g} s in "
+            f"{len(self.time)} samples: {joints}, {len(self.channels)} channels"
+        )
+
     def _names(self) -> list[str]:
         """Names of all columns, in the order in which they are written."""
         joints = [x + suffix for suffix in ("", VELOCITY, FORCE) for x in self.joints]
@@ -196,7 +205,7 @@ class Recording:
         try:
             return cls._from_table(table)
         except RecordingError as error:
-            raise RecordingError(f"{path}: {error}") from None
+            raise RecordingError(at(str(path), error)) from None
 
     @classmethod
     def _from_table(cls, table: Table) -> "Recording":

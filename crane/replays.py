@@ -7,11 +7,11 @@ import numpy as np
 
 from crane import timeseries
 from crane.control import Signals, ValveDrive
-from crane.errors import InputError, RecordingError, known
+from crane.errors import InputError, RecordingError, at, known
 from crane.machine import Machine
 from crane.measured import check_pressures, column, motion_of
 from crane.recording import FORCE, FORCE_UNITS, VELOCITY, VELOCITY_UNITS, Recording
-from crane.samples import Array, as_number
+from crane.samples import Array, Brief, as_number
 from crane.simulation import Progress, simulate
 from crane.timeseries import TIME, Table, check_unit, spellings
 
@@ -21,8 +21,8 @@ _FEWEST = 5  # samples of that fit
 _RESTS = 1e-12  # variation of a channel that is rounding, per its size
 
 
-@dataclass(frozen=True, eq=False)
-class Channel:
+@dataclass(frozen=True, eq=False, repr=False)
+class Channel(Brief):
     """One channel, measured and simulated at the measured instants.
 
     Attributes:
@@ -62,6 +62,13 @@ class Comparison:
 
     time: Array
     channels: tuple[Channel, ...]
+
+    def __repr__(self) -> str:
+        """How long, and what is compared."""
+        return (
+            f"Comparison over {self.time[-1] - self.time[0]:.6g} s in {len(self.time)} samples: "
+            + ", ".join(channel.name for channel in self.channels)
+        )
 
     def to_markdown(self) -> str:
         """A table with a row per channel."""
@@ -105,7 +112,7 @@ def replay(
     try:
         time, drive, initial = _prepare(machine, table)
     except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
+        raise RecordingError(at(str(path), error)) from None
     steps = int(time[-1] / step + 1e-9)
     if steps < 1:
         raise RecordingError(f"{path}: is shorter than a step of {step:g} s, shorten the step")
@@ -114,7 +121,7 @@ def replay(
     try:
         return recording, compare(table, recording)
     except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
+        raise RecordingError(at(str(path), error)) from None
 
 
 def compare(table: Table, recording: Recording) -> Comparison:

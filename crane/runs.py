@@ -13,7 +13,7 @@ from crane.output import staging
 from crane.recording import Recording
 from crane.replays import Comparison
 from crane.studies.table import Study
-from crane.summary import summarize
+from crane.summary import subject, summarize, title
 
 if TYPE_CHECKING:
     from crane.identification.result import Identification
@@ -52,7 +52,7 @@ def check_free(file: Path, force: bool) -> None:
         raise OutputError(f"{file}: exists already, choose another name or add --force")
 
 
-def write_run(folder: Path, recording: Recording, title: str) -> str:
+def write_run(folder: Path, recording: Recording) -> str:
     """Write a recording and its summary into a folder, created where there is none.
 
     Figure and page of an earlier run in the same folder are removed: they show something else.
@@ -63,7 +63,8 @@ def write_run(folder: Path, recording: Recording, title: str) -> str:
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    text = f"# {title}\n\n{summarize(recording).to_markdown()}"
+    heading = title(subject(recording), recording.task)
+    text = f"# {heading}\n\n{summarize(recording).to_markdown()}"
     with staging(folder) as part:
         recording.to_csv(part / RECORDING)
         (part / SUMMARY).write_text(text, encoding="utf-8")
@@ -72,9 +73,7 @@ def write_run(folder: Path, recording: Recording, title: str) -> str:
     return text
 
 
-def write_comparison(
-    folder: Path, recording: Recording, comparison: Comparison, title: str
-) -> str:
+def write_comparison(folder: Path, recording: Recording, comparison: Comparison) -> str:
     """Write a replay into a folder: its recording, and how it compares with what was measured.
 
     Returns:
@@ -85,8 +84,9 @@ def write_comparison(
     """
     from crane.view.comparison_plots import plot_comparison
 
-    write_run(folder, recording, title)
-    text = f"# {title}\n\n{comparison.to_markdown()}"
+    write_run(folder, recording)
+    heading = title(subject(recording), recording.task)
+    text = f"# {heading}\n\n{comparison.to_markdown()}"
     with staging(folder) as part:
         (part / COMPARISON).write_text(text, encoding="utf-8")
         if comparison.channels:

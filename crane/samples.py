@@ -1,6 +1,6 @@
 """One sample (n,) or a stack of them (N, n): every public function takes both."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Sized
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -50,17 +50,72 @@ def as_sample(value: ArrayLike, size: int, what: str, names: Sequence[str] = ())
     return as_samples(value, size, what, names)
 
 
-def as_number(value: object, what: str, unit: str, above: float = -np.inf) -> float:
-    """A finite number above a bound.
+class Brief:
+    """Shown in one line: arrays by their shapes, collections by their lengths."""
+
+    def __repr__(self) -> str:
+        """Class and fields."""
+        words = []
+        for name, value in vars(self).items():
+            if isinstance(value, str | int | float | bool) or value is None:
+                words.append(f"{name}={value!r}")
+            elif isinstance(value, np.ndarray):
+                words.append(f"{name}={value.shape}")
+            elif isinstance(value, Sized) and not isinstance(value, Brief):
+                words.append(f"{name}: {len(value)}")
+        return f"{type(self).__name__}({', '.join(words)})"
+
+
+# Between these lies every quantity of a machine in SI units but zero, and its square is a number.
+SMALLEST, LARGEST = 1e-15, 1e15
+FARTHEST = 1e6  # coordinate [m], [rad] whose sine still has ten digits
+MOST_SEEDS = 2**64 - 1
+
+
+def as_number(
+    value: object, what: str, unit: str, above: float = -np.inf, most: float = LARGEST
+) -> float:
+    """A number that a quantity of a machine can have.
+
+    Args:
+        value: What the user gave.
+        what: Its name, for errors.
+        unit: Its unit, for errors.
+        above: What it has to be above; of what has to be above zero, `SMALLEST` is the least.
+        most: What it may be at most, to both sides of zero.
 
     Raises:
         InputError: It is not.
     """
     array = _numbers(value, what, "give a number")
+    shown = " ".join(f"{what} is {value} {unit}".split())
     if array.ndim or not np.isfinite(array) or not array > above:
         bound = f" above {above:g}" if above > -np.inf else ""
-        raise InputError(f"{what} is {value} {unit}, give a number{bound}")
+        raise InputError(f"{shown}, give a number{bound}")
+    if abs(array) > most or (above == 0 and array < SMALLEST):
+        least = SMALLEST if above == 0 else above if above > -np.inf else -most
+        raise InputError(f"{shown}, give a number from {least:g} to {most:g}")
     return float(array)
+
+
+def as_count(value: object, what: str, least: int = 1, most: int = 10**9) -> int:
+    """A whole number within bounds.
+
+    Raises:
+        InputError: It is not.
+    """
+    if not isinstance(value, int | np.integer) or not least <= value <= most:
+        raise InputError(f"{what} is {value}, give a whole number from {least} to {most}")
+    return int(value)
+
+
+def as_seed(value: object) -> int:
+    """A seed of random numbers.
+
+    Raises:
+        InputError: It is negative, or no whole number.
+    """
+    return as_count(value, "the seed", 0, MOST_SEEDS)
 
 
 def _numbers(value: object, what: str, wanted: str) -> Array:

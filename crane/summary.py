@@ -1,11 +1,13 @@
 """The few numbers that sum a recording up."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from crane.recording import FORCE_UNITS, Recording
 from crane.samples import Array
+from crane.units import quantity
 
 # Unit to read a coordinate in, and how many of it make one rad or m.
 READING_UNITS = {"rad": ("deg", 180.0 / np.pi), "m": ("mm", 1000.0)}
@@ -74,8 +76,8 @@ class Summary:
                     joint.name,
                     f"{scale * joint.lowest:z.2f} to {scale * joint.highest:z.2f} {unit}",
                     f"{scale * joint.peak_speed:.2f} {unit}/s",
-                    f"{joint.peak_force:.4g} {force}",
-                    f"{joint.rms_force:.4g} {force}",
+                    quantity(joint.peak_force, force, 4),
+                    quantity(joint.rms_force, force, 4),
                     _measure(joint.peak_error, scale, unit),
                     _measure(joint.rms_error, scale, unit),
                 )
@@ -84,6 +86,16 @@ class Summary:
             errors = (_measure(x, 1e3, "mm") for x in (self.tip_peak_error, self.tip_rms_error))
             rows.append(("tip", "", "", "", "", *errors))
         return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def title(machine: str, what: str = "") -> str:
+    """What results are headed with, as figures, pages and tables alike: "patu655: swing"."""
+    return ": ".join(word for word in (machine, what) if word)
+
+
+def subject(recording: Recording, otherwise: str = "") -> str:
+    """Name of what a recording is of: of the bundled machine or file that it names, or else."""
+    return Path(recording.machine.split(" --")[0]).stem or otherwise
 
 
 def summarize(recording: Recording) -> Summary:

@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.errors import RecordingError
+from crane.errors import RecordingError, at
 from crane.npz import MOST, MOST_COLUMNS, read_columns
 from crane.output import replacing
-from crane.samples import Array
+from crane.samples import Array, Brief
 
 TIME = "time"
 _WORD = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
@@ -48,8 +48,8 @@ _TO_SI = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Table:
+@dataclass(frozen=True, eq=False, repr=False)
+class Table(Brief):
     """Columns of a file.
 
     Attributes:
@@ -133,7 +133,7 @@ def read_csv(path: str | Path) -> Table:
             )
         return _in_si(Table(units, _values(path, line, units), notes))
     except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
+        raise RecordingError(at(str(path), error)) from None
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: is not text, give a CSV in UTF-8") from None
     except OSError as error:
@@ -151,7 +151,7 @@ def read_npz(path: Path) -> Table:
         check_plain(path)
         names, values = read_columns(path)
     except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
+        raise RecordingError(at(str(path), error)) from None
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise RecordingError(f"{path}: {reason}, give the path of an npz file") from None
@@ -160,7 +160,7 @@ def read_npz(path: Path) -> Table:
     try:
         units = _units(heading.getvalue().rstrip())
     except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
+        raise RecordingError(at(str(path), error)) from None
     return _in_si(Table(units, values, {}))
 
 

@@ -418,7 +418,7 @@ def test_wrong_recordings_and_arguments_are_one_line(run, mini, tmp_path):
         assert not (tmp_path / "out").exists()
     for arguments, message in (
         (["--method", "lsq"], "method 'lsq' is unknown"),
-        (["--prior", "-1"], "the prior's standard deviation is -1"),
+        (["--prior", "-1"], "the prior's relative standard deviation is -1"),
         (["--bandwidth", "0"], "the bandwidth is 0.0 Hz"),
         (["--bandwidth", "1e-6"], "the bandwidth is 1e-06 Hz"),
         (["--validation", "none.csv"], "none.csv: no such file"),

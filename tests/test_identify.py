@@ -155,7 +155,11 @@ def test_what_cannot_be_identified(mini):
     other = crane.load("ur5_robot")
     for call, kind, message in (
         (lambda: identify(mini, given, method="lsq"), InputError, "method 'lsq' is unknown"),
-        (lambda: identify(mini, given, prior=0.0), InputError, "the prior's standard deviation"),
+        (lambda: identify(mini, given, prior=0.0), InputError, "the prior's relative standard"),
+        (lambda: identify(mini, given, prior=1e-300), InputError, "a number above 1e-07"),
+        (lambda: identify(mini, given, prior=1e300), InputError, "from 1e-07 to 1e.06"),
+        (lambda: identify(mini, given, bandwidth=np.nan), InputError, "the bandwidth is nan Hz"),
+        (lambda: identify(mini, given, slow={"X1": -1.0}), InputError, "it must not be negative"),
         (lambda: identify(other, recording), RecordingError, "'shoulder_pan_joint' of 'ur5'"),
         (
             lambda: identify(mini, given, feasible=True, terms=[friction(mini, "X1")]),

@@ -6,6 +6,8 @@ import numpy as np
 import oracles
 import pinocchio as pin
 import pytest
+from hydraulic_rig import STROKE as STROKES
+from hydraulic_rig import rig
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -50,6 +52,16 @@ def test_jacobian_and_bias_against_differences(name, frame, step, request):
         bias = kinematics.bias(q_a, v_a)
         assert np.abs(bias - rate).max() < 1e-8 * np.abs(bias).max()
         assert kinematics.bias(q_a, 3 * v_a) == pytest.approx(9 * bias, rel=1e-9, abs=1e-20)
+
+
+def test_a_machine_of_a_single_joint(tmp_path):
+    """A load on a vertical guide: its tip follows the stroke."""
+    machine = rig(tmp_path)
+    tip = crane.Kinematics(machine, "load_x")
+    assert tip.jacobian([0.2]) == pytest.approx(np.array([[0.0], [0.0], [1.0]]))
+    assert tip.position([0.3]) == pytest.approx([0, 0, 0.3])
+    space = crane.workspace(machine, 100, "load_x")
+    assert np.ptp(space.tips, axis=0) == pytest.approx([0, 0, STROKES], abs=1e-12)
 
 
 def test_stacks_equal_single_samples(mini, tip):

@@ -211,6 +211,31 @@ def group_is_empty(group):
     return False
 
 
+@pytest.mark.parametrize("aspect", [390 / 844, 0.7, 1.0, 1.8])
+def test_the_machine_is_in_view_and_above_the_panel_of_a_phone(patu, aspect):
+    """Projected corners of all shapes: within the window, and of one upright in its upper part."""
+    pytest.importorskip("viser")
+    from crane.live.serve import start, stop
+    from crane.live.stage import Stage, _corners
+    from crane.view.visuals import read_visuals
+
+    session = Session(patu)
+    server = start("127.0.0.1", 0)
+    try:
+        look_at, position = Stage(server, session).view(aspect)
+    finally:
+        stop(server)
+    forward = (look_at - position) / np.linalg.norm(look_at - position)
+    right = np.cross(forward, [0, 0, 1]) / np.linalg.norm(np.cross(forward, [0, 0, 1]))
+    ways = (_corners(read_visuals(patu), session) - position) @ np.column_stack(
+        [right, np.cross(right, forward), forward]
+    )
+    half = np.tan(np.radians(20))
+    x, y = ways[:, 0] / ways[:, 2] / half / aspect, ways[:, 1] / ways[:, 2] / half
+    assert np.abs(x).max() < 1 and y.max() < 1
+    assert y.min() > (0.2 if aspect < 1 else -1)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("connected", [False, True])

@@ -103,7 +103,7 @@ def test_references_are_dashed_and_told_apart(recording):
             assert line.is_dashed()
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["recording", "reference"]
-    assert figure.get_suptitle() == "mini forwarder: loading"
+    assert figure.get_suptitle() == "mini_forwarder: loading"
 
 
 def test_path_of_the_tip(recording):
@@ -247,3 +247,48 @@ def test_many_joints_are_wrapped(joints, tip):
         assert axes.get_xlabel() == ("time [s]" if row % 3 == 2 else "")
     letters = [text.get_text() for place in sorted(grid) for text in grid[place].texts]
     assert letters == [f"({letter})" for letter in ascii_lowercase[: 3 * joints]]
+
+
+def test_cylinders_with_valves_have_pressures_flows_and_signals(recording):
+    """In the units of the page, which are those of the largest of a row; the motor has none."""
+    time = recording.time
+    own = {
+        "pressure_X1_a": ("Pa", 1.2e7 + 1e6 * time), "pressure_X1_b": ("Pa", 3e6 - 1e5 * time),
+        "pressure_supply": ("Pa", 0 * time + 2e7), "flow_X1_a": ("m3/s", 5e-4 * time),
+        "flow_X1_b": ("m3/s", -3e-4 * time), "voltage_X1": ("V", 2 + time),
+    }  # fmt: skip
+    units = {name: unit for name, (unit, _) in own.items()}
+    channels = {name: values for name, (_, values) in own.items()}
+    tau = np.column_stack([9000 * time, 40e3 - 1e3 * time])
+    run = Recording(
+        time, recording.joints, recording.q, recording.v, tau, recording.units, channels, units
+    )
+    figure = recording_figure(run)
+    grid = panels(figure)
+    assert set(grid) == {(row, 0) for row in range(3)} | {(row, 1) for row in range(6)}
+    expected = {
+        (2, 0): ("torque [kN m]", {"recording": 1e-3 * tau[:, 0]}),
+        (2, 1): ("force [kN]", {"recording": 1e-3 * tau[:, 1]}),
+        (3, 1): ("pressure [bar]", {
+            "A": 120 + 10 * time, "B": 30 - time, "supply": np.full(len(time), 200.0)}),
+        (4, 1): ("flow [l/min]", {"A": 30 * time, "B": -18 * time}),
+        (5, 1): ("signal [V]", {"recording": 2 + time}),
+    }  # fmt: skip
+    for place, (label, lines) in expected.items():
+        assert grid[place].get_ylabel() == label
+        assert {line.get_label() for line in grid[place].get_lines()} == set(lines)
+        for name, values in lines.items():
+            np.testing.assert_allclose(curve(grid[place], name)[1], values, rtol=1e-12)
+    assert [grid[2, 0].get_xlabel(), grid[2, 1].get_xlabel()] == ["time [s]", ""]
+    assert grid[5, 1].get_xlabel() == "time [s]"
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["recording", "A", "B", "supply"]
+
+
+def test_a_small_force_beside_a_large_one_is_in_the_same_unit():
+    tau = np.array([[28e3, 300.0], [27e3, -500.0]])
+    zeros = np.zeros((2, 2))
+    run = Recording([0, 1], ("X1", "X2"), zeros, zeros, tau, {"X1": "m", "X2": "m"})
+    grid = panels(recording_figure(run))
+    assert [grid[2, i].get_ylabel() for i in (0, 1)] == ["force [kN]"] * 2
+    np.testing.assert_allclose(curve(grid[2, 1], "recording")[1], [0.3, -0.5])

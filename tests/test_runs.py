@@ -9,6 +9,7 @@ from crane.errors import OutputError
 from crane.output import file_name, staging
 from crane.recording import Recording
 from crane.runs import check_folder, check_free, read_run, write_run
+from crane.summary import subject, title
 
 
 @pytest.fixture
@@ -148,10 +149,10 @@ def test_files_that_results_cannot_go_to(tmp_path):
 def test_views_of_an_earlier_run_do_not_stay_beside_a_new_one(tmp_path, recording):
     for name in ("recording.csv", "figure.png", "view.html", "notes.txt"):
         (tmp_path / name).write_text("old")
-    text = write_run(tmp_path, recording, "a run")
+    text = write_run(tmp_path, recording)
     assert set(tree(tmp_path)) == {"recording.csv", "summary.md", "notes.txt"}
     assert (tmp_path / "summary.md").read_text() == text
-    assert text.startswith("# a run\n")
+    assert text.startswith(f"# {title(subject(recording), recording.task)}\n")
     np.testing.assert_array_equal(read_run(tmp_path).time, recording.time)
 
 

@@ -148,7 +148,7 @@ def test_table_and_picture(pins, tmp_path):
         ({"vary": {"payload.mass": []}}, "has no list of values"),
         ({"vary": {"payload.mass": [np.nan]}}, "is nan"),
         ({"vary": {"payload.mass": [0, 1, 2]}, "draws": 3}, "is drawn between two values"),
-        ({"vary": {"payload.mass": [0, 1]}, "draws": 0}, "0 variants are not possible"),
+        ({"vary": {"payload.mass": [0, 1]}, "draws": 0}, "the number of variants is 0, give"),
         ({"vary": {"payload.mass": [0]}, "tasks": ["lft"]}, "did you mean 'lift'?"),
         ({"vary": {"payload.mass": [0]}, "measures": ["peak_X"]}, "did you mean 'peak_X"),
         ({"vary": {"payload.mass": [-1.0]}}, "none of 1 variants can be measured"),

@@ -187,6 +187,36 @@ def test_the_box_holds_the_machine_in_every_frame(machine, recording):
         assert (tip - 1e-9 <= scene.upper).all()
 
 
+MAST = """<robot name="mast">
+  <link name="base">{fixed}</link>
+  <link name="arm">
+    <inertial><mass value="1"/>
+      <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>
+    <visual><origin xyz="1 0 0"/><geometry><box size="2 0.1 0.1"/></geometry></visual>
+  </link>
+  <joint name="lift" type="revolute"><origin xyz="0 0 1"/><parent link="base"/><child link="arm"/>
+    <axis xyz="0 -1 0"/><limit lower="-1.57" upper="1.57" effort="1" velocity="1"/></joint>
+</robot>"""
+PLINTH = '<visual><origin xyz="0 0 {}"/><geometry><box size="1 1 0.5"/></geometry></visual>'
+
+
+@pytest.mark.parametrize(
+    ("fixed", "ground"), [(PLINTH.format(0.25), 0.0), (PLINTH.format(-0.4), -0.65), ("", 0.0)]
+)
+def test_the_ground_is_where_the_machine_stands_however_low_its_tip_reaches(
+    tmp_path, fixed, ground
+):
+    path = tmp_path / "mast.urdf"
+    path.write_text(MAST.format(fixed=fixed))
+    mast = crane.load(path)
+    down = np.array([[0.0], [-1.5]])
+    moves = Recording([0, 1], ("lift",), down, 0 * down, 0 * down, {"lift": "rad"})
+    scene = build_scene(mast, moves)
+    assert scene.ground == pytest.approx(ground, abs=1e-12)
+    assert scene.lower[2] < -0.9  # the tip digs, and stays in view
+    assert f'"ground":{scene.ground!r}' in report(mast, moves, tmp_path / "a.html").read_text()
+
+
 @pytest.mark.parametrize(("step", "frames"), [(1e-3, 301), (5e-2, 201), (1.0, 11)])
 def test_frames_are_the_nearest_samples(step, frames):
     time = 7.0 + step * np.arange(round(10 / step) + 1)

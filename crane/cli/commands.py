@@ -130,6 +130,7 @@ def _is_run(what: str) -> bool:
 
 def _describe(machine: "Machine") -> Iterator[str]:
     from crane.dynamics import Dynamics
+    from crane.units import quantity
 
     closure = machine.closure
     structure = closure.structure
@@ -141,7 +142,7 @@ def _describe(machine: "Machine") -> Iterator[str]:
     yield f"  chains      {', '.join(chain.name for chain in machine.chains)}"
     yield (
         f"  joints      {len(machine.joints)}, of which {len(machine.active)} active; "
-        f"moving mass {mass:.4g} kg"
+        f"moving mass {quantity(mass, 'kg', 4)}"
     )
     width = max(10, 1 + max(map(len, (*machine.joints, *closure.equations.names))))
     for i, joint in enumerate(machine.active):

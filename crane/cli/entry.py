@@ -1,5 +1,6 @@
 """The program: options of all commands, and what becomes of errors."""
 
+import io
 import os
 import sys
 import warnings
@@ -20,7 +21,7 @@ from crane.cli import (  # noqa: F401  register their commands
     workspace,
 )
 from crane.cli.shared import app, say
-from crane.errors import CraneError, CraneWarning
+from crane.errors import CraneError, CraneWarning, one_line
 
 _INTERRUPTED = 130
 
@@ -29,6 +30,8 @@ def main() -> None:
     """Run the command line: errors are one line, exit status 2."""
     arguments = [word for word in sys.argv[1:] if word != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may be no text
+        sys.stdout.reconfigure(errors="backslashreplace")
     warnings.showwarning = _show_warning
     warnings.simplefilter("once", CraneWarning)
     try:
@@ -52,7 +55,8 @@ def main() -> None:
         if isinstance(error, BrokenPipeError):  # whoever read it has seen enough
             sys.exit(1)
         place = error.filename or "output"
-        say(f"error: {place}: {error.strerror or error}, check the place and try again")
+        reason = error.strerror or error
+        say(f"error: {one_line(f'{place}: {reason}')}, check the place and try again")
         sys.exit(2)
     except Exception as error:
         # the command line parser's own errors, whose class is not public
@@ -60,7 +64,7 @@ def main() -> None:
         if debug or message is None:
             raise
         if text := message():
-            say(f"error: {' '.join(text.split())} (crane --help shows the commands)")
+            say(f"error: {one_line(' '.join(text.split()))} (crane --help shows the commands)")
         sys.exit(2)
     sys.exit(status if isinstance(status, int) else 0)
 
@@ -87,7 +91,7 @@ def _options(
 
 
 def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
-    say(f"warning: {message}")
+    say(f"warning: {one_line(str(message))}")
 
 
 def _abandon_output() -> None:

@@ -65,16 +65,25 @@ NoOpen = Annotated[bool, typer.Option("--no-open", help="Do not open the browser
 def by_joint(
     option: str, words: list[str] | None, form: str = "JOINT=VALUE, as in X1=0.5"
 ) -> dict[str, float]:
-    """Numbers by joint, from JOINT=VALUE."""
-    out = {}
+    """Numbers by joint, from JOINT=VALUE.
+
+    Raises:
+        InputError: Something else is written, a joint twice, or a number that nothing has.
+    """
+    from crane.samples import as_number
+
+    out: dict[str, float] = {}
     for word in words or ():
         joint, _, text = word.rpartition("=")
         try:
-            out[joint] = float(text)
+            value = float(text)
         except ValueError:
-            joint = ""
+            joint, value = "", 0.0
         if not joint:
             raise InputError(f"{option} is '{word}', write {form}")
+        if joint in out:
+            raise InputError(f"{option} names '{joint}' twice, give it once")
+        out[joint] = as_number(value, f"{option} {joint}", "")
     return out
 
 

@@ -62,10 +62,10 @@ def simulate(
         duration = loaded.tasks[task].duration
     with progress_bar("simulating") as progress:
         recording = run(
-            loaded, control, duration=duration, step=step, task=task or "", progress=progress
-        )
-    title = f"{loaded.name}: {task or 'free motion'}"
-    print(write_run(out, recording, title), end="")
+            loaded, control, duration=duration, step=step, task=task or "free motion",
+            progress=progress,
+        )  # fmt: skip
+    print(write_run(out, recording), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")
 
 
@@ -96,5 +96,5 @@ def _replay(machine: "Machine", inputs: Path, out: Path, step: float) -> None:
 
     with progress_bar("simulating") as progress:
         recording, comparison = replay(machine, inputs, step, progress)
-    print(write_comparison(out, recording, comparison, f"{machine.name}: {inputs.stem}"), end="")
+    print(write_comparison(out, recording, comparison), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")

@@ -77,6 +77,14 @@ class Closure:
         self.home = self._branch.home.q.copy()
         self.home.flags.writeable = False
 
+    def __repr__(self) -> str:
+        """Its loops, and what drives them."""
+        loops = ", ".join(loop.name for loop in self.equations.loops) or "no loops"
+        return (
+            f"Closure of {loops}: {len(self.passive)} passive joints from "
+            f"{', '.join(self.active_names)}"
+        )
+
     @cached_property
     def _made(self) -> FastClosure | None:
         branch = self._branch

@@ -156,7 +156,8 @@ class LoopEquations:
         coupled = self.factors @ q - self.offsets
         if not self.loops:
             return coupled, self.factors.copy()
-        jacobian = pin.computeJointJacobians(self.model, self.data, q)
+        # of a single joint Pinocchio returns a vector, here and below
+        jacobian = pin.computeJointJacobians(self.model, self.data, q).reshape(6, -1)
         self._local.last = a, b, p1, p2 = self._geometry()
         phi = np.einsum("ij,ij->i", a, np.where(self._moves[:, None], p2 - p1, b))
         slopes = self._row_sign * (self._wrenches(a, b, p2) @ jacobian)
@@ -194,7 +195,7 @@ class LoopEquations:
         if not self.loops:
             return np.zeros(len(self.couplings))
         a, b, _, p2 = self._local.last
-        rate = pin.computeJointJacobiansTimeVariation(self.model, self.data, q, v)
+        rate = pin.computeJointJacobiansTimeVariation(self.model, self.data, q, v).reshape(6, -1)
         velocity = np.array([self.data.ov[joint].vector for joint, _ in self.frames])
         one = 2 * self._loop
         v2, w1, w2 = velocity[one + 1, :3], velocity[one, 3:], velocity[one + 1, 3:]
@@ -206,7 +207,7 @@ class LoopEquations:
         wrench_rate[self._moves, :3] = a_rate[self._moves]
         wrench_rate[:, 3:] = _cross(arm_rate, a) + _cross(arm, a_rate)
         split = self._row_sign * v  # (m, nv): v of frame 2 minus v of frame 1
-        relative, bias = split @ self.data.J.T, split @ rate.T
+        relative, bias = split @ self.data.J.reshape(6, -1).T, split @ rate.T
         bent = np.einsum("ij,ij->i", wrench_rate, relative) + np.einsum(
             "ij,ij->i", self._wrenches(a, b, p2), bias
         )

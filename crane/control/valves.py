@@ -76,6 +76,9 @@ class Signals:
         supply: Measured pressure of the supply (N,) [Pa], if it is to be used.
         tank: Measured pressure of the tank (N,) [Pa]; that of the machine file if not given.
 
+    Attributes:
+        title: What they come from, in words; recordings name their controller by it.
+
     Raises:
         InputError: Unknown joints, wrong lengths, or times that do not increase.
     """
@@ -83,6 +86,7 @@ class Signals:
     path: Path | None = None
     settings = np.zeros(0)
     period = 0.0
+    title = "given valve signals"
 
     def __init__(
         self,
@@ -196,7 +200,9 @@ def joystick(
         lever = np.interp(fine, times, levers)
         u = lever * (1.0 - valve.dead_band) + valve.dead_band * np.sign(lever)
         signals[joint] = valve.neutral + (valve.full - valve.neutral) * u
-    return Signals(machine, fine, signals)
+    found = Signals(machine, fine, signals)
+    found.title = "joystick"
+    return found
 
 
 class ValvePD:

@@ -14,7 +14,7 @@ from crane.description.hydraulics import Hydraulics
 from crane.description.spec import Chain, Coupling, Friction, MachineSpec
 from crane.description.urdf import read_urdf
 from crane.errors import InputError, known
-from crane.samples import as_number
+from crane.samples import FARTHEST, as_number
 
 PAYLOAD = "payload.mass"
 _TURNS = ("roll", "pitch", "yaw")
@@ -170,7 +170,7 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
     for name, given in lock.items():
         if name not in joints:
             raise InputError(f"joint '{name}' to lock is unknown, {known(joints, name)}")
-        _fix(joints[name], as_number(given, f"the coordinate to lock '{name}' at", ""))
+        _fix(joints[name], given)
     active = spec.active and tuple(name for name in spec.active if name not in lock)
     if (spec.active and not active) or not joints.keys() - lock.keys():
         raise InputError(f"with {', '.join(lock)} locked nothing drives the machine, lock less")
@@ -206,7 +206,8 @@ def _coupled(
 ) -> tuple[dict[str, float], tuple[Coupling, ...]]:
     """Locks with what couplings make of them, and the couplings of what still moves."""
     locked = {
-        name: as_number(x, f"the coordinate to lock '{name}' at", "") for name, x in lock.items()
+        name: as_number(x, f"the coordinate to lock '{name}' at", "m or rad", most=FARTHEST)
+        for name, x in lock.items()
     }
     rest = list(couplings)
     settled = False

@@ -61,6 +61,10 @@ class Dynamics:
             geometry = machine.closure.fast.geometry
             self.numbers = np.ascontiguousarray(numbers_of(machine, geometry, self.forces))
 
+    def __repr__(self) -> str:
+        """Of what, and how it is computed."""
+        return f"Dynamics of '{self.machine.name}', {self.path}"
+
     @property
     def parameters(self) -> Array:
         """(10 nb,) inertial parameters of the bodies, in the order of the tree's joints.

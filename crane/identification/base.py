@@ -10,7 +10,7 @@ from crane.closure.structure import Indices
 from crane.errors import ClosureError, InputError
 from crane.identification.model import Model, Samples
 from crane.machine import Machine
-from crane.samples import Array
+from crane.samples import Array, Brief
 
 _RANK = 1e-8  # of a column's norm, what of it must be new
 _NOTHING = 1e-10  # of the largest norm, below which a column is zero
@@ -30,8 +30,8 @@ _ORDER = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Base:
+@dataclass(frozen=True, eq=False, repr=False)
+class Base(Brief):
     """The smallest set of parameters with the same effect: W beta = W[:, independent] K beta.
 
     Attributes:

@@ -23,7 +23,7 @@ from crane.identification.identify import motion_of
 from crane.identification.steady import steady
 from crane.machine import Machine
 from crane.recording import Recording
-from crane.samples import Array
+from crane.samples import Array, Brief
 
 NAMES = ("coulomb", "coulomb_offset", "viscous", "stiction", "stribeck")
 
@@ -34,8 +34,8 @@ _STILL = 0.01  # of the fastest speed
 _SEARCHED = 40  # stribeck velocities tried before the fit
 
 
-@dataclass(frozen=True, eq=False)
-class CylinderFriction:
+@dataclass(frozen=True, eq=False, repr=False)
+class CylinderFriction(Brief):
     """Friction of one joint.
 
     Attributes:

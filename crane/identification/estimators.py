@@ -11,7 +11,7 @@ import numpy as np
 
 from crane.errors import InputError
 from crane.identification.noise import Noise, between
-from crane.samples import Array
+from crane.samples import Array, Brief
 
 Prior = tuple[Array, Array]
 """Means (p,) and standard deviations (p,) of the parameters; infinite where nothing is known."""
@@ -24,8 +24,8 @@ _ROUNDS = 100
 _LEAST_SHARE = 0.2  # of the degrees of freedom, however many parameters take theirs
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
+@dataclass(frozen=True, eq=False, repr=False)
+class Estimate(Brief):
     """Estimated parameters.
 
     Attributes:

@@ -16,21 +16,23 @@ from crane.identification.fourier import Fourier
 from crane.identification.information import CRITERIA, Information, Quality
 from crane.identification.limits import QUANTITIES, Limits, by_joint, gear, limits
 from crane.identification.model import Model, Samples
-from crane.identification.search import Search
+from crane.identification.search import COARSE, Search
 from crane.machine import Machine
 from crane.output import replacing
 from crane.recording import FORCE_UNITS, VELOCITY_UNITS
-from crane.samples import Array, as_number
+from crane.samples import Array, Brief, as_count, as_number, as_seed
 from crane.timeseries import TIME, Table
 
 _SHARE = 0.01  # of a drive's force limit, its noise if none is given
 _WORST = 5  # parameters in the table
+_MOST = 4_000_000  # samples of the recording
+_MEMORY = 1e9  # that motions are optimised in [bytes]
 
 Progress = Callable[[float], None]
 
 
-@dataclass(frozen=True, eq=False)
-class Excitation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Excitation(Brief):
     """A reference to identify a machine with.
 
     Attributes:
@@ -205,17 +207,21 @@ def excite(
     if criterion not in CRITERIA:
         raise InputError(f"criterion '{criterion}' is unknown, {known(CRITERIA, criterion)}")
     for what, value in (("starts", starts), ("harmonics", harmonics), ("periods", periods)):
-        if not isinstance(value, int | np.integer) or value < 1:
-            raise InputError(f"the number of {what} is {value}, give an integer above 0")
-    as_number(period, "the period", "s", above=0)
-    as_number(step, "the step", "s", above=0)
-    if not isinstance(seed, int | np.integer) or seed < 0:
-        raise InputError(f"the seed is {seed}, give an integer that is not negative")
+        as_count(value, f"the number of {what}")
+    period = as_number(period, "the period", "s", above=0)
+    step = as_number(step, "the step", "s", above=0)
+    seed = as_seed(seed)
     model = model or Model(machine)
+    _check_size(model, period, harmonics, periods, step)
     bounds = limits(machine, acceleration, margin)
     force = machine.model.effortLimit[machine.closure.active]
     default = np.where(np.isfinite(force), _SHARE * force, 1.0)
     deviation = by_joint(machine, noise, "noise", default)
+    for joint, most, value in zip(machine.active, force, deviation, strict=True):
+        if value > most:
+            raise InputError(
+                f"noise of '{joint}' is {value:g}, above the {most:g} of its drive: give less"
+            )
     force = np.where(np.isfinite(force), force, deviation / _SHARE)
     base = base_parameters(model)
     if not base.rank:
@@ -259,9 +265,32 @@ def excite(
         used=search.used(path),
         noise=deviation,
         criterion=criterion,
-        seed=int(seed),
-        step=float(step),
+        seed=seed,
+        step=step,
     )
+
+
+def _check_size(model: Model, period: float, harmonics: int, periods: int, step: float) -> None:
+    """See that the search and the recording have room.
+
+    Raises:
+        InputError: They have none; the message has what would be possible.
+    """
+    n = len(model.machine.active)
+    room = _MEMORY / (24 * n * len(model.names))  # samples of three regressors at once
+    least = max(period / room, (periods + 1) * period / _MOST)
+    if step < least:
+        raise InputError(
+            f"{periods} periods of {period:g} s and the ways from and to rest are "
+            f"{(periods + 1) * period / step:.3g} samples of {step:g} s, for which there is no "
+            f"room: give a step of at least {least:.2g} s, or fewer or shorter periods"
+        )
+    most = max(1, int((room / (2 * n * COARSE)) ** 0.5))  # a stack of motions per derivative
+    if harmonics > most:
+        raise InputError(
+            f"the number of harmonics is {harmonics}, more than there is room for with {n} active "
+            f"joints: give at most {most}"
+        )
 
 
 def _anywhere(model: Model, bounds: Limits, fastest: float) -> Samples:

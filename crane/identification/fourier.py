@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from crane.errors import InputError
 from crane.paths import Path
-from crane.samples import Array, as_number, as_samples
+from crane.samples import Array, as_count, as_number, as_samples
 
 
 class Fourier(Path):
@@ -44,9 +44,7 @@ class Fourier(Path):
             )
         self.coefficients = as_samples(table, table.shape[1], "coefficients")
         self.period = as_number(period, "the period", "s", above=0)
-        if not isinstance(periods, int | np.integer) or periods < 1:
-            raise InputError(f"the number of periods is {periods}, give an integer above 0")
-        self.periods = int(periods)
+        self.periods = as_count(periods, "the number of periods")
         self.lead = self.period / 2
         self.duration = self.periods * self.period + 2 * self.lead
         self.tip = None

@@ -30,6 +30,7 @@ _SLOW = 0.02  # of a joint's largest velocity, below which its rows are left out
 _FAST = 40.0  # times the frequency below which 99 % of the accelerations are
 _FEWEST = 5.0  # periods of the filter's cutoff in a recording
 _EXACT = 1e-4  # of the forces, noise that a feasible estimate counts with at least
+_PRIORS = 1e-7, 1e6  # above and up to which a relative standard deviation lies
 _PRIOR = 0.3  # relative standard deviation of a body towards which a feasible estimate is drawn
 _THICKNESS = 0.05  # of a body's size, added to what is thinner in a prior
 
@@ -149,6 +150,7 @@ def identify(
     base = base_parameters(model)
     if bandwidth is None:
         bandwidth = _bandwidth(motion)
+    bandwidth = as_number(bandwidth, "the bandwidth", "Hz", above=0)
     fastest = np.abs(motion.v).max(axis=0)
     limits = _slow(machine, slow, fastest)
     rows = _equations(model, base, motion, bandwidth, limits)
@@ -233,7 +235,9 @@ def _slow(machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastes
         for joint, value in slow.items():
             if joint not in machine.active:
                 raise InputError(f"slow is for '{joint}', {known(machine.active, joint)}")
-            out[machine.active.index(joint)] = as_number(value, f"slow of '{joint}'", "")
+            if (limit := as_number(value, f"slow of '{joint}'", "")) < 0:
+                raise InputError(f"slow of '{joint}' is {limit:g}, it must not be negative")
+            out[machine.active.index(joint)] = limit
         return out
     return out if slow is None else np.broadcast_to(np.asarray(slow, np.float64), out.shape)
 
@@ -264,10 +268,9 @@ def prior_of_bodies(model: Model, relative: float) -> Prior:
         Means (p,) and standard deviations (p,), infinite for what is no body.
 
     Raises:
-        InputError: The share is not above zero.
+        InputError: The share is not from 1e-7 to 1e6.
     """
-    if not relative > 0:
-        raise InputError(f"the prior's standard deviation is {relative:g}, give one above 0")
+    relative = as_number(relative, "the prior's relative standard deviation", "", *_PRIORS)
     std = np.full(len(model.names), np.inf)
     for i in range(len(model.bodies)):
         mass, length = _size(model.nominal[10 * i : 10 * i + 10])

@@ -12,13 +12,13 @@ from crane.dynamics import Dynamics
 from crane.dynamics.elements import JointForces
 from crane.errors import InputError, known
 from crane.machine import Machine
-from crane.samples import Array, as_samples
+from crane.samples import Array, Brief, as_samples
 
 PER_BODY = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 
 
-@dataclass(frozen=True, eq=False)
-class Samples:
+@dataclass(frozen=True, eq=False, repr=False)
+class Samples(Brief):
     """A closed motion.
 
     Attributes:

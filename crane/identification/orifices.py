@@ -22,7 +22,7 @@ from crane.identification.orifice_rows import OrificeRows, Sides, sides, terms
 from crane.identification.signals import differentiate
 from crane.machine import Machine
 from crane.recording import Recording
-from crane.samples import Array
+from crane.samples import Array, Brief
 
 NAMES = ("1/beta", "c1", "c2", "c3", "c4")
 UNITS = ("1/Pa",) + 4 * ("m3/(s Pa^0.5)",)
@@ -47,8 +47,8 @@ _REASONS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Orifices:
+@dataclass(frozen=True, eq=False, repr=False)
+class Orifices(Brief):
     """X of one cylinder.
 
     Attributes:

@@ -15,7 +15,7 @@ from crane.identification.result import Comparison
 from crane.identification.signals import Motion
 from crane.machine import Machine
 from crane.recording import Recording
-from crane.samples import Array
+from crane.samples import Array, Brief
 
 _TOLD = 1e-6  # what of a direction may be missing from those that forces tell
 
@@ -48,8 +48,8 @@ class Load:
         return rows[:, :, self._columns] @ self._turn
 
 
-@dataclass(frozen=True, eq=False)
-class PayloadEstimate:
+@dataclass(frozen=True, eq=False, repr=False)
+class PayloadEstimate(Brief):
     """A load on a frame.
 
     Attributes:

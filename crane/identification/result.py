@@ -10,11 +10,11 @@ from crane.identification.base import Base
 from crane.identification.estimators import Estimate
 from crane.identification.model import Model
 from crane.machine import Machine
-from crane.samples import Array
+from crane.samples import Array, Brief
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Brief):
     """Measured and modelled forces of one recording, both through the same filter.
 
     Attributes:
@@ -91,6 +91,15 @@ class Identification:
     feasible: bool
     training: Comparison
     validation: Comparison | None = None
+
+    def __repr__(self) -> str:
+        """What was identified, how, and how well it predicts."""
+        kind = "feasible, " if self.feasible else ""
+        judged = "" if self.validation is None else f", validation {self.validation.stacked:.3%}"
+        return (
+            f"Identification of '{self.machine.name}': {len(self.values)} base parameters, "
+            f"{kind}{self.method}, error {self.training.stacked:.3%}{judged}"
+        )
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from crane.identification.model import Samples
 from crane.samples import Array
 
 DENSE = 64  # samples per period of the highest harmonic, to see that limits hold
-_COARSE = 12  # the same to optimise with
+COARSE = 12  # the same to optimise with
 _WITHIN = float(np.cos(np.pi / DENSE))  # at samples, so that nothing exceeds 1 in between
 _DRAWS, _TRIALS = 20, 200  # random references: how many within the limits, of how many at most
 _HALVINGS = 10  # of the interval in which the largest amplitude lies
@@ -56,7 +56,7 @@ class Search:
         self._machine, self._count, self._period = information.model.machine, count, period
         self._dynamics = Dynamics(self._machine)
         n = len(bounds.half)
-        samples = max(_COARSE * harmonics, -(-2 * information.base.rank // n))
+        samples = max(COARSE * harmonics, -(-2 * information.base.rank // n))
         self._bases = bases(period * np.arange(samples) / samples, harmonics, period)
         wk = 2 * np.pi / period * np.arange(1, harmonics + 1)[:, None]
         alone = np.minimum(bounds.velocity, np.minimum(wk * bounds.half, bounds.acceleration / wk))

@@ -8,15 +8,15 @@ from numpy.typing import ArrayLike
 
 from crane.errors import InputError, RecordingError
 from crane.identification.smoother import smooth
-from crane.samples import Array, as_number
+from crane.samples import Array, Brief, as_number
 
 _FEWEST = 50  # samples
 _LONGEST_GAP = 5.0  # steps
 _JITTER = 0.01  # steps
 
 
-@dataclass(frozen=True, eq=False)
-class Motion:
+@dataclass(frozen=True, eq=False, repr=False)
+class Motion(Brief):
     """What an identification starts from: N samples of n active joints.
 
     Attributes:
@@ -34,8 +34,8 @@ class Motion:
     tau: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Derivatives:
+@dataclass(frozen=True, eq=False, repr=False)
+class Derivatives(Brief):
     """Smoothed coordinates and their derivatives (N, n).
 
     Attributes:
@@ -174,8 +174,9 @@ def average_periods(time: Array, x: Array, period: float) -> tuple[Array, Array,
 
     Raises:
         RecordingError: Fewer than two periods, or no multiple of the step.
+        InputError: The period is no number above zero.
     """
-    step = sampling(time)
+    step, period = sampling(time), as_number(period, "the period", "s", above=0)
     count = round(period / step)
     if count < 1 or abs(count * step - period) > _JITTER * step:
         raise RecordingError(

@@ -20,7 +20,7 @@ from crane.identification.cylinder_signals import channel, parts, speed
 from crane.identification.steady import steady
 from crane.machine import Machine
 from crane.recording import Recording
-from crane.samples import Array
+from crane.samples import Array, Brief
 
 NAMES = ("edge up", "edge down", "slope up", "slope down")
 _UNITS = ("V", "V", "{0}/s/V", "{0}/s/V")
@@ -28,8 +28,8 @@ _STILL = 0.01  # of the fastest speed, at which a signal moves nothing
 _FEWEST_LEVELS = 0.05  # of the signal's range, by which levels of one direction must differ
 
 
-@dataclass(frozen=True, eq=False)
-class ValveCurve:
+@dataclass(frozen=True, eq=False, repr=False)
+class ValveCurve(Brief):
     """Steady speed over signal.
 
     Attributes:

@@ -44,6 +44,7 @@ class Page:
         self._recorded: Array | None = None
         machine, gui = session.machine, server.gui
         self._stage = Stage(server, session)
+        server.on_client_connect(self._aim)
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         gui.set_panel_label(machine.name)
@@ -70,6 +71,14 @@ class Page:
         self._show(session.posture)
         if playback is not None:
             self.work([(_TIME, playback.start)])
+
+    def _aim(self, client: Any) -> None:
+        """Turn the camera of a window that has come to where it sees the machine."""
+        if client.camera.aspect < 1:
+            look_at, position = self._stage.view(client.camera.aspect)
+            with client.atomic():
+                client.camera.position = position  # which takes what is looked at along
+                client.camera.look_at = look_at
 
     @property
     def playing(self) -> bool:

@@ -9,10 +9,12 @@ import pinocchio as pin
 from crane.description.visuals import Box, Cylinder, Mesh, Sphere, Visual
 from crane.live.session import Session, round_up
 from crane.samples import Array
+from crane.view.scene import ground
 from crane.view.visuals import read_visuals
 
 _VIEW = np.array([0.55, -1.0, 0.45])  # from what is looked at to the camera, over its size
 _FIELD = 40.0  # of view, upright [deg]
+_ABOVE = 0.4  # share of a phone's height that viser's panel leaves free
 _LOAD = 1000.0  # density of the ball that stands for the payload [kg/m3]
 _ORANGE = (224, 112, 26)
 
@@ -38,8 +40,7 @@ class Stage:
         if session.machine.tip is not None:
             self._links.append(session.machine.tip)
             self._frames.append(server.scene.add_frame("/tip", show_axes=False))
-        ground = float(_corners(visuals, session)[:, 2].min())
-        self._look(*_bounds(visuals, session), ground)
+        self._look(*_bounds(visuals, session), ground(session.machine, visuals))
         self.show()
 
     def show(self) -> None:
@@ -69,11 +70,11 @@ class Stage:
                 "/path", segments, _ORANGE, thickness=2.0, thickness_units="screen"
             )
 
-    def _look(self, lower: Array, upper: Array, ground: float) -> None:
-        """A grid at the height of the ground [m], and a camera that has everything in view."""
+    def _look(self, lower: Array, upper: Array, floor: float) -> None:
+        """A grid at a height [m], and a camera that has everything in view."""
         scene, camera = self._server.scene, self._server.initial_camera
-        size = float(np.linalg.norm(upper - lower))
-        middle = (lower + upper) / 2
+        self._size = size = float(np.linalg.norm(upper - lower))
+        self._middle = middle = (lower + upper) / 2
         cell = round_up(size / 12)
         scene.add_grid(
             "/ground",
@@ -83,15 +84,30 @@ class Stage:
             section_size=10 * cell,
             cell_color=(215, 218, 222),
             section_color=(185, 190, 196),
-            position=(middle[0], middle[1], ground),
+            position=(middle[0], middle[1], floor),
         )
         scene.set_background_image(np.full((2, 2, 3), 247, dtype=np.uint8))
-        direction = _VIEW / np.linalg.norm(_VIEW)
-        away = 0.5 * size / np.tan(np.radians(_FIELD / 2))
         camera.fov = np.radians(_FIELD)
         camera.near, camera.far = size / 1000, 100 * size
-        camera.look_at = middle
-        camera.position = middle + away * direction
+        camera.look_at, camera.position = self.view()
+
+    def view(self, aspect: float = 1.0) -> tuple[Array, Array]:
+        """What a camera looks at and where it stands [m], everything in view.
+
+        In a window that stands upright, as a phone's, the panel covers the lower part: the machine
+        goes into the part above it, and no wider than the window.
+
+        Args:
+            aspect: Width of the window over its height.
+        """
+        direction = _VIEW / np.linalg.norm(_VIEW)
+        half = float(np.tan(np.radians(_FIELD / 2)))
+        if aspect >= 1:
+            return self._middle, self._middle + 0.5 * self._size / half * direction
+        away = 0.5 * self._size / (half * min(aspect, _ABOVE))
+        up = np.array([0.0, 0.0, 1.0]) - direction[2] * direction
+        centre = self._middle - (1 - _ABOVE) * half * away * up / np.linalg.norm(up)
+        return centre, centre + away * direction
 
 
 def _add(scene: Any, name: str, visual: Visual) -> None:

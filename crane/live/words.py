@@ -8,6 +8,7 @@ from crane.machine import Machine
 from crane.recording import FORCE_UNITS
 from crane.samples import Array
 from crane.summary import READING_UNITS
+from crane.units import quantity
 
 _TABLE = '<table style="width:100%;font-size:0.8em;border-spacing:0 0.15em">'
 _HEAD = '<tr style="opacity:0.6">'
@@ -39,8 +40,8 @@ def numbers(
     rows = []
     for i, joint in enumerate(machine.active):
         unit = FORCE_UNITS[machine.unit(joint)]
-        row = [joint, _force(posture.gravity[i], unit)]
-        rows.append(row + ([_force(recorded[i], unit)] if recorded is not None else []))
+        row = [joint, quantity(posture.gravity[i], unit)]
+        rows.append(row + ([quantity(recorded[i], unit)] if recorded is not None else []))
     parts = [_table(heads, rows)]
     if posture.tip is not None:
         x, y, z = (f"{round(1e3 * value, 1) + 0.0:.1f}" for value in posture.tip)
@@ -63,13 +64,6 @@ def numbers(
 def warning(text: str) -> str:
     """A message in a box as HTML, nothing for an empty one."""
     return f"{_BOX}{escape(text)}</div>" if text else ""
-
-
-def _force(value: float, unit: str) -> str:
-    text = f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
-    if abs(value) < 1e-9:
-        text = "0"
-    return f"{text} {unit}"
 
 
 def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -10,7 +10,7 @@ from lxml import etree
 from crane.closure import Closure, frame_id
 from crane.description import LoopSpec, MachineSpec, inertia_problem
 from crane.description.findings import kept, note
-from crane.errors import DescriptionError, MechanismError
+from crane.errors import DescriptionError, MechanismError, at
 from crane.machine.axes import wrong_axis
 from crane.samples import Array
 
@@ -78,7 +78,7 @@ def closed(
         hint = ""
         if spec.active == () and spec.path.suffix.lower() == ".urdf":
             hint = ', and mark what you choose with independent="true"'
-        raise MechanismError(f"{where}: {error}{hint}", error.about) from None
+        raise MechanismError(at(where, error) + hint, error.about) from None
 
 
 def _closure(

@@ -96,6 +96,17 @@ class Machine:
     changes: Mapping[str, float]
     locks: Mapping[str, float]
 
+    def __repr__(self) -> str:
+        """Name, joints, loops and what drives it."""
+        drives = ", ".join(f"{joint} [{self.unit(joint)}]" for joint in self.active)
+        loops = len(self.closure.equations.loops)
+        circuit = ", hydraulic" if self.hydraulics is not None else ""
+        return (
+            f"Machine '{self.name}': {len(self.joints)} joints, "
+            f"{loops} loop{'' if loops == 1 else 's'}{circuit}, "
+            f"driven by {drives}"
+        )
+
     @property
     def home(self) -> Array:
         """(nq,) the home posture, closed."""

@@ -16,7 +16,7 @@ from crane.paths import Path
 from crane.recording import FORCE_UNITS, VELOCITY_UNITS, Recording
 from crane.rig.plant import Tolerances, drawn
 from crane.rig.sensors import Sensors, default_sensors
-from crane.samples import Array, as_number
+from crane.samples import Array, as_number, as_seed
 from crane.straight import Number, TooLongError
 
 _STABLE = 2.0  # fastest rate times substep; Runge-Kutta of fourth order bears 2.785
@@ -56,12 +56,11 @@ class Rig:
         tolerances: Tolerances = Tolerances(),  # noqa: B008
         sensors: Mapping[str, Sensors] | None = None,
     ):
-        if not isinstance(seed, int | np.integer) or seed < 0:
-            raise InputError(f"the seed is {seed!r}, give a whole number from 0 on")
+        seed = as_seed(seed)
         for joint in sensors or {}:
             if joint not in machine.active:
                 raise InputError(f"sensors of '{joint}', {known(machine.active, joint)}")
-        self.machine, self.seed, self._runs = machine, int(seed), 0
+        self.machine, self.seed, self._runs = machine, seed, 0
         self.sensors = {
             joint: (sensors or {}).get(joint) or default_sensors(machine, joint)
             for joint in machine.active

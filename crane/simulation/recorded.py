@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 
-from crane.control import Controller, Free, StiffController, ValveDrive
+from crane.control import Controller, Free, Signals, StiffController, ValveDrive
 from crane.errors import CraneWarning
 from crane.hydraulics.circuit import BALANCES
 from crane.kinematics import Kinematics
@@ -93,9 +93,10 @@ def recorded(
 
 
 def _name_of(control: Controller) -> str:
-    """What drives the machine, by the name of its class."""
+    """What drives the machine: what its command calls itself, or the name of its class."""
     if isinstance(control, ValveDrive):
-        return type(control.command).__name__
+        command = control.command
+        return command.title if isinstance(command, Signals) else type(command).__name__
     return "" if isinstance(control, Free) else type(control).__name__
 
 

@@ -262,7 +262,9 @@ def _as_controller(
         raise InputError(f"{machine!r} is not a machine, load it with crane.load")
     if controller is None:
         if machine.hydraulics is not None:
-            return ValveDrive(machine, Signals(machine, [0.0], {}))
+            neutral = Signals(machine, [0.0], {})
+            neutral.title = "neutral valves"
+            return ValveDrive(machine, neutral)
         return Free(machine)
     if isinstance(controller, Command):
         return ValveDrive(machine, controller)

@@ -1,7 +1,9 @@
 """Design studies: the same measures of many variants, here or on a cluster."""
 
 import itertools
+import math
 import multiprocessing
+import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -14,13 +16,14 @@ from numpy.typing import ArrayLike
 
 from crane.description import parameters, read
 from crane.dynamics import Dynamics
-from crane.errors import CraneError, CraneWarning, InputError, known
+from crane.errors import CraneError, CraneWarning, InputError, at, known
 from crane.machine import Machine, load
-from crane.samples import Array, as_number, as_samples
+from crane.samples import Array, as_count, as_samples, as_seed
 from crane.studies.measures import of_strokes, of_task, stroke_measures, task_measures, together
 from crane.studies.table import Study
 
 _MOST = 100_000  # variants
+_PER_CORE = 8  # processes: more would wait for each other, and each has the machine in memory
 # Parameters that inverse dynamics does not know, by their first word.
 _IDLE = ("control", "supply", "oil", "cylinder", "valve", "valve_control")
 
@@ -72,18 +75,16 @@ def study(
         measures: Which ones; all if not given.
         draws: Number of variants drawn uniformly from the ranges.
         seed: Of the draws.
-        processes: How many to compute with; more than one need a main module that may be
-            imported (`if __name__ == "__main__":`).
+        processes: How many to compute with, at most eight per core; more than one need a main
+            module that may be imported (`if __name__ == "__main__":`).
         scheduler: Address of a Dask scheduler whose workers compute instead.
         progress: Called with the finished share, 0 to 1.
 
     Raises:
         InputError: Unknown names, values that do not go together, or no variant can be measured.
     """
-    if as_number(processes, "the number of processes", "") < 1:
-        raise InputError(f"the number of processes is {processes}, give at least 1")
-    if as_number(seed, "the seed", "") < 0:
-        raise InputError(f"the seed is {seed}, it must not be negative")
+    as_count(processes, "the number of processes", 1, _PER_CORE * (os.cpu_count() or 1))
+    seed = as_seed(seed)
     base = load(machine)
     name = base.reference if base.reference == str(machine) else str(base.path.resolve())
     values, grid = _variants(vary, draws, seed)
@@ -140,7 +141,7 @@ def variant(job: Job) -> tuple[dict[str, float], str]:
                 done.append(of_task(machine, dynamics, task))
                 found |= {f"{name} {task}": value for name, value in done[-1][1].items()}
             except CraneError as error:
-                reasons.append(f"task '{task}': {error}")
+                reasons.append(at(f"task '{task}'", error))
         if done and len(done) == len(job.tasks):
             found |= together(done)
         if job.strokes:
@@ -160,9 +161,8 @@ def _variants(
         axes.append(as_samples(axis, len(axis), f"what '{name}' is varied over"))
         if axis.ndim > 1 or not len(axis):
             raise InputError(f"parameter '{name}' has no list of values, give one")
-    count = draws if draws is not None else int(np.prod([float(len(axis)) for axis in axes]))
-    if not (isinstance(count, int | np.integer) and 1 <= count <= _MOST):
-        raise InputError(f"{count} variants are not possible, ask for 1 to {_MOST}")
+    count = math.prod(len(axis) for axis in axes) if draws is None else draws
+    count = as_count(count, "the number of variants", 1, _MOST)
     if draws is None:
         return np.array(list(itertools.product(*axes))), tuple(len(axis) for axis in axes)
     for name, axis in zip(vary, axes, strict=True):

@@ -39,6 +39,14 @@ class Study:
     reasons: tuple[str, ...]
     grid: tuple[int, ...]
 
+    def __repr__(self) -> str:
+        """What varies, and what is measured."""
+        failed = sum(map(bool, self.reasons))
+        return (
+            f"Study of {self.machine}: {len(self)} variants of {', '.join(self.parameters)}, "
+            f"{failed} not measured; {', '.join(self.measures)}"
+        )
+
     @property
     def rows(self) -> list[dict[str, float | str]]:
         """One dictionary per variant, with its "reason"."""

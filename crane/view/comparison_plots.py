@@ -5,21 +5,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from crane.recording import FORCE_UNITS
-from crane.replays import Channel, Comparison
-from crane.summary import READING_UNITS
+from crane.replays import Comparison
+from crane.units import reading
 from crane.view.figure_text import plain
 from crane.view.plots import DASHED, RECORDED, write_figure
 
 _ACROSS = 3
 _MOST = 4000  # instants that a line needs
-_READING = {
-    **READING_UNITS,
-    **{f"{unit}/s": (f"{name}/s", scale) for unit, (name, scale) in READING_UNITS.items()},
-    "Pa": ("bar", 1e-5),
-    "m3/s": ("l/min", 6e4),
-    **{unit: (unit, 1.0) for unit in FORCE_UNITS.values()},
-}
 
 
 def plot_comparison(comparison: Comparison, path: str | Path) -> None:
@@ -40,7 +32,8 @@ def _figure(comparison: Comparison) -> Figure:
     every = -(-len(comparison.time) // _MOST)
     time = comparison.time[::every]
     for axes, channel in zip(panels, comparison.channels, strict=False):
-        unit, scale = _reading(channel)
+        both = channel.measured, channel.simulated
+        unit, scale = reading(channel.unit, max(float(np.abs(x).max()) for x in both))
         axes.plot(time, scale * channel.measured[::every], color=RECORDED, label="measured")
         axes.plot(time, scale * channel.simulated[::every], label="simulated", **DASHED)
         label = f" [{unit}]" if unit else ""
@@ -57,9 +50,3 @@ def _figure(comparison: Comparison) -> Figure:
         axes.set_xlabel("time [s]")
     panels[0].legend(loc="best", fontsize=7)
     return figure
-
-
-def _reading(channel: Channel) -> tuple[str, float]:
-    """Unit to read a channel in, and how many of it make one SI unit."""
-    name, scale = _READING.get(channel.unit, (channel.unit, 1.0))
-    return name, float(np.float64(scale))

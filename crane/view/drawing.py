@@ -47,8 +47,8 @@ def draw_visuals(viewer: Any, visuals: Sequence[Visual]) -> None:
         shape.set_transform(placement)
 
 
-def draw_surroundings(viewer: Any, lower: Array, upper: Array) -> None:
-    """Background and a grid with round spacing on the ground, around a box (3,), (3,)."""
+def draw_surroundings(viewer: Any, lower: Array, upper: Array, floor: float) -> None:
+    """Background and a grid with round spacing at a height, around a box (3,), (3,) [m]."""
     import meshcat.geometry as g
 
     viewer["/Background"].set_property("top_color", _SKY)
@@ -63,7 +63,7 @@ def draw_surroundings(viewer: Any, lower: Array, upper: Array) -> None:
     along = np.array([[(tick, -end), (tick, end)] for tick in ticks]).reshape(-1, 2)
     centre = np.round((lower + upper)[:2] / 2 / spacing) * spacing
     level = np.concatenate([along, along[:, ::-1]]) + centre
-    points = np.column_stack([level, np.full(len(level), lower[2])])
+    points = np.column_stack([level, np.full(len(level), floor)])
     viewer.set_object(g.LineSegments(_points(points), g.LineBasicMaterial(color=_GRID)))
 
 

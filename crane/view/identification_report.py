@@ -13,6 +13,7 @@ from crane.identification.estimators import essential
 from crane.identification.result import Identification
 from crane.output import replacing
 from crane.recording import FORCE_UNITS
+from crane.summary import title
 from crane.view.identification_figures import (
     image_tag,
     matrix_figure,
@@ -74,7 +75,7 @@ def write_report(
     """
     if Path(path).suffix.lower() not in SUFFIXES:
         raise OutputError(f"{path}: a page is for a browser, end the name in .html")
-    title = f"Identification of {result.machine.name.replace('_', ' ')}"
+    heading = escape(title(result.machine.name, "identification"))
     with mpl.rc_context(STYLE):
         parts = [
             _summary(result, recording, validation),
@@ -88,8 +89,8 @@ def write_report(
     text = (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n"
-        f"<h1>{escape(title)}</h1>\n" + "\n".join(parts) + "\n</body>\n</html>\n"
+        f"<title>{heading}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n"
+        f"<h1>{heading}</h1>\n" + "\n".join(parts) + "\n</body>\n</html>\n"
     )
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")

@@ -14,7 +14,7 @@ import numpy as np
 from crane.errors import OutputError, RecordingError
 from crane.machine import Machine
 from crane.output import replacing
-from crane.summary import points
+from crane.summary import points, subject, title
 from crane.view.page_arrays import packed
 from crane.view.page_channels import Grid, groups
 from crane.view.page_motion import (
@@ -92,7 +92,7 @@ def open_in_browser(path: str | Path) -> bool:
 def _about(machine: Machine, scene: Scene, recording: "Recording | None") -> dict[str, Any]:
     """What is known of the machine itself."""
     return {
-        "machine": machine.name,
+        "machine": machine.name if recording is None else subject(recording, machine.name),
         "task": "home posture" if recording is None else recording.task,
         "tree": tree(machine),
         "tip": None if machine.tip is None else place(machine, machine.tip),
@@ -101,6 +101,7 @@ def _about(machine: Machine, scene: Scene, recording: "Recording | None") -> dic
         "actuators": [],
         "lower": scene.lower.tolist(),
         "upper": scene.upper.tolist(),
+        "ground": scene.ground,
         "views": {name: _turned(view, scene.heading) for name, view in VIEWS.items()},
         "summary": run_summary(machine, recording),
         "runs": [{"motion": motion(scene.time, scene.q)}],
@@ -185,10 +186,9 @@ def _html(about: dict[str, Any], scene: Scene) -> str:
     assets = files("crane.view") / "assets"
     blobs = [base64.b64encode(umsgpack.packb(c)).decode() for c in scene.commands]
     viewer = files(meshcat) / "viewer" / "dist" / "main.min.js"
-    machine, task = about["machine"], about["task"]
     template = Template((assets / "page.html").read_text(encoding="utf-8"))
     return template.substitute(
-        title=escape(f"{machine}: {task}" if task else machine),
+        title=escape(title(about["machine"], about["task"])),
         style=(assets / "page.css").read_text(encoding="utf-8"),
         viewer=viewer.read_text(encoding="utf-8"),
         data=_json(about),

@@ -14,6 +14,7 @@ import numpy as np
 from crane.machine import Machine
 from crane.recording import FORCE_UNITS, VELOCITY, VELOCITY_UNITS
 from crane.samples import Array
+from crane.units import reading
 from crane.view.page_arrays import packed
 
 if TYPE_CHECKING:
@@ -24,20 +25,6 @@ SPANS_PER_SECOND = 15.0  # in a long one
 MOST_SPANS = 1_100_000  # in all columns of a page
 SHOWN = 8  # lines that a plot shows at first
 
-# Unit: other units to read it in, how many of them make one, from which value on (in SI).
-READING: dict[str, tuple[tuple[str, float, float], ...]] = {
-    "rad": (("deg", 180 / np.pi, 0.0),),
-    "rad/s": (("deg/s", 180 / np.pi, 0.0),),
-    "m": (("m", 1.0, 5.0), ("mm", 1e3, 0.0)),
-    "m/s": (("m/s", 1.0, 2.0), ("mm/s", 1e3, 0.0)),
-    "N": (("kN", 1e-3, 1e3),),
-    "N m": (("kN m", 1e-3, 1e4),),
-    "Pa": (("bar", 1e-5, 0.0),),
-    "J": (("kJ", 1e-3, 1e4),),
-    "W": (("kW", 1e-3, 1e3),),
-    "m3/s": (("l/min", 6e4, 0.0),),
-    "m3": (("l", 1e3, 0.0),),
-}
 ANGLES, STROKES = "Angles", "Strokes"
 TORQUES, FORCES = "Torques", "Forces"
 # Groups in the order of the page; those of the first tuple are open at first.
@@ -141,7 +128,8 @@ def groups(
     found = []
     for title, unit in sorted(sorted_in, key=lambda key: order.index(key[0])):
         members = sorted_in[title, unit]
-        reading, scale = _reading(unit, members)
+        peak = max(float(np.abs(column.values).max()) for column in members)
+        shown, scale = reading(unit, peak)
         lines = []
         for index, (column, hue, shade) in enumerate(_coloured(machine, members)):
             line = {
@@ -164,7 +152,7 @@ def groups(
         found.append(
             {
                 "title": title,
-                "unit": reading,
+                "unit": shown,
                 "open": moves and title in OPEN,
                 "lines": lines,
             }
@@ -241,15 +229,6 @@ def _place(machine: Machine, name: str, unit: str) -> tuple[str, str]:
 def _varies(values: Array) -> bool:
     """Whether a column is more than a constant and rounding noise."""
     return float(np.ptp(values)) > 1e-9 * max(1.0, float(np.abs(values).max()))
-
-
-def _reading(unit: str, members: list[Column]) -> tuple[str, float]:
-    """Unit to read a group in, and how many of it make one."""
-    peak = max(float(np.abs(column.values).max()) for column in members)
-    for reading, scale, start in READING.get(unit, ()):
-        if peak >= start:
-            return reading, scale
-    return unit, 1.0
 
 
 def _coloured(machine: Machine, members: list[Column]) -> Iterator[tuple[Column, int, int]]:

@@ -8,6 +8,7 @@ from crane.machine import Machine
 from crane.recording import FORCE_UNITS
 from crane.samples import Array
 from crane.summary import READING_UNITS, summarize
+from crane.units import number, quantity
 
 if TYPE_CHECKING:
     from crane.recording import Recording
@@ -23,7 +24,7 @@ def run_summary(machine: Machine, recording: "Recording | None") -> dict[str, An
         facts: Pairs of words; forces: rows (joint, range, peak and RMS force); limits: sentences.
     """
     moving = [inertia.mass for inertia in list(machine.model.inertias)[1:]]
-    facts = [("moving mass", f"{sum(moving):.4g} kg")]
+    facts = [("moving mass", quantity(sum(moving), "kg", 4))]
     if machine.changes:
         changed = ", ".join(f"{name} = {value:g}" for name, value in machine.changes.items())
         facts.append(("changed", changed))
@@ -43,16 +44,16 @@ def run_summary(machine: Machine, recording: "Recording | None") -> dict[str, An
     if count > 1:
         facts.insert(0, ("duration", f"{summary.duration:.4g} s"))
         given, taken = mechanical_work(recording)
-        text = f"{_energy(given)} given"
+        text = f"{_quantity(given, 'J')} given"
         if taken > 1e-3 * given:
-            text += f", {_energy(taken)} taken back"
+            text += f", {_quantity(taken, 'J')} taken back"
         facts.append(("actuators' work", text))
     channels = recording.channels
     for name, words in (("dissipated", "lost to friction"), ("pump_work", "pump's work")):
         if count > 1 and recording.channel_units.get(name) == "J":
             change = float(channels[name][-1] - channels[name][0])
             if _number(change) != "0":
-                facts.append((words, _energy(change)))
+                facts.append((words, _quantity(change, "J")))
     if summary.tip_rms_error is not None and summary.tip_peak_error is not None:
         peak, rms = 1e3 * summary.tip_peak_error, 1e3 * summary.tip_rms_error
         facts.append(("tip to reference", f"{rms:.3g} mm RMS, {peak:.3g} mm peak"))
@@ -63,8 +64,8 @@ def run_summary(machine: Machine, recording: "Recording | None") -> dict[str, An
             (
                 joint.name,
                 f"{_number(scale * joint.lowest)} to {_number(scale * joint.highest)} {unit}",
-                _force(joint.peak_force, FORCE_UNITS[joint.unit]),
-                _force(joint.rms_force, FORCE_UNITS[joint.unit]),
+                _quantity(joint.peak_force, FORCE_UNITS[joint.unit]),
+                _quantity(joint.rms_force, FORCE_UNITS[joint.unit]),
             )
         )
     return {"facts": facts, "forces": forces, "limits": limits_hit(machine, recording)}
@@ -108,17 +109,9 @@ def _percent(share: float) -> str:
     return f"{100 * share:{'.0f' if share >= 0.1 else '.2g'}}\u00a0%"
 
 
-def _energy(value: float) -> str:
-    return f"{_number(value / 1e3)} kJ" if abs(value) >= 1e4 else f"{_number(value)} J"
-
-
-def _force(value: float, unit: str) -> str:
-    return f"{_number(value / 1e3)} k{unit}" if value >= 1e3 else f"{_number(value)} {unit}"
+def _quantity(value: float, unit: str) -> str:
+    return quantity(value, unit).replace("-", "\u2212")
 
 
 def _number(value: float) -> str:
-    """Three digits, and nothing for what is rounding noise in any unit."""
-    if abs(value) < 1e-6:
-        return "0"
-    digits = max(2 - int(np.floor(np.log10(abs(value)))), 0)
-    return f"{value:.{digits}f}".replace("-", "\u2212") if digits < 6 else f"{value:.2e}"
+    return number(value).replace("-", "\u2212")

@@ -1,7 +1,8 @@
 """A recording as one figure: displacements, velocities and forces, and the path of the tip."""
 
+import itertools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from string import ascii_lowercase
@@ -19,7 +20,8 @@ from crane.errors import OutputError
 from crane.output import replacing
 from crane.recording import FORCE_UNITS, Recording
 from crane.samples import Array
-from crane.summary import READING_UNITS, points
+from crane.summary import points, subject, title
+from crane.units import reading
 from crane.view.figure_text import plain
 
 FORMATS: dict[str, dict[str, None] | None] = {  # with the date left out of what is written
@@ -58,18 +60,33 @@ STYLE: Any = {
 # Distances of words from the axes of a box [points], of which matplotlib adds the last by itself.
 TICK_OFFSET, LABEL_OFFSET, PAD_OFFSET = 8.0, 14.0, 8.0
 MOST_COLUMNS = 5  # joints beside each other
-# Least height of an axis, so that rounding noise of a joint at rest looks like rest.
-LEAST_SPAN = {"deg": 0.2, "mm": 0.2, "deg/s": 0.2, "mm/s": 0.2, "N m": 0.02, "N": 0.2}
+# Least height of an axis [SI], so that rounding noise of a joint at rest looks like rest.
+LEAST_SPAN = {
+    "rad": 3e-3, "m": 2e-4, "rad/s": 3e-3, "m/s": 2e-4, "N m": 0.02, "N": 0.2, "Pa": 1e4,
+    "m3/s": 1e-7, "V": 0.01,
+}  # fmt: skip
+# Rows of a hydraulic machine: quantity, unit, channels of a joint by what a line is called.
+HYDRAULIC_ROWS = (
+    ("pressure", "Pa", {"A": "pressure_{}_a", "B": "pressure_{}_b", "supply": "pressure_supply"}),
+    ("flow", "m3/s", {"A": "flow_{}_a", "B": "flow_{}_b"}),
+    ("signal", "V", {"recording": "voltage_{}"}),
+)
+LINES: Mapping[str, Any] = {
+    "recording": {"color": RECORDED},
+    "A": {"color": RECORDED},
+    "B": {"color": "#2a8c4a"},
+    "supply": {"color": "#a8a8a8", "linewidth": 1.0},
+    "reference": DASHED,
+}
 
 
 @dataclass(frozen=True, eq=False)
 class _Panel:
-    """One quantity of one joint over time, in the units to read it in."""
+    """One quantity of one joint over time [SI]: lines (N,) by what they are called."""
 
     quantity: str
     unit: str
-    values: Array
-    reference: Array | None
+    lines: dict[str, Array]
 
 
 def plot_recording(recording: Recording, path: str | Path) -> None:
@@ -99,13 +116,17 @@ def write_figure(path: str | Path, draw: Callable[[], Figure]) -> None:
 def recording_figure(recording: Recording) -> Figure:
     """The figure of a recording.
 
-    One column per active joint with its displacement, velocity and force over time, in degrees
-    and millimetres, many joints in several bands below each other; where the channels tip_x,
-    tip_y, tip_z exist, the path of the tip beside them. References (channels reference_<joint>,
+    One column per active joint with its displacement, velocity and force over time, in the units
+    that the page of a run has, many joints in several bands below each other; of cylinders with
+    valves also pressures, flows and signals. Where the channels tip_x, tip_y, tip_z exist, the
+    path of the tip is beside them. References (channels reference_<joint>,
     reference_velocity_<joint>, reference_tip_x, ...) are dashed; with one for the tip comes its
     distance from it.
     """
     tip, joints = points(recording, "tip"), recording.joints
+    panels = [_panels(recording, index) for index in range(len(joints))]
+    kept = [row for row in range(len(panels[0])) if any(column[row].lines for column in panels)]
+    rows = len(kept)
     with mpl.rc_context(STYLE):
         bands = -(-len(joints) // MOST_COLUMNS)
         columns = -(-len(joints) // bands)
@@ -113,82 +134,88 @@ def recording_figure(recording: Recording) -> Figure:
         width = 2.4 * sum(widths) + 0.3
         margin = 0.3 if tip is not None else 0.0  # the layout overlooks the label of the z axis
         layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0 - margin / width, 1.0))
-        figure = Figure(figsize=(width, 6.0 * bands), layout=layout)
-        grid = figure.add_gridspec(3 * bands, len(widths), width_ratios=widths)
-        for index, name in enumerate(joints):
-            band, column = divmod(index, columns)
-            beside = min(columns, len(joints) - band * columns)
-            for row, panel in enumerate(_panels(recording, index)):
-                axes = figure.add_subplot(grid[3 * band + row, column])
-                _draw_panel(axes, recording.time, panel)
-                _letter(axes, 3 * band * columns + row * beside + column)
+        figure = Figure(figsize=(width, 2.0 * rows * bands), layout=layout)
+        grid = figure.add_gridspec(rows * bands, len(widths), width_ratios=widths)
+        letters = iter(ascii_lowercase)
+        for band, row in itertools.product(range(bands), range(rows)):
+            beside = range(band * columns, min((band + 1) * columns, len(joints)))
+            scales = _scales([column[kept[row]] for column in panels])
+            for index in beside:
+                panel = panels[index][kept[row]]
+                if not panel.lines:
+                    continue
+                axes = figure.add_subplot(grid[rows * band + row, index - beside.start])
+                _draw_panel(axes, recording.time, panel, *scales[panel.unit])
+                _letter(axes, letters)
                 if row == 0:
-                    axes.set_title(joint_symbol(name))
-                if row == 2:
+                    axes.set_title(joint_symbol(joints[index]))
+                if not any(panels[index][below].lines for below in kept[row + 1 :]):
                     axes.set_xlabel("time [s]")
                 else:
                     axes.tick_params(labelbottom=False)
         if tip is not None:
             reference = points(recording, "reference_tip")
-            rows = slice(3) if reference is None else slice(2)
-            space = figure.add_subplot(grid[rows, -1], projection="3d")
+            tall = slice(3) if reference is None else slice(2)
+            space = figure.add_subplot(grid[tall, -1], projection="3d")
             _draw_path(space, tip, reference)
-            _letter(space, 3 * len(joints))
+            _letter(space, letters)
             if reference is not None:
                 axes = figure.add_subplot(grid[2, -1])
-                _draw_panel(axes, recording.time, _tip_error(tip, reference))
-                _letter(axes, 3 * len(joints) + 1)
+                _draw_panel(axes, recording.time, _tip_error(tip, reference), "mm", 1e3)
+                _letter(axes, letters)
                 axes.set_xlabel("time [s]")
         _caption(figure, recording)
     return figure
 
 
-def _panels(recording: Recording, column: int) -> tuple[_Panel, _Panel, _Panel]:
-    """Displacement, velocity and force of one active joint."""
-    name = recording.joints[column]
-    unit, scale = READING_UNITS[recording.units[name]]
-    turns = unit == "deg"
+def _panels(recording: Recording, column: int) -> list[_Panel]:
+    """Displacement, velocity and force of an active joint, and its cylinder's; some are empty."""
+    name, channels = recording.joints[column], recording.channels
+    unit = recording.units[name]
+    turns, wanted = unit == "rad", f"reference_{name}"
 
-    def reference(prefix: str) -> Array | None:
-        values = recording.channels.get(prefix + name)
-        return None if values is None else scale * values
+    def lines(values: Array, reference: str = "") -> dict[str, Array]:
+        beside = {"reference": channels[reference]} if reference in channels else {}
+        return {"recording": values[:, column], **beside}
 
-    return (
-        _Panel(
-            "angle" if turns else "displacement",
-            unit,
-            scale * recording.q[:, column],
-            reference("reference_"),
-        ),
-        _Panel(
-            "velocity",
-            f"{unit}/s",
-            scale * recording.v[:, column],
-            reference("reference_velocity_"),
-        ),
-        _Panel(
-            "torque" if turns else "force",
-            FORCE_UNITS[recording.units[name]],
-            recording.tau[:, column],
-            None,
-        ),
-    )
+    found = [
+        _Panel("angle" if turns else "displacement", unit, lines(recording.q, wanted)),
+        _Panel("velocity", f"{unit}/s", lines(recording.v, f"reference_velocity_{name}")),
+        _Panel("torque" if turns else "force", FORCE_UNITS[unit], lines(recording.tau)),
+    ]
+    for quantity, shown, names in HYDRAULIC_ROWS:
+        own = [label for label, channel in names.items() if channel.format(name) != channel]
+        there = {
+            label: channels[channel]
+            for label, channel in ((label, text.format(name)) for label, text in names.items())
+            if recording.channel_units.get(channel) == shown
+        }
+        found.append(_Panel(quantity, shown, there if any(x in there for x in own) else {}))
+    return found
+
+
+def _scales(panels: Sequence[_Panel]) -> dict[str, tuple[str, float]]:
+    """The unit that panels of a row are read in, and its scale, the same for equal units."""
+    peaks: dict[str, float] = {}
+    for panel in panels:
+        for values in panel.lines.values():
+            peaks[panel.unit] = max(peaks.get(panel.unit, 0.0), float(np.abs(values).max()))
+    return {unit: reading(unit, peak) for unit, peak in peaks.items()}
 
 
 def _tip_error(tip: Array, reference: Array) -> _Panel:
     distance = np.linalg.norm(tip - reference, axis=1)
-    return _Panel("tip to reference", "mm", 1e3 * distance, None)
+    return _Panel("tip to reference", "m", {"recording": distance})
 
 
-def _draw_panel(axes: Axes, time: Array, panel: _Panel) -> None:
+def _draw_panel(axes: Axes, time: Array, panel: _Panel, unit: str, scale: float) -> None:
     marker = "o" if len(time) == 1 else None
-    axes.plot(time, panel.values, color=RECORDED, marker=marker, label="recording")
-    if panel.reference is not None:
-        axes.plot(time, panel.reference, marker=marker, label="reference", **DASHED)
-    axes.set_ylabel(f"{panel.quantity} [{panel.unit}]")
+    for label, values in panel.lines.items():
+        axes.plot(time, scale * values, marker=marker, label=label, **LINES[label])
+    axes.set_ylabel(f"{panel.quantity} [{unit}]")
     axes.margins(x=0.0, y=0.08)
     low, high = axes.get_ylim()
-    if (lacking := LEAST_SPAN[panel.unit] - (high - low)) > 0:
+    if (lacking := scale * LEAST_SPAN[panel.unit] - (high - low)) > 0:
         axes.set_ylim(low - lacking / 2, high + lacking / 2)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
@@ -235,23 +262,21 @@ def _ticks(low: float, high: float, share: float) -> list[float]:
     return inside[:: -(-len(inside) // most)]
 
 
-def _letter(axes: Axes, index: int) -> None:
+def _letter(axes: Axes, letters: Iterator[str]) -> None:
     """(a), (b), ... as panels are referred to in a text."""
-    if index < len(ascii_lowercase):
-        text, corner = f"({ascii_lowercase[index]})", "axes fraction"
-        axes.annotate(text, (0, 1), (-28, 7), corner, "offset points")
+    if letter := next(letters, ""):
+        axes.annotate(f"({letter})", (0, 1), (-28, 7), "axes fraction", "offset points")
 
 
 def _caption(figure: Figure, recording: Recording) -> None:
     """What is shown, and which line is what."""
-    machine = Path(recording.machine).stem.replace("_", " ")
-    words = ": ".join(word for word in (machine, recording.task) if word)
-    if words:
+    if words := title(subject(recording), recording.task):
         figure.suptitle(plain(words), x=0.01, ha="left", fontsize=11, fontweight="bold")
     lines = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
-    if "reference" in lines:
-        shown = [lines["recording"], lines["reference"]]
-        figure.legend(handles=shown, loc="outside upper right", ncols=2)
+    if shown := [lines[label] for label in LINES if label in lines and label != "recording"]:
+        figure.legend(
+            handles=[lines["recording"], *shown], loc="outside upper right", ncols=1 + len(shown)
+        )
 
 
 def joint_symbol(name: str) -> str:

@@ -34,6 +34,7 @@ class Scene:
         q: (N, nq) their postures.
         lower: (3,) lowest corner of what is drawn [m].
         upper: (3,) highest corner [m].
+        ground: Height that the machine stands at [m].
         heading: Angle about z from the x axis to where the tip points in the first frame, seen
             from the first joint that moves it [rad]; 0 without a tip, or with one on that axis.
     """
@@ -44,6 +45,7 @@ class Scene:
     q: Array
     lower: Array
     upper: Array
+    ground: float
     heading: float
 
 
@@ -70,10 +72,12 @@ def build_scene(machine: Machine, recording: "Recording | None" = None) -> Scene
     some = np.unique(np.linspace(0, len(q) - 1, _LOOKED_AT).astype(int))
     poses = link_poses(machine, q[some], links)
     lower, upper = _bounds(visuals, poses)
+    floor = ground(machine, visuals)
+    lower[2], upper[2] = min(lower[2], floor), max(upper[2], floor)
 
     recorder = Recorder()
     viewer = meshcat.Visualizer(window=recorder)
-    draw_surroundings(viewer["ground"], lower, upper)
+    draw_surroundings(viewer["ground"], lower, upper, floor)
     draw_visuals(viewer["machine"], visuals)
     for link, pose in poses.items():
         viewer["machine"][link].set_transform(pose[0])
@@ -84,6 +88,7 @@ def build_scene(machine: Machine, recording: "Recording | None" = None) -> Scene
         q=q,
         lower=lower,
         upper=upper,
+        ground=floor,
         heading=_heading(machine, q[0], float(np.linalg.norm(upper - lower))),
     )
 
@@ -105,6 +110,21 @@ def link_poses(machine: Machine, q: Array, links: Iterable[str]) -> dict[str, Ar
         if not np.isfinite(pose).all():
             raise InputError(f"link '{link}' has a pose that is not finite, check the recording")
     return poses
+
+
+def ground(machine: Machine, visuals: Sequence[Visual]) -> float:
+    """Height that the machine stands at [m]: the lowest point of what cannot move.
+
+    The origin's height where nothing of what is drawn stands still: how low the tip reaches says
+    nothing about the ground.
+    """
+    heights = [
+        float((place.placement * corner)[2])
+        for visual in visuals
+        if not (place := machine.model.frames[machine.frame(visual.link)]).parentJoint
+        for corner in visual.corners()
+    ]
+    return min(heights, default=0.0)
 
 
 def _heading(machine: Machine, q: Array, size: float) -> float:

@@ -11,6 +11,7 @@ from scipy.stats import rankdata
 
 from crane.samples import Array
 from crane.studies import Study
+from crane.summary import title
 from crane.view.figure_text import plain
 from crane.view.plots import DASHED, RECORDED, STYLE, write_figure
 
@@ -47,10 +48,8 @@ def study_figure(study: Study) -> Figure:
             figure = _scatter(study, shown[:_MOST_SCATTERED])
         else:
             figure = _panels(study, shown)
-        machine = Path(study.machine).stem.replace("_", " ")
-        words = ", ".join(study.tasks)
-        title = f"{machine}: {words}" if words else machine
-        figure.suptitle(plain(title), x=0.01, ha="left", fontsize=11, fontweight="bold")
+        words = title(Path(study.machine).stem, ", ".join(study.tasks))
+        figure.suptitle(plain(words), x=0.01, ha="left", fontsize=11, fontweight="bold")
     return figure
 
 

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch as Swatch
 from matplotlib.ticker import MaxNLocator
 
 from crane.samples import Array
-from crane.summary import READING_UNITS
+from crane.summary import READING_UNITS, title
 from crane.view.figure_text import plain
 from crane.view.plots import DASHED, INK, RECORDED, STYLE, joint_symbol, write_figure
 from crane.workspaces import Workspace
@@ -220,12 +220,12 @@ def _held(space: Workspace) -> str:
 
 
 def _caption(figure: Figure, space: Workspace) -> None:
-    title = f"{plain(space.machine.name.replace('_', ' '))}: workspace"
+    words = plain(title(space.machine.name, "workspace"))
     if space.slew is not None:
         i = space.machine.active.index(space.slew)
         turn = np.rad2deg([space.low[i], space.high[i]])
-        title += f", turned by {joint_symbol(space.slew)} from {turn[0]:.4g}° to {turn[1]:.4g}°"
-    figure.suptitle(title, x=0.01, ha="left", fontsize=11, fontweight="bold")
+        words += f", turned by {joint_symbol(space.slew)} from {turn[0]:.4g}° to {turn[1]:.4g}°"
+    figure.suptitle(words, x=0.01, ha="left", fontsize=11, fontweight="bold")
     handles: list[Line2D | Swatch] = [
         Line2D([], [], marker="o", ls="", color=INK, mfc="white", mew=1.3, label="home")
     ]

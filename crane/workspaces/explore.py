@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from crane.errors import InputError
 from crane.kinematics import Kinematics
 from crane.machine import Machine
-from crane.samples import Array, as_number
+from crane.samples import Array, as_count, as_seed
 from crane.workspaces.cover import triangles
 from crane.workspaces.curves import branch_edges, curves_of, singular_curves
 from crane.workspaces.extremes import extremes
@@ -18,6 +18,7 @@ from crane.workspaces.raster import Raster
 from crane.workspaces.result import StrokeMap, Workspace
 from crane.workspaces.section import section_of, slewing
 
+_MOST = 1_000_000  # postures
 _MOVES = 1e-9  # slope of a tip that a joint moves [m per joint's scale]
 _FULL = 3  # joints that a regular grid is made of
 _MAP = 81  # values of each stroke of the map
@@ -44,11 +45,10 @@ def workspace(
         seed: Of what is drawn.
 
     Raises:
-        InputError: Fewer than 100 samples, an unknown frame, no tip, or a frame that no active
-            joint moves.
+        InputError: Fewer than 100 samples or more than a million, an unknown frame, no tip, or a
+            frame that no active joint moves.
     """
-    if as_number(samples, "the number of samples", "") < 100:
-        raise InputError(f"{samples} samples show nothing, give at least 100")
+    samples, seed = as_count(samples, "the number of samples", 100, _MOST), as_seed(seed)
     kinematics = Kinematics(machine, frame)
     low, high = _limits(machine)
     random = np.random.default_rng(seed)

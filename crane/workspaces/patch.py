@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from crane.errors import ClosureError
 from crane.machine import Machine
-from crane.samples import Array
+from crane.samples import Array, Brief
 
 Node = tuple[int, int]
 
@@ -15,8 +15,8 @@ _STEPS = 16  # from one posture of the grid to the next, where one step fails
 _EDGE = 2.0**-30  # share of a way to which its last closed posture is found
 
 
-@dataclass(frozen=True, eq=False)
-class Patch:
+@dataclass(frozen=True, eq=False, repr=False)
+class Patch(Brief):
     """Postures over two active coordinates (one, if the second axis has one value).
 
     Attributes:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from crane.machine import Machine
-from crane.samples import Array
+from crane.samples import Array, Brief
 from crane.timeseries import Table, write
 from crane.workspaces.patch import Patch
 from crane.workspaces.raster import Raster
@@ -18,8 +18,8 @@ KINDS = {
 }
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
+@dataclass(frozen=True, eq=False, repr=False)
+class Curve(Brief):
     """A singular curve; a point where one stroke is all that moves.
 
     Attributes:
@@ -35,8 +35,8 @@ class Curve:
     places: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Extreme:
+@dataclass(frozen=True, eq=False, repr=False)
+class Extreme(Brief):
     """How far the section reaches in one direction.
 
     Attributes:
@@ -50,8 +50,8 @@ class Extreme:
     q_a: Array
 
 
-@dataclass(frozen=True, eq=False)
-class StrokeMap:
+@dataclass(frozen=True, eq=False, repr=False)
+class StrokeMap(Brief):
     """Two strokes against each other, or one: those that move the tip most, others at home.
 
     Attributes:
@@ -113,6 +113,13 @@ class Workspace:
     stroke_map: StrokeMap
     raster: Raster
     complete: bool
+
+    def __repr__(self) -> str:
+        """What moves, with what, and how much of it closes."""
+        return (
+            f"Workspace of '{self.frame}' of '{self.machine.name}': {len(self.tips)} postures "
+            f"over {', '.join(self.strokes)}, {100 * self.share:.3g} % close, {self.area:.4g} m2"
+        )
 
     def __len__(self) -> int:
         return len(self.q_a)

@@ -6,13 +6,13 @@ import numpy as np
 import pinocchio as pin
 
 from crane.machine import Machine
-from crane.samples import Array
+from crane.samples import Array, Brief
 
 _FLAT = 1e-7  # share of the extent that counts as none
 
 
-@dataclass(frozen=True, eq=False)
-class Section:
+@dataclass(frozen=True, eq=False, repr=False)
+class Section(Brief):
     """Two coordinates (u, w) of the tip.
 
     Of a machine whose slewing joint stands upright on the ground: distance from the slewing axis
@@ -77,7 +77,7 @@ def slewing(machine: Machine, frame: str) -> tuple[int, Array] | None:
     for i, name in enumerate(machine.active):
         joint = model.getJointId(name)
         column = machine.column(name)
-        axis = data.J[3:, column]
+        axis = data.J.reshape(6, -1)[3:, column]  # of a single joint it comes as a vector
         if (
             model.parents[joint] == 0
             and joint in carrying

@@ -8,7 +8,7 @@ const THREE = MeshCat.THREE;
 const vector = ([x, y, z]) => new THREE.Vector3(x, z, -y);
 
 class Space {
-    constructor({ lower, upper, views, tree }) {
+    constructor({ lower, upper, ground, views, tree }) {
         this.views = views;
         this.tree = new Tree(tree);
         const pane = element("pane");
@@ -26,6 +26,7 @@ class Space {
         const commands = JSON.parse(element("page-commands").textContent);
         for (const command of commands) viewer.handle_command_bytearray(bytes(command));
         this.lower = lower;
+        this.ground = ground;
         this.upper = upper;
         this.centre = vector(lower.map((low, i) => (low + upper[i]) / 2));
         this.radius = vector(upper).distanceTo(vector(lower)) / 2;
@@ -170,7 +171,7 @@ class Space {
         Object.assign(sun.shadow.camera, { left: -r, right: r, bottom: -r, top: r, near: r / 10, far: 5 * r });
         const ground = new THREE.Mesh(new THREE.PlaneGeometry(40 * r, 40 * r), new THREE.ShadowMaterial({ opacity: 0.18 }));
         ground.rotateX(-Math.PI / 2);
-        ground.position.copy(centre).setY(this.lower[2]);
+        ground.position.copy(centre).setY(this.ground);
         ground.receiveShadow = true;
         const group = new THREE.Group();
         group.rotateX(Math.PI / 2);

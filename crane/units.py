@@ -1,0 +1,44 @@
+"""Units that numbers are read in, and how numbers are written for reading."""
+
+import math
+from collections.abc import Mapping
+
+# Unit: other units to read it in, how many of them make one, from which value on (in SI).
+READING: Mapping[str, tuple[tuple[str, float, float], ...]] = {
+    "rad": (("deg", 180 / math.pi, 0.0),),
+    "rad/s": (("deg/s", 180 / math.pi, 0.0),),
+    "m": (("m", 1.0, 5.0), ("mm", 1e3, 0.0)),
+    "m/s": (("m/s", 1.0, 2.0), ("mm/s", 1e3, 0.0)),
+    "N": (("kN", 1e-3, 1e3),),
+    "N m": (("kN m", 1e-3, 1e4),),
+    "Pa": (("bar", 1e-5, 0.0),),
+    "J": (("kJ", 1e-3, 1e4),),
+    "W": (("kW", 1e-3, 1e3),),
+    "m3/s": (("l/min", 6e4, 0.0),),
+    "m3": (("l", 1e3, 0.0),),
+    "kg": (("t", 1e-3, 1e4),),
+}
+_NOTHING = 1e-6  # is rounding noise in any of these units
+
+
+def reading(unit: str, peak: float) -> tuple[str, float]:
+    """Unit to read numbers up to a peak (in SI) in, and how many of it make one."""
+    for name, scale, start in READING.get(unit, ()):
+        if abs(peak) >= start:
+            return name, scale
+    return unit, 1.0
+
+
+def number(value: float, digits: int = 3) -> str:
+    """So many digits before zeros, without an exponent, and 0 for what is rounding noise."""
+    if abs(value) < _NOTHING:
+        return "0"
+    places = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
+    text = f"{value:.{places}f}"
+    return text.rstrip("0").rstrip(".") if places else text
+
+
+def quantity(value: float, unit: str, digits: int = 3) -> str:
+    """A number (in SI) in the unit to read it in: 13.36 t, 4.2 kN, 350 bar."""
+    name, scale = reading(unit, value)
+    return f"{number(scale * value, digits)} {name}"
