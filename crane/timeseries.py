@@ -139,12 +139,56 @@ def read_npz(path: Path) -> Table:
     Raises:
         RecordingError: The file does not exist or is not such a table.
     """
+    return from_columns(path, _npz(path), {})
+
+
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    """What an npz file or a CSV of another program holds, by name: nothing is converted.
+
+    A CSV has one header row; it separates columns by commas, semicolons or tabs.
+
+    Raises:
+        RecordingError: The file does not exist or is none of these.
+    """
+    if path.suffix.lower() == ".npz":
+        return _npz(path)
+    try:
+        _, heading, line = _head(path)
+        between = max(",;\t", key=heading.count)
+        names = [cell.strip() for cell in next(csv.reader([heading], delimiter=between))]
+        values = np.loadtxt(
+            path, delimiter=between, comments=None, skiprows=line, ndmin=2, encoding="utf-8"
+        )
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(f"{path}: {reason}, give the path of a CSV or npz file") from None
+    except (ValueError, csv.Error) as error:  # text that is none among them
+        reason = str(error).rstrip(".")
+        raise RecordingError(f"{path}: no table of numbers ({reason}), correct it") from None
+    if values.shape[1] != len(names) or len(set(names)) < len(names):
+        raise RecordingError(
+            f"{path}: {len(set(names))} different names head {values.shape[1]} columns, name each"
+        )
+    return dict(zip(names, values.T, strict=True))
+
+
+def _npz(path: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as file:
-            columns = {name: np.asarray(file[name]) for name in file.files}
+            return {name: np.asarray(file[name]) for name in file.files}
     except (OSError, ValueError, zipfile.BadZipFile) as error:
         reason = getattr(error, "strerror", None) or "is no npz file of arrays"
         raise RecordingError(f"{path}: {reason.lower()}, give one") from None
+
+
+def from_columns(path: Path, columns: Mapping[str, np.ndarray], notes: dict[str, str]) -> Table:
+    """A table in SI units of arrays (N,) named 'name [unit]'; the path is for errors.
+
+    Raises:
+        RecordingError: They are of different lengths, or not named like columns.
+    """
     count = max((len(x) for x in columns.values() if x.ndim == 1), default=0)
     for name, column in columns.items():
         if column.shape != (count,) or column.dtype.kind not in "biuf":
@@ -160,7 +204,8 @@ def read_npz(path: Path) -> Table:
         units = _units(heading.getvalue().rstrip())
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
-    return _in_si(Table(units, np.column_stack(list(columns.values())).astype(np.float64), {}))
+    values = np.column_stack(list(columns.values())).astype(np.float64)
+    return _in_si(Table(units, values, notes))
 
 
 def _in_si(table: Table) -> Table:
