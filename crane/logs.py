@@ -116,7 +116,7 @@ def _evaluated(expression: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
         ) from None
     if value.ndim > 1:
         raise RecordingError(
-            f"'{expression}' has the shape {value.shape}, choose a column by its number, as in a[0]"
+            f"'{expression}' has the shape {value.shape}, choose a column by its number: a[0]"
         )
     return value
 

@@ -9,8 +9,8 @@ PACKAGE = Path(__file__).parents[1] / "crane"
 ORDER = [
     "errors", "samples", "output", "timeseries", "straight", "description", "closure", "machine",
     "check", "formats", "dynamics", "kinematics", "workspaces", "hydraulics", "paths", "control",
-    "integration", "recording", "logs", "measured", "summary", "simulation", "replays", "batch", "studies",
-    "rig", "identification", "view", "live", "runs", "demo", "cli",
+    "integration", "recording", "logs", "measured", "summary", "simulation", "replays", "batch",
+    "studies", "rig", "identification", "view", "live", "runs", "demo", "cli",
 ]  # fmt: skip
 
 
