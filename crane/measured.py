@@ -12,7 +12,7 @@ What is there is taken as it is. Everything else is a channel.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,7 @@ from crane.timeseries import TIME, Table, check_unit, spellings
 _PRESSURE, _CHAMBER = "pressure_", re.compile("pressure_.+_[ab]")
 _TELLS = 1e-6  # least share of a joint's motion that others do not tell
 _SAME = 1e-6  # [m], [rad]
+_HELD = {"rad": 0.02, "m": 2e-3}  # by which a joint that is held may be off
 _SLACK = 0.1  # of a range, by which sensors may be off
 
 
@@ -118,6 +119,30 @@ def check_pressures(machine: Machine, table: Table) -> None:
                 f"'{name}' is {pressure[sample]:g} Pa at sample {sample}, but pressures count "
                 "from a vacuum: to gauge pressures add 1e5 Pa"
             )
+
+
+def moved_locks(
+    machine: Machine, columns: Mapping[str, Array], units: Mapping[str, str]
+) -> list[str]:
+    """What recorded columns (N,) say against locked joints, a text for each.
+
+    The middle 99 % of the samples have to lie within a fiftieth of a radian or two millimetres of
+    where the joint is locked, but for eight standard deviations of their noise.
+    """
+    told = []
+    for joint, place in machine.locks.items():
+        unit = units.get(joint, "")
+        if joint not in columns or unit not in _HELD:
+            continue
+        x = columns[joint]
+        noise = float(np.median(np.abs(np.diff(x)))) if len(x) > 1 else 0.0
+        low, high = np.quantile(x, [0.005, 0.995])
+        if max(high - place, place - low) > _HELD[unit] + 8 * noise:
+            told.append(
+                f"'{joint}' is locked at {place:.4g} {unit}, but goes from {low:.4g} to "
+                f"{high:.4g} {unit} in the recording"
+            )
+    return told
 
 
 def _force(machine: Machine, joint: str, table: Table) -> Array:

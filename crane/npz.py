@@ -5,10 +5,12 @@ headers; here sizes are compared with what is there, and nothing that could run 
 """
 
 import lzma
+import math
 import zipfile
 import zlib
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, TypeVar
 
 import numpy as np
 
@@ -17,7 +19,9 @@ from crane.samples import Array
 
 MOST = 1 << 27  # numbers in a file: 1 GiB
 MOST_COLUMNS = 4096
+NUMBERS = "biuf"  # kinds of numpy's types
 _AT_ONCE = 1 << 20  # numbers
+T = TypeVar("T")
 _DAMAGED = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError,
 )  # fmt: skip
@@ -31,9 +35,24 @@ def read_columns(path: Path) -> tuple[list[str], Array]:
         RecordingError: It is no npz file, is damaged or encrypted, or holds other than columns of
             equal length, or too many numbers. The message does not name the file.
     """
+    return _opened(path, _columns)
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Arrays of any shape by name; of those that hold no numbers nothing but their type.
+
+    Raises:
+        OSError: The file cannot be opened.
+        RecordingError: It is no npz file, is damaged or encrypted, or holds too many numbers. The
+            message does not name the file.
+    """
+    return _opened(path, _arrays)
+
+
+def _opened(path: Path, read: Callable[[zipfile.ZipFile], T]) -> T:
     try:
         with zipfile.ZipFile(path) as archive:
-            return _columns(archive)
+            return read(archive)
     except _DAMAGED as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0][:80]
         raise RecordingError(
@@ -41,7 +60,8 @@ def read_columns(path: Path) -> tuple[list[str], Array]:
         ) from None
 
 
-def _columns(archive: zipfile.ZipFile) -> tuple[list[str], Array]:
+def _declared(archive: zipfile.ZipFile) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+    """Shape and type of each array."""
     entries = archive.infolist()
     if len(entries) > MOST_COLUMNS:
         raise RecordingError(f"holds {len(entries)} arrays, give at most {MOST_COLUMNS}")
@@ -54,9 +74,14 @@ def _columns(archive: zipfile.ZipFile) -> tuple[list[str], Array]:
             raise RecordingError(f"'{name}' is encrypted, save the file without a password")
         with archive.open(entry) as file:
             types[name] = _header(name, file)
+    return types
+
+
+def _columns(archive: zipfile.ZipFile) -> tuple[list[str], Array]:
+    types = _declared(archive)
     count = max((shape[0] for shape, _ in types.values() if len(shape) == 1), default=0)
     for name, (shape, dtype) in types.items():
-        if shape != (count,) or dtype.kind not in "biuf":
+        if shape != (count,) or dtype.kind not in NUMBERS:
             raise RecordingError(
                 f"'{name}' has the shape {shape} of {str(dtype)[:40]}, give ({count},) numbers "
                 "per column"
@@ -67,15 +92,53 @@ def _columns(archive: zipfile.ZipFile) -> tuple[list[str], Array]:
         raise RecordingError(
             f"declares {count} samples of {len(types)} columns, give at most {MOST} numbers"
         )
-    for entry, (_, dtype) in zip(entries, types.values(), strict=True):
-        if entry.file_size < count * dtype.itemsize:
-            raise RecordingError(f"'{_name(entry)}' is cut short, save the file again")
+    _check_sizes(archive, types)
     values = np.empty((count, len(types)))
-    for column, (entry, (_, dtype)) in enumerate(zip(entries, types.values(), strict=True)):
-        with archive.open(entry) as file:
-            _header(_name(entry), file)
-            _read(_name(entry), file, dtype, values[:, column])
+    for column, entry in enumerate(archive.infolist()):
+        _fill(archive, entry, types, values[:, column])
     return list(types), values
+
+
+def _arrays(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
+    types = _declared(archive)
+    numbers = {name for name, (_, dtype) in types.items() if dtype.kind in NUMBERS}
+    if (count := sum(math.prod(types[name][0]) for name in numbers)) > MOST:
+        raise RecordingError(f"declares {count} numbers, give at most {MOST}")
+    _check_sizes(archive, {name: types[name] for name in numbers})
+    found: dict[str, np.ndarray] = {}
+    for entry in archive.infolist():
+        name = _name(entry)
+        shape, dtype = types[name]
+        found[name] = np.empty(0, dtype)
+        if name in numbers:
+            values = np.empty(math.prod(shape))
+            fortran = _fill(archive, entry, types, values)
+            found[name] = values.reshape(shape, order="F" if fortran else "C")
+    return found
+
+
+def _check_sizes(
+    archive: zipfile.ZipFile, types: Mapping[str, tuple[tuple[int, ...], np.dtype]]
+) -> None:
+    """Compare what the headers declare with what is there."""
+    for entry in archive.infolist():
+        shape, dtype = types.get(_name(entry), ((0,), np.dtype(float)))
+        if entry.file_size < math.prod(shape) * dtype.itemsize:
+            raise RecordingError(f"'{_name(entry)}' is cut short, save the file again")
+
+
+def _fill(
+    archive: zipfile.ZipFile,
+    entry: zipfile.ZipInfo,
+    types: Mapping[str, tuple[tuple[int, ...], np.dtype]],
+    values: Array,
+) -> bool:
+    """Read an array's numbers one after the other; whether its columns stand together."""
+    with archive.open(entry) as file:
+        np.lib.format.read_magic(file)
+        _, fortran, _ = np.lib.format.read_array_header_1_0(file)
+        _read(_name(entry), file, types[_name(entry)][1], values)
+    return bool(fortran)
 
 
 def _name(entry: zipfile.ZipInfo) -> str:

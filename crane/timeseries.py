@@ -12,16 +12,19 @@ import math
 import re
 import stat
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
 from crane.errors import RecordingError, at
-from crane.npz import MOST, MOST_COLUMNS, read_columns
+from crane.npz import MOST, MOST_COLUMNS, read_arrays, read_columns
 from crane.output import replacing
 from crane.samples import Array, Brief
+
+T = TypeVar("T")
 
 TIME = "time"
 _WORD = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
@@ -147,21 +150,72 @@ def read_npz(path: Path) -> Table:
     Raises:
         RecordingError: The file does not exist, or as `crane.npz.read_columns`.
     """
+    names, values = _npz(path, read_columns)
+    return _table(path, names, values, {})
+
+
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    """What an npz file or a CSV of another program holds, by name: nothing is converted.
+
+    A CSV has one header row; it separates columns by commas, semicolons or tabs.
+
+    Raises:
+        RecordingError: The file does not exist or is none of these.
+    """
+    if path.suffix.lower() == ".npz":
+        return _npz(path, read_arrays)
     try:
         check_plain(path)
-        names, values = read_columns(path)
+        _count_lines(path)
+        _, heading, line = _head(path)
+        between = max(",;\t", key=heading.count)
+        names = [cell.strip() for cell in next(csv.reader([heading], delimiter=between))]
+        values = np.loadtxt(
+            path, delimiter=between, comments=None, skiprows=line, ndmin=2, encoding="utf-8"
+        )
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(f"{path}: {reason}, give the path of a CSV or npz file") from None
+    except (ValueError, csv.Error) as error:  # text that is none among them
+        reason = str(error).rstrip(".")
+        raise RecordingError(f"{path}: no table of numbers ({reason}), correct it") from None
+    if values.shape[1] != len(names) or len(set(names)) < len(names):
+        raise RecordingError(
+            f"{path}: {len(set(names))} different names head {values.shape[1]} columns, name each"
+        )
+    return dict(zip(names, values.T, strict=True))
+
+
+def _npz(path: Path, read: Callable[[Path], T]) -> T:
+    try:
+        check_plain(path)
+        return read(path)
     except RecordingError as error:
         raise RecordingError(at(str(path), error)) from None
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise RecordingError(f"{path}: {reason}, give the path of an npz file") from None
+
+
+def from_columns(path: Path, columns: Mapping[str, np.ndarray], notes: dict[str, str]) -> Table:
+    """A table in SI units of arrays (N,) named 'name [unit]'; the path is for errors.
+
+    Raises:
+        RecordingError: They are not named like columns.
+    """
+    return _table(path, list(columns), np.column_stack(list(columns.values())), notes)
+
+
+def _table(path: Path, names: Sequence[str], values: Array, notes: dict[str, str]) -> Table:
     heading = io.StringIO()
     csv.writer(heading).writerow(names)
     try:
         units = _units(heading.getvalue().rstrip())
     except RecordingError as error:
         raise RecordingError(at(str(path), error)) from None
-    return _in_si(Table(units, values, {}))
+    return _in_si(Table(units, values, notes))
 
 
 def check_plain(path: Path) -> None:

@@ -9,8 +9,8 @@ PACKAGE = Path(__file__).parents[1] / "crane"
 ORDER = [
     "errors", "samples", "units", "output", "npz", "timeseries", "straight", "description",
     "closure", "machine", "check", "formats", "dynamics", "kinematics", "workspaces", "hydraulics",
-    "paths", "control", "integration", "recording", "measured", "summary", "simulation", "replays",
-    "batch", "studies", "rig", "identification", "view", "live", "runs", "demo", "cli",
+    "paths", "control", "integration", "recording", "logs", "measured", "summary", "simulation",
+    "replays", "batch", "studies", "rig", "identification", "view", "live", "runs", "demo", "cli",
 ]  # fmt: skip
 
 

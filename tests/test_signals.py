@@ -1,13 +1,15 @@
+import dataclasses
 import math
+import warnings
 
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from crane.errors import InputError, RecordingError
+from crane.errors import CraneWarning, InputError, RecordingError
 from crane.identification import checks, signals, smoother
 from crane.identification.checks import check, check_forces
-from crane.identification.signals import differentiate
+from crane.identification.signals import Motion, differentiate
 
 JOINTS, UNITS = ("q1", "X1"), {"q1": "rad", "X1": "m"}
 
@@ -345,20 +347,70 @@ def test_bad_recordings_are_explained(spoil, message):
     assert message in str(error.value)
 
 
-def test_forces_against_a_model():
-    r = recorded()
-    modelled = 0.6 * r["tau"]
-    check_forces(r["time"], r["tau"], modelled, JOINTS)
-    for factor, message in (
-        (1e3, "'q1_force' is 1.67e+03 times the model's, it looks 1000-fold, give SI units"),
-        (1e-3, "'q1_force' is 0.00167 times the model's, it looks like kN, give SI units"),
-        (100, "'q1_force' is 167 times the model's, look at its unit"),
-    ):
-        with pytest.raises(RecordingError) as error:
-            check_forces(r["time"], factor * r["tau"], modelled, JOINTS)
-        assert message == str(error.value)
+def moved():
+    """A motion, its force by weight and inertia, and what friction and a rotor add to it."""
+    time = np.arange(5000) * 4e-3
+    q, v, a = movement(time)
+    modelled = 50 * np.cos(3 * q) + 10 * a
+    rest = 20 * np.sign(v) + 30 * v + 100 * a + np.random.default_rng(9).standard_normal(q.shape)
+    return Motion(time, q, v, a, modelled + rest), modelled
+
+
+def first(motion):
+    """Its first joint."""
+    parts = (x[:, :1] for x in (motion.q, motion.v, motion.a, motion.tau))
+    return Motion(motion.time, *parts)
+
+
+def times(motion, factor):
+    return dataclasses.replace(motion, tau=factor * motion.tau)
+
+
+@pytest.mark.parametrize(
+    ("factor", "message"),
+    [
+        (1e3, "times the model's, it looks 1000-fold, give SI units"),
+        (1e-3, "times the model's, it looks like kN, give SI units"),
+        (100, "times the model's, look at its unit and its gear ratio"),
+        (-1, "'q1_force' is -1 times the model's, turn its sign"),
+    ],
+)
+def test_forces_against_a_model(factor, message):
+    motion, modelled = moved()
+    check_forces(motion, modelled, JOINTS)
+    motion, modelled = first(motion), modelled[:, :1]
+    with pytest.raises(RecordingError) as error:
+        check_forces(times(motion, factor), modelled, JOINTS[:1])
+    line = str(error.value)
+    assert message in line and line.endswith("trust it (trust=True, --trust)")
+    found = float(line.split(" is ")[1].split(" times")[0])
+    assert abs(found / factor - 1) < 0.02
+    with pytest.warns(CraneWarning, match="'q1_force' is .*: trusted"):
+        check_forces(times(motion, factor), modelled, JOINTS[:1], trust=True)
+
+
+def test_forces_of_friction_and_rotors_tell_no_unit():
+    """Where bodies have a hundredth of the force, it is a doubt; a visible share settles it."""
+    motion, modelled = moved()
+    others = motion.tau - modelled
+    for share, told in ((1e-4, True), (2e-2, False)):
+        heavy = dataclasses.replace(motion, tau=share * modelled + others)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            check_forces(first(heavy), share * modelled[:, :1], JOINTS[:1])
+        assert bool(caught) == told
+        if told:
+            line = str(caught[0].message)
+            assert line.startswith("'q1_force' is ") and line.endswith("recording cannot say")
+
+
+def test_forces_come_late():
+    motion, modelled = moved()
+    late = Motion(
+        *(x[50:] for x in (motion.time, motion.q, motion.v, motion.a)), 1.2 * modelled[:-50]
+    )
     with pytest.raises(RecordingError, match="'q1_force' is 200 ms behind its model"):
-        check_forces(r["time"][50:], r["tau"][:-50], modelled[50:], JOINTS)
+        check_forces(late, modelled[50:], JOINTS)
 
 
 def test_delay_between_samples():

@@ -1,11 +1,11 @@
-"""The command that writes a machine in another format."""
+"""Commands between formats: convert for machines, import for recordings."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from crane.cli.shared import Change, Force, Lock, MachineName, app, load
+from crane.cli.shared import Change, Force, Lock, MachineName, _place, app, load
 from crane.errors import InputError, known
 
 _FORMATS = ("urdf+", "mjcf", "machine")
@@ -49,3 +49,31 @@ def convert(
         written = out
         (write_urdf_plus if kind == "urdf+" else write_mjcf)(loaded, out)
     print(f"written to {written}")
+
+
+@app.command("import")
+def import_log(
+    log: Annotated[
+        Path, typer.Argument(metavar="LOG", help="A CSV or npz file of another program.")
+    ],
+    columns: Annotated[
+        Path,
+        typer.Argument(metavar="COLUMNS", help="Lines such as 'q1 [deg] = angle[0] - 90'."),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option("--out", metavar="FILE", parser=_place, help="The recording, a .csv file."),
+    ],
+    force: Force = False,
+) -> None:
+    """Write the recording that is in the log of another program."""
+    from crane import timeseries
+    from crane.logs import read_log
+    from crane.runs import check_free
+
+    if out.suffix.lower() != ".csv":
+        raise InputError(f"{out}: a recording is written as .csv, name it so")
+    check_free(out, force)
+    table = read_log(log, columns)
+    timeseries.write(out, table)
+    print(f"{len(table.values)} samples of {len(table.units)} columns written to {out}")

@@ -13,6 +13,7 @@ from crane.cli.shared import (
     Method,
     Out,
     RecordingFile,
+    Trust,
     app,
     by_joint,
     load,
@@ -138,6 +139,7 @@ def identify(
         ),
     ] = None,
     lock: Lock = None,
+    trust: Trust = False,
     force: Force = False,
 ) -> None:
     """Find a machine's parameters from a recording, and how well they predict."""
@@ -162,6 +164,7 @@ def identify(
             feasible,
             bandwidth=bandwidth,
             slow=by_joint("--slow", slow),
+            trust=trust,
         )
     with status("writing the report"):
         name = "" if validation is None else validation.name
@@ -178,6 +181,7 @@ def payload(
     ] = None,
     method: Method = "wls",
     lock: Lock = None,
+    trust: Trust = False,
 ) -> None:
     """Estimate mass and centre of mass of what a machine carries from a recording."""
     from crane.identification.payload import estimate_payload
@@ -186,5 +190,5 @@ def payload(
     loaded = load(machine, lock)
     carried = read_run(recording, loaded)
     with status("estimating"):
-        estimate = estimate_payload(loaded, carried, frame, method)
+        estimate = estimate_payload(loaded, carried, frame, method, trust=trust)
     print(estimate.to_text(), end="")

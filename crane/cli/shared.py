@@ -59,6 +59,12 @@ Lock = Annotated[
     list[str] | None,
     typer.Option(metavar="JOINT=VALUE", help="A joint that is held, and where, in m or rad."),
 ]
+Trust = Annotated[
+    bool,
+    typer.Option(
+        "--trust", help="Take a recording that looks wrong: tell why, and refuse it not."
+    ),
+]
 NoOpen = Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")]
 
 

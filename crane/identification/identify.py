@@ -8,11 +8,22 @@ from numpy.typing import ArrayLike
 
 from crane.errors import InputError, RecordingError, known
 from crane.identification.base import Base, base_parameters
-from crane.identification.checks import check, check_forces
+from crane.identification.checks import (
+    check,
+    check_forces,
+    check_samples,
+    doubt,
+    tell_delays,
+    tell_hum,
+    tell_validation,
+    without_outliers,
+)
+from crane.identification.delays import delays, motion_frequency
 from crane.identification.estimators import Prior, conditions, huber, least_squares, weighted
 from crane.identification.feasible import feasible as feasible_estimate
 from crane.identification.feasible import pseudo_inertia
 from crane.identification.model import Model, Samples, Term
+from crane.identification.outliers import outliers, repaired
 from crane.identification.result import Comparison, Identification
 from crane.identification.signals import (
     Motion,
@@ -22,13 +33,15 @@ from crane.identification.signals import (
     resample,
 )
 from crane.machine import Machine
-from crane.recording import Recording
+from crane.measured import moved_locks
+from crane.recording import FORCE, Recording
 from crane.samples import Array, as_number
 
 METHODS = {"ols": least_squares, "wls": weighted, "huber": huber}
 _SLOW = 0.02  # of a joint's largest velocity, below which its rows are left out
 _FAST = 40.0  # times the frequency below which 99 % of the accelerations are
 _FEWEST = 5.0  # periods of the filter's cutoff in a recording
+_MOVES = 10.0  # times the frequency of the motion, above which a line in a spectrum is hum
 _EXACT = 1e-4  # of the forces, noise that a feasible estimate counts with at least
 _PRIORS = 1e-7, 1e6  # above and up to which a relative standard deviation lies
 _PRIOR = 0.3  # relative standard deviation of a body towards which a feasible estimate is drawn
@@ -65,22 +78,30 @@ def motion_of(
     recording: Recording,
     derivatives: str = "kalman",
     cutoff: float | None = None,
+    trust: bool = False,
 ) -> Motion:
     """Velocities and accelerations of a recording, which is checked first.
+
+    Outliers are bridged by lines between their neighbours, before anything is filtered.
 
     Args:
         machine: What was recorded.
         recording: With all active joints of the machine.
         derivatives: "kalman" or "lowpass", see `signals.differentiate`.
         cutoff: [Hz] of "lowpass".
+        trust: Whether what is most likely wrong with the recording is only told, and outliers
+            are left in.
 
     Raises:
         RecordingError: What is recorded cannot serve; the message names column and time.
     """
     missing = [joint for joint in machine.active if joint not in recording.joints]
     if missing:
+        listed = ", ".join(f"'{joint}'" for joint in missing)
+        held = " ".join(f"--lock {joint}=VALUE" for joint in missing)
         raise RecordingError(
-            f"'{missing[0]}' of '{machine.name}' is not recorded, {known(recording.joints)}"
+            f"{listed} of '{machine.name}' not recorded, {known(recording.joints)}; lock what was "
+            f"held ({held})"
         )
     order = [recording.joints.index(joint) for joint in machine.active]
     q, v, tau = (x[:, order] for x in (recording.q, recording.v, recording.tau))
@@ -92,13 +113,25 @@ def motion_of(
     limits = np.column_stack([machine.lower, machine.upper])
     bounded = limits if np.isfinite(limits).all() else None
     units = {joint: machine.unit(joint) for joint in machine.active}
-    recorded_v = v if np.any(v) else None
-    check(recording.time, q, tau, machine.active, units, recorded_v, bounded)
-    step = float(np.median(np.diff(recording.time)))
-    time, columns = recording.time, np.column_stack([q, tau])
+    time = recording.time
+    every = {x: column for x, column in recording.columns().items() if x in machine.locks}
+    for text in moved_locks(machine, every, recording.units | recording.channel_units):
+        doubt(f"{text}, do not lock it, or lock it where it is", trust)
+    names = [x + suffix for suffix in ("", FORCE) for x in machine.active]
+    raw = dict(zip(names, np.column_stack([q, tau]).T, strict=True))
+    check_samples(time, raw)
+    raw = without_outliers(time, raw, trust)
+    q, tau = np.split(np.column_stack(list(raw.values())), 2, axis=1)
+    if np.any(v):  # only compared; where no velocities were recorded, derivatives of outliers
+        v = np.column_stack([repaired(x, outliers(x)) for x in v.T])
+    check(time, q, tau, machine.active, units, v if np.any(v) else None, bounded, trust=trust)
+    step = float(np.median(np.diff(time)))
+    columns = np.column_stack([q, tau])
     if np.abs(np.diff(time) - step).max() > 1e-3 * step:
         time, columns = resample(time, columns, step)
     q, tau = np.split(columns, 2, axis=1)
+    lowest = _MOVES * motion_frequency(q, step)
+    tell_hum(time, dict(zip(names, columns.T, strict=True)), lowest)
     found = differentiate(time, q, derivatives, cutoff)
     return Motion(time, found.q, found.v, found.a, tau)
 
@@ -114,6 +147,7 @@ def identify(
     terms: Sequence[Term] | None = None,
     bandwidth: float | None = None,
     slow: Mapping[str, float] | ArrayLike | None = None,
+    trust: bool = False,
 ) -> Identification:
     """Base parameters of a machine from recorded strokes and forces.
 
@@ -135,6 +169,8 @@ def identify(
             Lower where the motion is measured badly, as by a coarse potentiometer.
         slow: Velocities below which rows are left out, (n,) or by joint; a share of a joint's
             largest if not given. A few times that over which friction at rest fades.
+        trust: Whether a recording that is most likely wrong is taken nevertheless: why it is so
+            is told as a warning, and outliers are left in.
 
     Returns:
         Parameters, their confidence, and how well they predict both recordings.
@@ -146,7 +182,7 @@ def identify(
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
     model = Model(machine, terms)
-    motion = recording if isinstance(recording, Motion) else motion_of(machine, recording)
+    motion = _motion(machine, recording, trust)
     base = base_parameters(model)
     if bandwidth is None:
         bandwidth = _bandwidth(motion)
@@ -155,12 +191,7 @@ def identify(
     limits = _slow(machine, slow, fastest)
     rows = _equations(model, base, motion, bandwidth, limits)
     if model.bodies:
-        check_forces(
-            rows.time,
-            rows.y + rows.offset,
-            rows.W @ base.values(model.nominal) + rows.offset,
-            machine.active,
-        )
+        _check_forces(model, base, motion, rows, limits, trust)
     W, y, groups, instants = rows.stacked()
     if not len(y):
         raise RecordingError("no joint moves faster than what counts as standstill, move it more")
@@ -189,12 +220,32 @@ def identify(
 
     judged = None
     if validation is not None:
-        other = validation if isinstance(validation, Motion) else motion_of(machine, validation)
+        other = _motion(machine, validation, trust)
         judged = compare(_equations(model, base, other, bandwidth, limits))
+        tell_validation(compare(rows), judged)
     return Identification(
         model, told, values, covariance, parameters, estimate, method, feasible,
         compare(rows), judged,
     )  # fmt: skip
+
+
+def _motion(machine: Machine, recording: Recording | Motion, trust: bool) -> Motion:
+    if isinstance(recording, Motion):
+        return recording
+    return motion_of(machine, recording, trust=trust)
+
+
+def _check_forces(
+    model: Model, base: Base, motion: Motion, rows: _Rows, slow: Array, trust: bool
+) -> None:
+    """Doubts about the forces of a recording, by what the model can say."""
+    every = max(1, round((rows.time[1] - rows.time[0]) / (motion.time[1] - motion.time[0])))
+    thinned = Motion(
+        rows.time, motion.q[::every], motion.v[::every], motion.a[::every], rows.y + rows.offset
+    )
+    modelled = rows.W @ base.values(model.nominal) + rows.offset
+    check_forces(thinned, modelled, model.machine.active, trust=trust)
+    tell_delays(model.machine.active, *delays(model, base, motion, slow))
 
 
 def _equations(

@@ -117,6 +117,7 @@ def estimate_payload(
     frame: str | None = None,
     method: str = "wls",
     inertia: bool = True,
+    trust: bool = False,
 ) -> PayloadEstimate:
     """What a machine carries, from the forces that are not its own.
 
@@ -130,6 +131,7 @@ def estimate_payload(
         frame: What it is fixed to; the tip if not given.
         method: As of `identify`.
         inertia: Whether the load's inertia about the frame is estimated too, or neglected.
+        trust: As of `identify`.
 
     Raises:
         InputError: An unknown frame or method, or one that does not move.
@@ -138,12 +140,16 @@ def estimate_payload(
     if frame is None and machine.tip is None:
         raise InputError(f"'{machine.name}' has no tip, give the frame that holds the load")
     frame = frame or str(machine.tip)
-    motion = recording if isinstance(recording, Motion) else motion_of(machine, recording)
+    if isinstance(recording, Motion):
+        motion = recording
+    else:
+        motion = motion_of(machine, recording, trust=trust)
     load = Load(machine, frame, inertia)
     own = Dynamics(machine).inverse(motion.q, motion.v, motion.a, friction=True)
     moves = np.flatnonzero(np.ptp(motion.v, axis=0) > 0)
     names = [machine.active[i] for i in moves]
-    check_forces(motion.time, motion.tau[:, moves], own[:, moves], names)
+    parts = (x[:, moves] for x in (motion.q, motion.v, motion.a, motion.tau))
+    check_forces(Motion(motion.time, *parts), own[:, moves], names, trust=trust)
     rest = Motion(motion.time, motion.q, motion.v, motion.a, motion.tau - own)
     bare = machine.replace(friction={}, forces=(), gas_springs=(), end_stops=())
     result = identify(bare, rest, method=method, terms=[load])

@@ -1,0 +1,171 @@
+"""Logs of other programs as recordings."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import crane
+from crane import timeseries
+from crane.errors import RecordingError
+from crane.logs import read_log
+from crane.recording import Recording
+
+DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
+COLUMNS = Path(__file__).parents[1] / "scripts" / "columns"
+recorded = pytest.mark.skipif(
+    not DATA.is_dir(), reason="the recordings, ../shared/data, are not there"
+)
+
+TIME = np.arange(5) * 0.5
+MOTORS = np.arange(10.0).reshape(5, 2)
+GOOD = """# machine: two_links
+# task: a test
+
+time [ms] = 1e3 * t
+q1 [deg] = motors[0] / 32 - 90
+q2 [rad] = (motors[1] - 2 * motors[0]) / -gear[1] + pi / 2
+q1_force [N m] = 'torque 1 (Nm)' * gear[0]
+hold [V] = 5.8
+"""
+
+
+@pytest.fixture
+def log(tmp_path):
+    path = tmp_path / "log.npz"
+    np.savez(path, **{"t": TIME, "motors": MOTORS, "gear": [32, 45], "torque 1 (Nm)": TIME**2})
+    return path
+
+
+def columns(folder, text):
+    path = folder / "columns.txt"
+    path.write_text(text)
+    return path
+
+
+def test_columns_are_combined_and_converted(log, tmp_path):
+    table = read_log(log, columns(tmp_path, GOOD))
+    assert table.notes == {"machine": "two_links", "task": "a test"}
+    assert table.units == {
+        "time": "s", "q1": "rad", "q2": "rad", "q1_force": "N m", "hold": "V",
+    }  # fmt: skip
+    wanted = [
+        TIME,
+        np.deg2rad(MOTORS[:, 0] / 32 - 90),
+        (2 * MOTORS[:, 0] - MOTORS[:, 1]) / 45 + np.pi / 2,
+        32 * TIME**2,
+        np.full(5, 5.8),
+    ]
+    np.testing.assert_allclose(table.values, np.transpose(wanted), rtol=1e-15, atol=1e-15)
+
+
+@pytest.mark.parametrize("between", [",", ";", "\t"])
+def test_csv_of_other_programs(tmp_path, between):
+    path = tmp_path / "log.csv"
+    rows = [["t_s", "s1 (mm)"], ["0", "820.5"], ["0.01", "821.0"]]
+    path.write_text("\n".join(between.join(row) for row in rows) + "\n")
+    table = read_log(path, columns(tmp_path, "time [s] = t_s\nX [mm] = 's1 (mm)' - 820\n"))
+    np.testing.assert_allclose(table.values, [[0, 0.5e-3], [0.01, 1e-3]], rtol=1e-12)
+
+
+def change(old, new):
+    return GOOD.replace(old, new)
+
+
+BROKEN = {
+    "unknown": (change("= 1e3 * t", "= 1e3 * tt"), ":4: the log has no 'tt', known: gear, motors"),
+    "a table": (
+        change("motors[0] / 32", "motors"),
+        ":5: 'motors - 90' has the shape (5, 2), choo",
+    ),
+    "too far": (
+        change("gear[0]", "gear[2]"),
+        ":7: 'gear[2]' is not there, give numbers from 0 to",
+    ),
+    "a list": (change("* gear[0]", "* gear"), ":7: ''torque 1 (Nm)' * gear' cannot be computed"),
+    "a call": (change("1e3 * t", "abs(t)"), ":4: 'abs(t)' cannot be computed, combine columns"),
+    "an attribute": (change("1e3 * t", "t.real"), ":4: 't.real' cannot be computed"),
+    "no expression": (change("= 5.8", ""), ":8: is no column, write 'name [unit] = expression'"),
+    "twice": (change("hold [V]", "q1 [deg]"), ":8: column 'q1 [deg]' is there twice, remove one"),
+    "unit twice": (change("hold [V]", "q1 [rad]"), "column 'q1' is there twice"),
+    "no time": (change("time [ms]", "t [s]"), "no column 'time' in the header, add 'time [s]'"),
+    "standing": (
+        change("1e3 * t", "0 * t"),
+        "'time' is 0.0 at sample 1, give strictly increasing",
+    ),
+    "infinite": (change("/ 32", "/ 0"), "'q1' is nan at sample 0, give finite numbers"),
+    "nothing": ("# machine: x\n", "names no columns, write 'name [unit] = expression'"),
+    "deep": (change("1e3 * t", "(" * 400 + "t" + ")" * 400), ":4: '((("),
+}
+
+
+@pytest.mark.parametrize(("text", "message"), BROKEN.values(), ids=BROKEN.keys())
+def test_broken_files_of_columns(log, tmp_path, text, message):
+    with pytest.raises(RecordingError) as caught:
+        read_log(log, columns(tmp_path, text))
+    assert message in str(caught.value) and str(caught.value).isprintable()
+
+
+def test_logs_that_cannot_be_read(log, tmp_path):
+    good = columns(tmp_path, GOOD)
+    for path, text, message in (
+        ("gone.npz", None, "no such file"),
+        ("gone.csv", None, "no such file"),
+        ("words.csv", "t,x\n0,up\n", "no table of numbers"),
+        ("twice.csv", "t,t\n0,1\n", "1 different names head 2 columns"),
+        ("short.csv", "t\n0,1\n", "1 different names head 2 columns"),
+    ):
+        if text is not None:
+            (tmp_path / path).write_text(text)
+        with pytest.raises(RecordingError, match=message):
+            read_log(tmp_path / path, good)
+    with pytest.raises(RecordingError, match="no such file or directory, give a file of columns"):
+        read_log(log, tmp_path / "gone.txt")
+
+
+def test_command_line(log, tmp_path):
+    def run(*arguments):
+        code = "from crane.cli import main; main()"
+        return subprocess.run(
+            [sys.executable, "-c", code, "import", *map(str, arguments)],
+            capture_output=True, text=True, timeout=300,
+        )  # fmt: skip
+
+    given = log, columns(tmp_path, GOOD), "--out", tmp_path / "run.csv"
+    done = run(*given)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == f"5 samples of 5 columns written to {tmp_path / 'run.csv'}\n"
+    found = Recording.read(tmp_path / "run.csv")
+    assert found.joints == ("q1",) and found.machine == "two_links"
+    np.testing.assert_array_equal(found.tau[:, 0], 32 * TIME**2)
+    again = run(*given)
+    assert again.returncode == 2 and "exists already" in again.stderr
+    assert "name it so" in run(*given[:-1], tmp_path / "run.npz").stderr
+
+
+@recorded
+def test_the_measured_arms_come_as_their_owners_wrote_them():
+    """Against the conversion written out in numpy; limits of the machines hold."""
+    table = read_log(DATA / "kr300" / "kr300_A.npz", COLUMNS / "kr300.txt")
+    with np.load(DATA / "kr300" / "kr300_A.npz") as file:
+        q = np.deg2rad(file["motor_position_deg"] + [0, -90, 90, 0, 0, 0])
+        tau = file["motor_torque"] * file["gear_ratio"]
+    np.testing.assert_allclose(table.values[:, 1:7], q, atol=1e-12)
+    np.testing.assert_allclose(table.values[:, 7:], tau, rtol=1e-14)
+    crane.load("kr300").check_limits(table.values[:, 1:7])
+
+    table = read_log(DATA / "tx40" / "tx40_recording.npz", COLUMNS / "tx40.txt")
+    ratio = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])
+    ratio[5, 4] = 32.0
+    with np.load(DATA / "tx40" / "tx40_recording.npz") as file:
+        q = np.linalg.solve(ratio, file["motor_position"].T).T
+        tau = file["motor_torque"] @ ratio
+    zero = [0, -np.pi / 2, np.pi / 2, 0, 0, 0]
+    np.testing.assert_allclose(table.values[:, 1:7], q + zero, atol=1e-12)
+    np.testing.assert_allclose(table.values[:, 7:], tau, rtol=1e-12, atol=1e-12)
+
+    table = read_log(DATA / "patu655" / "lifting_first_half.csv", COLUMNS / "patu655.txt")
+    assert timeseries.spellings("m")[0] == table.units["X_lift"]
+    assert table.values[0, 1] == pytest.approx(0.942197 - 0.820)
