@@ -1,12 +1,16 @@
 """Machines loaded with some of their numbers changed."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pinocchio as pin
 import pytest
 from broken import DATA
 
 import crane
-from crane.description import parameters, read
+import crane.cli.entry
+from crane.description import bundled, parameters, read
 from crane.errors import InputError
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
@@ -111,7 +115,11 @@ def test_urdfs_can_be_changed_too():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"link3G.x": 1.0}, "parameter 'link3G.x' is unknown, did you mean 'link3_G.x'?"),
+        (
+            {"link3G.x": 1.0},
+            "parameter 'link3G.x' is unknown, did you mean 'link3_G.x'? like it are "
+            "'link3.x' and 'link3_H.x'; crane info mini_forwarder --parameters lists all names",
+        ),
         ({"link7.mass": -1.0}, "parameter 'link7.mass' is -1 kg, it must not be negative"),
         ({"link7.mass": "heavy"}, "parameter 'link7.mass' is not made of real numbers"),
         ({"link7.mass": float("nan")}, "parameter 'link7.mass' is nan"),
@@ -173,3 +181,34 @@ def test_what_cannot_be_locked():
         with pytest.raises(InputError) as caught:
             crane.load("mini_forwarder", lock=lock)
         assert str(caught.value).startswith(message)
+
+
+def documented():
+    """Patterns of the names in the documentation, and the fields that they stand for."""
+    text = (Path(__file__).parents[1] / "docs" / "machine_file.md").read_text()
+    section = text.split("## Names of parameters")[1].split("\n## ")[0]
+    names = [name for row in section.splitlines() if row.startswith("| `")
+             for name in re.findall("`([^`]+)`", row.split("|")[1])]  # fmt: skip
+    return {name: name.replace(".", r"\.").replace("LINK", ".+").replace("JOINT", ".+")
+            .replace("KEY", "[a-z0-9_]+") for name in names}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [*bundled(), str(DATA / "four_bar.yaml")])
+def test_every_name_is_documented(name):
+    patterns = documented()
+    for parameter in parameters(read(name)):
+        assert any(re.fullmatch(x, parameter) for x in patterns.values()), parameter
+
+
+def test_every_documented_name_is_one():
+    names = [x for name in (*bundled(), DATA / "four_bar.yaml") for x in parameters(read(name))]
+    for name, pattern in documented().items():
+        assert any(re.fullmatch(pattern, x) for x in names), name
+
+
+def test_names_can_be_listed_and_changed(capsys):
+    crane.cli.entry.app(args=["info", "mini_forwarder", "--parameters"], standalone_mode=False)
+    listed = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert {name: float(f"{x:.6g}") for name, x in parameters(read("mini_forwarder")).items()} == {
+        name: float(value) for name, value in listed
+    }

@@ -170,7 +170,7 @@ def test_errors():
         least_squares(W, y[:49])
     with pytest.raises(InputError, match="samples of group 0 do not increase, sort its rows"):
         least_squares(W, y, samples=np.zeros(50))
-    with pytest.raises(InputError, match="the prior is not means and deviations > 0"):
+    with pytest.raises(InputError, match="the prior has the deviation 0, give one above 0"):
         least_squares(W, y, prior=(np.zeros(4), np.zeros(4)))
     y[7] = np.nan
     with pytest.raises(InputError, match="forces not finite in row 7, leave such rows out"):

@@ -42,8 +42,23 @@ def list_machines() -> None:
 
 
 @app.command()
-def info(machine: MachineName) -> None:
+def info(
+    machine: MachineName,
+    parameters: Annotated[
+        bool,
+        typer.Option("--parameters", help="List the names that --set changes, and their values."),
+    ] = False,
+) -> None:
     """Show what a machine consists of."""
+    if parameters:
+        from crane.description import parameters as parameters_of
+        from crane.description import read
+
+        values = parameters_of(read(machine))
+        width = max(map(len, values), default=0)
+        for name, value in values.items():
+            print(f"{name:{width}}  {value:.6g}")
+        return
     for line in _describe(load(machine)):
         print(line)
 

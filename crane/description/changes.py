@@ -2,7 +2,8 @@
 
 import copy
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Any
 
@@ -11,6 +12,7 @@ from lxml import etree
 
 from crane.description.circuit_section import numbers_of
 from crane.description.hydraulics import Hydraulics
+from crane.description.sources import bundled
 from crane.description.spec import Chain, Coupling, Friction, MachineSpec
 from crane.description.urdf import read_urdf
 from crane.errors import InputError, known
@@ -106,7 +108,7 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
     circuit = _parts(spec.hydraulics) if spec.hydraulics else {}
     for name, given in changes.items():
         if name not in names:
-            raise InputError(f"parameter '{name}' is unknown, {known(names, name)}")
+            raise InputError(f"parameter '{name}' is unknown, {_nearest(spec, names, name)}")
         value = as_number(given, f"parameter '{name}'", "")
         head, _, rest = name.partition(".")
         if name.endswith(".mass") and value < 0:
@@ -130,6 +132,16 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
         hydraulics=_circuit(circuit) if circuit else None,
         where={**spec.where, "link payload": PAYLOAD},
     )
+
+
+def _nearest(spec: MachineSpec, names: Iterable[str], wanted: str) -> str:
+    """What an error about an unknown parameter ends with: names like it, and where all are."""
+    near = get_close_matches(wanted, names, 3, 0.6)
+    meant = f"did you mean '{near[0]}'? " if near else ""
+    if len(near) > 1:
+        meant += f"like it are {' and '.join(map(repr, near[1:]))}; "
+    at = spec.path.stem if bundled().get(spec.path.stem) == spec.path else spec.path
+    return f"{meant}crane info {at} --parameters lists all names"
 
 
 def _parts(hydraulics: Hydraulics) -> dict[str, Any]:

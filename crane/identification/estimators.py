@@ -221,8 +221,13 @@ class _Rows:
         self.mean, self.weight = np.zeros(size), np.zeros(size)
         if prior is not None:
             mean, std = (np.asarray(x, dtype=np.float64) for x in prior)
-            if mean.shape != (size,) or std.shape != (size,) or not (std > 0).all():
-                raise InputError(f"the prior is not means and deviations > 0, give ({size},) each")
+            if mean.shape != (size,) or std.shape != (size,):
+                raise InputError(
+                    f"the prior has means of the shape {mean.shape} and deviations of the shape "
+                    f"{std.shape}, give ({size},) each, one per column of the regressor"
+                )
+            if not (std > 0).all():
+                raise InputError(f"the prior has the deviation {std.min():g}, give one above 0")
             self.mean, self.weight = mean, 1 / std
         if count + np.count_nonzero(self.weight) <= size:
             raise InputError(f"{count} rows for {size} parameters are too few, record longer")
@@ -272,7 +277,8 @@ class _Rows:
         if values[-1] < np.finfo(float).eps * len(A) * values[0]:
             raise InputError(
                 f"the {A.shape[1]} columns of the regressor depend on each other (condition "
-                f"{values[0] / max(values[-1], 1e-300):.1g}), take base parameters or a prior"
+                f"{values[0] / max(values[-1], 1e-300):.1g}), take base parameters, or a prior "
+                "with finite deviations of those that do"
             )
         return np.linalg.solve(A, Q.T @ y), Q, A
 

@@ -24,6 +24,7 @@ from crane.identification.feasible import feasible as feasible_estimate
 from crane.identification.feasible import pseudo_inertia
 from crane.identification.model import Model, Samples, Term
 from crane.identification.outliers import outliers, repaired
+from crane.identification.priors import check_told, checked
 from crane.identification.result import Comparison, Identification
 from crane.identification.signals import (
     Motion,
@@ -197,13 +198,17 @@ def identify(
         raise RecordingError("no joint moves faster than what counts as standstill, move it more")
     told = base.narrowed(W)
     picked = np.searchsorted(base.independent, told.independent)
-    prior = prior_of_bodies(model, prior) if isinstance(prior, int | float) else prior
+    if isinstance(prior, int | float):
+        prior = prior_of_bodies(model, prior)
+    elif prior is not None:
+        prior = checked(model, base, prior, feasible)
     parameters = None
     if feasible:
         estimate = METHODS[method](W[:, picked], y, groups, instants)
         parameters = _possible(model, told, W[:, picked], y, estimate.noise[groups], prior)
         values, covariance = told.values(parameters), estimate.covariance
     elif prior is not None:
+        check_told(model.names, W[:, picked] @ told.grouping, prior)
         estimate = METHODS[method](W[:, picked] @ told.grouping, y, groups, instants, prior)
         plain, scaled = conditions(W[:, picked])
         estimate = replace(estimate, condition=plain, scaled_condition=scaled)

@@ -1,0 +1,72 @@
+"""What is wrong with a prior is told in terms of the parameters that it is about."""
+
+import numpy as np
+import pytest
+from broken import DATA
+
+import crane
+from crane.errors import InputError
+from crane.identification.identify import Motion, identify
+from crane.identification.model import Model
+
+TIME = np.arange(0, 8, 0.01)
+W = np.pi
+
+
+@pytest.fixture(scope="module")
+def four_bar():
+    return crane.load(DATA / "four_bar.yaml")
+
+
+def motion(machine, q, v, a):
+    q, v, a = (np.asarray(x)[:, None] for x in (q, v, a))
+    tau = crane.Dynamics(machine).inverse(q, v, a, friction=True)
+    return Motion(TIME, q, v, a, tau + 1e-4 * np.random.default_rng(0).normal(size=tau.shape))
+
+
+@pytest.fixture(scope="module")
+def one_way(four_bar):
+    """The crank never turns back: Coulomb friction and its offset are one."""
+    return motion(
+        four_bar,
+        0.2 + 0.15 * TIME + 0.02 * np.sin(W * TIME),
+        0.15 + 0.02 * W * np.cos(W * TIME),
+        -0.02 * W**2 * np.sin(W * TIME),
+    )
+
+
+def test_what_neither_prior_nor_motion_tells_is_named(four_bar, one_way):
+    assert identify(four_bar, one_way).parameters is None  # base parameters come out
+    with pytest.raises(InputError) as caught:
+        identify(four_bar, one_way, prior=0.3)
+    assert str(caught.value) == (
+        "the prior says nothing of crank.coulomb, crank.coulomb_offset, crank.viscous, "
+        "crank.viscous_offset, and this motion does not tell them apart: move the joints both "
+        "ways and at several speeds, give prior=(means, deviations) with finite ones for them, "
+        "or leave the prior out, which tells of them together"
+    )
+    names = Model(four_bar).names
+    std = np.array([1.0 if name.startswith("crank.") or "_arm" in name else np.inf
+                    for name in names])  # fmt: skip
+    assert len(identify(four_bar, one_way, prior=(np.zeros(len(names)), std)).parameters) == 36
+
+
+@pytest.mark.parametrize(
+    ("prior", "feasible", "message"),
+    [
+        (([0.0] * 10, [1.0] * 10), False, "the prior is about the 10 base parameters, give means "
+         "and standard deviations of all 36 parameters"),
+        (([0.0] * 9, [1.0] * 9), False, "the prior's means has the shape"),
+        (([0.0] * 36, [0.0] * 36), False, "the prior's deviation of 'crank_arm.m' is 0, give one"),
+        (([np.nan] * 36, [1.0] * 36), False, "the prior's means is nan at crank_arm.m"),
+        (([0.0] * 36, [np.nan] * 36), False, "the prior's deviations is nan at crank_arm.m"),
+        (([0.0] * 36, [1.0] * 36), True, "the prior's mean of 'crank_arm' has the mass 0 kg"),
+        ((1, 2, 3), False, "the prior is no pair, give means"),
+        ({}, False, "the prior is no pair, give means"),
+        (-1.0, False, "the prior's standard deviation is -1, give one above 0"),
+    ],
+)  # fmt: skip
+def test_a_prior_that_is_none(four_bar, one_way, prior, feasible, message):
+    with pytest.raises(InputError) as caught:
+        identify(four_bar, one_way, prior=prior, feasible=feasible)
+    assert str(caught.value).startswith(message) and str(caught.value).isprintable()
