@@ -12,6 +12,7 @@ from crane.control import Controller
 from crane.dynamics import Dynamics
 from crane.errors import CraneError, InputError
 from crane.machine import Machine
+from crane.paths import beyond_limits
 from crane.samples import Array, Brief
 from crane.simulation import Progress, imbalance, trajectory
 
@@ -84,9 +85,15 @@ def simulate_batch(
                 f"{', '.join(active)}: simulate them apart"
             )
 
+    beyond: dict[int, str] = {}
+
     def run(i: int) -> tuple[Array, ...]:
         machine = machines[i]
         control = None if controller is None else controller(machine)
+        path = getattr(control, "path", None)
+        if path is not None:
+            text = beyond_limits(machine, path, np.inf if duration is None else duration)
+            beyond.update({i: text} if text else {})
         time, states, seen = trajectory(Dynamics(machine), control, starts[i], duration, step)
         nq, n = machine.model.nq, len(active)
         energy = np.column_stack([seen[:, 2 * n : 2 * n + 2], states[:, -2:]])
@@ -110,11 +117,15 @@ def simulate_batch(
                     progress((len(results) + len(failures)) / len(machines))
     if not results:
         raise InputError(f"all {len(machines)} simulations failed, the first: {failures[0]}")
-    return _stack(results, failures, len(machines), step)
+    return _stack(results, failures, beyond, len(machines), step)
 
 
 def _stack(
-    results: dict[int, tuple[Array, ...]], failures: dict[int, str], count: int, step: float
+    results: dict[int, tuple[Array, ...]],
+    failures: dict[int, str],
+    beyond: dict[int, str],
+    count: int,
+    step: float,
 ) -> Batch:
     lengths = {len(result[0]) for result in results.values()}
     if len(lengths) > 1:
@@ -129,9 +140,9 @@ def _stack(
             stack[i] = result[k]
         stacks.append(stack)
     q, v, tau, energy = stacks
-    doubts = {
-        i: text
-        for i in sorted(results)
-        if (text := imbalance(energy[i, :, 2], energy[i, :, :2], energy[i, :, 3], step))
-    }
+    doubts = {}
+    for i in sorted(results):
+        gap = imbalance(energy[i, :, 2], energy[i, :, :2], energy[i, :, 3], step)
+        if text := "; ".join(filter(None, (beyond.get(i, ""), gap))):
+            doubts[i] = text
     return Batch(first[0], q, v, tau, energy, dict(sorted(failures.items())), doubts)

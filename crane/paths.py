@@ -6,11 +6,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import PPoly, make_interp_spline
 
-from crane.errors import InputError, known
+from crane.errors import InputError, LimitError, known
 from crane.kinematics import Kinematics
 from crane.machine import Machine
 from crane.samples import Array, as_number, as_samples
 
+LIMIT_SLACK = 1e-6  # [m], [rad] by which a reference may pass a limit between its knots
 _KNOTS_PER_SECOND = 100
 
 
@@ -34,6 +35,13 @@ class Path:
     def position(self, time: ArrayLike) -> Array:
         """Coordinates alone, (n,) or (N, n) at times () or (N,) [s]."""
         return np.asarray(self._curves[0](np.clip(time, 0.0, self.duration)))
+
+    def turns(self) -> Array:
+        """Times (k,) [s] at which a coordinate may be largest or least: knots, and rests."""
+        curve, rate = self._curves[:2]
+        rests = [np.ravel(roots) for roots in np.ravel(rate.roots(extrapolate=False))]
+        times = np.concatenate([curve.x, *rests])
+        return np.unique(times[np.isfinite(times)])
 
     def __call__(self, time: ArrayLike) -> tuple[Array, Array, Array]:
         """Coordinates, velocities and accelerations.
@@ -175,5 +183,35 @@ def task_path(machine: Machine, task: str) -> Path:
         rows = [chosen.coefficients[axis] for axis in ("x", "y", "z")]
         return tip_path(machine, polynomial(rows, chosen.duration))
     path = polynomial([chosen.coefficients[name] for name in machine.active], chosen.duration)
-    machine.check_limits(path(np.linspace(0, path.duration, 501))[0], f"task '{task}'")
+    if text := beyond_limits(machine, path):
+        raise LimitError(f"task '{task}': {text}")
     return path
+
+
+def beyond_limits(machine: Machine, path: Path, until: float = np.inf) -> str:
+    """What to say of a reference that leaves the limits of an active joint, else nothing.
+
+    Args:
+        machine: The machine.
+        path: Reference of its active joints.
+        until: End of what is looked at [s].
+    """
+    times = np.unique(np.minimum(path.turns(), until))
+    q_a = path.position(times)
+    if q_a.shape[1:] != machine.lower.shape:
+        return ""  # of another machine, which is told elsewhere
+    excess = np.maximum(machine.lower - q_a, q_a - machine.upper)
+    if not (excess > LIMIT_SLACK).any():
+        return ""
+    span = machine.upper - machine.lower
+    shares = excess / np.where(np.isfinite(span), span, 1.0)
+    k, i = np.unravel_index(int(shares.argmax()), shares.shape)
+    joint, value = machine.active[i], q_a[k, i]
+    limit = machine.lower[i] if value < machine.lower[i] else machine.upper[i]
+    unit = machine.unit(joint)
+    others = int((excess > LIMIT_SLACK).any(axis=0).sum()) - 1
+    more = f" ({others} other joint{'s' * (others > 1)} likewise)" if others else ""
+    return (
+        f"the reference of '{joint}' goes to {value:.6g} {unit} at t = {times[k]:.4g} s, beyond "
+        f"its limit {limit:.6g} {unit}{more}: keep it within, or widen the limits"
+    )

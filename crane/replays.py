@@ -1,5 +1,6 @@
 """Measured valve signals put through the model, and what comes out beside what was measured."""
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from crane import timeseries
 from crane.control import Signals, ValveDrive
-from crane.errors import InputError, RecordingError, at, known
+from crane.errors import CraneWarning, InputError, RecordingError, at, known
 from crane.machine import Machine
 from crane.measured import check_pressures, column, motion_of
 from crane.recording import FORCE, FORCE_UNITS, VELOCITY, VELOCITY_UNITS, Recording
@@ -18,6 +19,7 @@ from crane.timeseries import TIME, Table, check_unit, spellings
 _SIGNAL, _SUPPLY, _TANK = "voltage_", "pressure_supply", "pressure_tank"
 _FIRST = 0.1  # over which the velocity at the start is fitted [s]
 _FEWEST = 5  # samples of that fit
+_BEYOND = 0.01  # of a range, beyond a limit, that noise does not explain
 _RESTS = 1e-12  # variation of a channel that is rounding, per its size
 
 
@@ -201,6 +203,7 @@ def _prepare(
     initial = None
     if any(joint in table.units for joint in machine.joints):
         q_a, v_a = motion_of(machine, table)
+        _warn_of_limits(machine, time, q_a)
         first = time <= max(_FIRST, time[min(_FEWEST, len(time)) - 1])
         if any(f"{joint}_velocity" in table.units for joint in machine.joints):
             initial = q_a[0], v_a[0]
@@ -208,3 +211,21 @@ def _prepare(
             slope = np.polyfit(time[first], q_a[first], 1)[0] if first.sum() > 2 else v_a[0]
             initial = q_a[0], slope
     return time, drive, initial
+
+
+def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
+    """Warn of measured coordinates (N, n) where the simulated machine cannot be."""
+    span = machine.upper - machine.lower
+    excess = np.maximum(machine.lower - q_a, q_a - machine.upper)
+    excess /= np.where(np.isfinite(span), span, 1.0)
+    for i, joint in enumerate(machine.active):
+        k = int(np.argmax(excess[:, i]))
+        if excess[k, i] > _BEYOND:
+            limit = machine.lower[i] if q_a[k, i] < machine.lower[i] else machine.upper[i]
+            unit = machine.unit(joint)
+            warnings.warn(
+                f"measured '{joint}' goes to {q_a[k, i]:.6g} {unit} at t = {time[k]:.4g} s, "
+                f"beyond its limit {limit:.6g} {unit}: look at the limits and the sensor's zero",
+                CraneWarning,
+                stacklevel=4,
+            )

@@ -7,7 +7,7 @@ from hydraulic_rig import COMPENSATED, rig
 import crane
 from crane import timeseries
 from crane.control import Signals
-from crane.errors import CraneError, RecordingError
+from crane.errors import CraneError, CraneWarning, RecordingError
 from crane.replays import Channel, replay
 from crane.timeseries import Table
 
@@ -55,6 +55,19 @@ def test_the_model_s_own_recording_comes_back(tmp_path, measured):
     assert again.time[-1] == pytest.approx(3.7)
     assert again.task == "file"
     assert np.ptp(recording.q[300:, 0]) > 0.005
+
+
+def test_measured_strokes_beyond_the_limits_are_told(tmp_path, measured):
+    """A bump of the sensor to 600 mm, the stroke being 535 mm; noise of 1 mm is none."""
+    machine, recording = measured
+    columns, units = columns_of(recording)
+    columns["x"] = columns["x"] + np.where(np.abs(recording.time - 2) < 0.0105, 400.0, 0.0)
+    top = columns["x"].max()
+    path = write(tmp_path / "file.csv", columns, units)
+    told = rf"measured 'x' goes to {top / 1e3:.6g} m at t = "
+    with pytest.warns(CraneWarning, match=told) as caught:
+        replay(machine, path)
+    assert "beyond its limit 0.535 m: look at the limits" in str(caught[0].message)
 
 
 def test_a_wrong_model_shows(tmp_path, measured):

@@ -91,12 +91,12 @@ def test_strokes_where_the_loops_close(monkeypatch):
             except ClosureError:
                 pass
     assert found["range"] == len(closed) / 121 < 0.7
-    assert found["lower_X2"] == pytest.approx(min(x2 for _, x2 in closed))
+    # the true ends lie up to a cell farther, see test_reach
+    assert 0 < min(x2 for _, x2 in closed) - found["lower_X2"] < 0.003
     assert found["upper_X1"] == pytest.approx(max(x1 for x1, _ in closed))
     tip = crane.Kinematics(machine)
-    assert found["reach"] == pytest.approx(
-        max(np.hypot(*tip.position([0.0, *x])[:2]) for x in closed), abs=1e-12
-    )
+    coarse = max(np.hypot(*tip.position([0.0, *x])[:2]) for x in closed)
+    assert coarse <= found["reach"] < coarse + 0.005
 
 
 def test_an_open_arm_has_strokes_too():
@@ -126,8 +126,10 @@ def test_draws_come_from_their_seed():
 
 def test_table_and_picture(pins, tmp_path):
     lines = text_of(pins, tmp_path).decode().splitlines()
-    assert lines[0] == "# machine: mini_forwarder" and len(lines) == 2 + len(pins)
-    assert lines[1].startswith("link3_G.x [m],link3_G.y [m],peak_q1 [N m],")
+    assert lines[0] == "# machine: mini_forwarder" and len(lines) == 4 + len(pins)
+    assert lines[1] == "# note: forces are taken every 5 ms of a task"
+    assert lines[2] == "# note: range is counted on 31 values of each of 2 strokes"
+    assert lines[3].startswith("link3_G.x [m],link3_G.y [m],peak_q1 [N m],")
     assert "* " in pins.to_text() and "cannot be measured" in pins.to_text()
     plot_study(pins, tmp_path / "map.png")
     for vary, draws in (

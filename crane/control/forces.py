@@ -1,5 +1,6 @@
 """Controllers of the forces of active joints."""
 
+import warnings
 from collections.abc import Mapping
 
 import numpy as np
@@ -8,7 +9,7 @@ from numpy.typing import ArrayLike
 from crane.control.base import Traced
 from crane.description import PIGains
 from crane.dynamics import Dynamics
-from crane.errors import InputError
+from crane.errors import ClosureError, CraneWarning, InputError
 from crane.machine import Machine
 from crane.paths import Path
 from crane.samples import Array, as_number, as_sample
@@ -94,6 +95,9 @@ class ComputedTorque:
 
     tau = inverse(q_A, v_A, a_ref + 2 w (v_ref - v_A) + w^2 (q_ref - q_A)) with friction.
 
+    It moves all active joints. Where nothing is said to drive one (`Machine.undriven`), a warning
+    names it and the force that it takes along the path.
+
     Args:
         machine: The machine.
         path: Reference of the active joints.
@@ -108,6 +112,28 @@ class ComputedTorque:
         self._active = machine.closure.active
         self.settings = np.array([float(bandwidth)])
         self.columns = 3 * len(machine.active)
+        if machine.undriven:
+            warnings.warn(self._needed(machine), CraneWarning, stacklevel=2)
+
+    def _needed(self, machine: Machine) -> str:
+        """What to say of joints that are moved though nothing drives them."""
+        path = self._reference
+        try:
+            peaks = np.abs(
+                self._dynamics.inverse(*path(np.linspace(0.0, path.duration, 201)), friction=True)
+            ).max(axis=0)
+        except ClosureError:  # the simulation will say where
+            peaks = np.full(len(machine.active), np.nan)
+        words = []
+        for joint in machine.undriven:
+            peak = peaks[machine.active.index(joint)]
+            unit = "N" if machine.unit(joint) == "m" else "N m"
+            words.append(f"'{joint}'" + (f" (up to {peak:.3g} {unit})" if peak == peak else ""))
+        return (
+            f"nothing is said to drive {', '.join(words)} of '{machine.name}', computed torque "
+            "does so all the same: write an effort above 0 into the <limit> of what is driven, or "
+            "describe its cylinder or gains, and lock what is not"
+        )
 
     def start(self, q_a: Array) -> Array:
         """See `Controller`."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.description import Hydraulics, PDGains
+from crane.description.magnitudes import meant
 from crane.errors import InputError, known
 from crane.machine import Machine
 from crane.paths import Path
@@ -125,6 +126,12 @@ class Signals:
                         f"pressure of the {what} is {columns[-1].min():g} Pa, it counts from a "
                         "vacuum and cannot be negative: add 1e5 to gauge pressures"
                     )
+            highest = float(columns[-2].max())
+            if 0 < highest < columns[-1].min() / 2:  # also of a pump that rests the line has more
+                raise InputError(
+                    f"pressure of the supply is {highest:g} Pa at most, far below the tank's"
+                    + (meant("pressure", highest) or ", give it in Pa from a vacuum")
+                )
         self._values = np.column_stack(columns)
         self._count = len(circuit.joints)
         self.columns = len(columns)

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from difflib import get_close_matches
 from types import MappingProxyType
@@ -12,10 +13,11 @@ from lxml import etree
 
 from crane.description.circuit_section import numbers_of
 from crane.description.hydraulics import Hydraulics
+from crane.description.magnitudes import doubt
 from crane.description.sources import bundled
 from crane.description.spec import Chain, Coupling, Friction, MachineSpec
 from crane.description.urdf import read_urdf
-from crane.errors import InputError, known
+from crane.errors import CraneWarning, InputError, known
 from crane.samples import FARTHEST, as_number
 
 PAYLOAD = "payload.mass"
@@ -106,6 +108,7 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
     chains = spec.chains
     friction, control = dict(spec.friction), dict(spec.control)
     circuit = _parts(spec.hydraulics) if spec.hydraulics else {}
+    replaced: dict[str, dict[str, float]] = {}
     for name, given in changes.items():
         if name not in names:
             raise InputError(f"parameter '{name}' is unknown, {_nearest(spec, names, name)}")
@@ -118,18 +121,23 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
         elif head == "friction":
             _set(friction, rest, value, Friction)
         elif (part := name.rpartition(".")[0]) in circuit:
-            circuit[part] = dataclasses.replace(circuit[part], **{name.rpartition(".")[2]: value})
+            replaced.setdefault(part, {})[name.rpartition(".")[2]] = value
         elif head == "control":
             _set(control, rest, value, None)
         else:
             numbers[name].set(value)
+    for part, values in replaced.items():
+        circuit[part] = dataclasses.replace(circuit[part], **values)
+    hydraulics = _circuit(circuit) if circuit else None
+    for part, values in replaced.items():
+        _warn_of_units(spec, part, values)
     return dataclasses.replace(
         spec,
         chains=chains,
         tree=tree,
         friction=MappingProxyType(friction),
         control=MappingProxyType(control),
-        hydraulics=_circuit(circuit) if circuit else None,
+        hydraulics=hydraulics,
         where={**spec.where, "link payload": PAYLOAD},
     )
 
@@ -142,6 +150,19 @@ def _nearest(spec: MachineSpec, names: Iterable[str], wanted: str) -> str:
         meant += f"like it are {' and '.join(map(repr, near[1:]))}; "
     at = spec.path.stem if bundled().get(spec.path.stem) == spec.path else spec.path
     return f"{meant}crane info {at} --parameters lists all names"
+
+
+def _warn_of_units(spec: MachineSpec, part: str, values: Mapping[str, float]) -> None:
+    """Warn of numbers of the circuit that can be, and hardly are in their SI unit."""
+    joint = part.partition(".")[2]
+    turning = any(
+        element.get("name") == joint and element.get("type") != "prismatic"
+        for element in spec.tree.iterfind("joint")
+    )
+    for name, value in values.items():
+        if text := doubt(name, value, turning):
+            what = f"parameter '{part}.{name}' {text}"
+            warnings.warn(what, CraneWarning, stacklevel=2)
 
 
 def _parts(hydraulics: Hydraulics) -> dict[str, Any]:

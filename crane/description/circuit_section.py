@@ -1,6 +1,8 @@
 """The section `hydraulics` of a machine file."""
 
 import math
+import warnings
+from collections.abc import Callable
 from dataclasses import MISSING, fields
 from typing import Any, TypeVar
 
@@ -10,17 +12,23 @@ from crane.description.hydraulics import (
     Cylinder,
     Hydraulics,
     Oil,
+    PartError,
     PDGains,
     Supply,
     Valve,
+    check_relief,
+    check_tank,
 )
+from crane.description.magnitudes import doubt
 from crane.description.section import Section
 from crane.description.tree import Tree
-from crane.errors import InputError, known
+from crane.errors import CraneWarning, InputError, known
 
+Made = TypeVar("Made")
 Part = TypeVar("Part", Oil, Supply, Counterbalance, Cylinder, Valve, PDGains)
 
 _NOT_NUMBERS = ("joint", "counterbalance_a", "counterbalance_b")
+_TOGETHER = ("tank", "relief")  # looked at with other parts
 _KINDS = ("orifice", "compensated")
 
 
@@ -52,6 +60,10 @@ def read_hydraulics(top: Section, tree: Tree, active: tuple[str, ...]) -> Hydrau
         if oil_section is not None:
             oil_section.only(*numbers_of(Oil))
             oil = _part(oil_section, Oil)
+    if supply is not None and supply_section is not None:
+        with kept():
+            _checked(supply_section, check_tank, supply, oil)
+            _warn_of_unit(supply_section, "tank", supply.tank)
     named: dict[str, list[str]] = {"cylinder": [], "valve": [], "control": []}
     cylinders: dict[str, Cylinder] = {}
     holding = ("counterbalance_a", "counterbalance_b")
@@ -65,7 +77,14 @@ def read_hydraulics(top: Section, tree: Tree, active: tuple[str, ...]) -> Hydrau
                     f"joint '{joint}' is continuous, a cylinder needs the limits of its stroke"
                 )
                 note(item.fail(None, problem))
-            cylinders[joint] = _part(item, Cylinder, joint=joint, **_holding(item, holding))
+            turning = _turns(tree, joint)
+            holds = _holding(item, holding)
+            cylinder = _part(item, Cylinder, turning, joint=joint, **holds)
+            cylinders[joint] = cylinder
+            if supply is not None:
+                _checked(item, check_relief, supply, cylinder)
+                _warn_of_unit(item, "relief", cylinder.relief)
+                _warn_of_relief(item, supply, cylinder)
     valves: dict[str, Valve] = {}
     given = (*numbers_of(Valve), "type", "flow", "meter_out")
     for joint, item in section.mappings("valves", "valve of", *given):
@@ -105,20 +124,54 @@ def _check_joint(joint: str, item: Section, active: tuple[str, ...]) -> None:
         raise item.fail(None, f"'{joint}' is not an active joint, {known(active, joint)}")
 
 
-def _part(section: Section, kind: type[Part], **given: Any) -> Part:
+def _turns(tree: Tree, joint: str) -> bool:
+    return any(
+        element.get("name") == joint and element.get("type") != "prismatic"
+        for element in tree.robot.iterfind("joint")
+    )
+
+
+def _part(section: Section, kind: type[Part], turning: bool = False, **given: Any) -> Part:
     """A part whose remaining numbers stand in a section."""
-    for entry in fields(kind):
-        if entry.name in _NOT_NUMBERS or entry.name in given:
-            continue
+    own = [x for x in fields(kind) if x.name not in _NOT_NUMBERS and x.name not in given]
+    for entry in own:
         least = -math.inf if entry.metadata.get("signed") else 0.0
         if entry.default is MISSING:
             given[entry.name] = section.number(entry.name, minimum=least)
         else:
             given[entry.name] = section.number(entry.name, float(entry.default), minimum=least)
+    part = _checked(section, kind, **given)
+    for entry in own:
+        if entry.name in section and entry.name not in _TOGETHER:
+            _warn_of_unit(section, entry.name, given[entry.name], turning)
+    return part
+
+
+def _checked(section: Section, make: Callable[..., Made], *items: object, **given: Any) -> Made:
+    """What is made of a section's numbers, or its error with file and line."""
     try:
-        return kind(**given)
+        return make(*items, **given)
+    except PartError as error:
+        raise section.fail(error.key, str(error)) from None
     except InputError as error:
         raise section.fail(None, str(error)) from None
+
+
+def _warn_of_unit(section: Section, key: str, value: float, turning: bool = False) -> None:
+    """Warn of a number that can be, and hardly is in its SI unit."""
+    if text := doubt(key, value, turning):
+        what = f"{section.where(key)}: '{key}' of {section.title} {text}"
+        warnings.warn(what, CraneWarning, stacklevel=2)
+
+
+def _warn_of_relief(section: Section, supply: Supply, cylinder: Cylinder) -> None:
+    if 0 < cylinder.relief <= supply.pressure and not doubt("relief", cylinder.relief):
+        what = (
+            f"{section.where('relief')}: 'relief' of {section.title} is {cylinder.relief:g} Pa, "
+            f"not above the supply's {supply.pressure:g} Pa: what the pump gives flows off there "
+            "before it can press, give a higher one"
+        )
+        warnings.warn(what, CraneWarning, stacklevel=2)
 
 
 def _holding(item: Section, names: tuple[str, ...]) -> dict[str, Counterbalance]:
@@ -143,8 +196,15 @@ def _valve(item: Section, joint: str) -> Valve:
     if kind == "orifice":
         return _part(item, Valve, joint=joint)
     flow, margin = item.number("flow", minimum=0.0), item.number("margin", minimum=0.0)
-    if margin == 0:
-        raise item.fail("margin", "'margin' is 0, give the pressure drop that is kept")
+    for name, value, what in (
+        ("flow", flow, "the flow at full stroke"),
+        ("margin", margin, "the pressure drop that is kept"),
+    ):
+        if value == 0:
+            raise item.fail(name, f"'{name}' is 0, give {what}")
     inlet = flow / math.sqrt(margin)
     outlet = item.number("meter_out", inlet, minimum=0.0)
+    _warn_of_unit(item, "flow", flow)
+    if "meter_out" in item:
+        _warn_of_unit(item, "meter_out", outlet)
     return _part(item, Valve, joint=joint, c1=inlet, c2=outlet, c3=outlet, c4=inlet)

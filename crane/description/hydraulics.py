@@ -4,10 +4,24 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields
 
+from crane.description.magnitudes import meant
 from crane.errors import InputError
 from crane.samples import as_number
 
 _LEAST = 1e-50  # of what must be positive: one over its square is still a number
+
+
+class PartError(InputError):
+    """A number of a part of the circuit that cannot be.
+
+    Args:
+        key: Its name.
+        message: See `CraneError`.
+    """
+
+    def __init__(self, key: str, message: str):
+        super().__init__(message)
+        self.key = key
 
 
 def check_numbers(item: object, what: str) -> None:
@@ -25,7 +39,7 @@ def check_numbers(item: object, what: str) -> None:
                 least = "must be positive" if entry.metadata.get("positive") else "must not be < 0"
                 if number > 0:
                     least = f"must be at least {_LEAST:g}"
-                raise InputError(f"{entry.name} of {what} is {number:g}, it {least}")
+                raise PartError(entry.name, f"{entry.name} of {what} is {number:g}, it {least}")
 
 
 def positive() -> float:
@@ -85,6 +99,16 @@ class Supply:
 
     def __post_init__(self) -> None:
         check_numbers(self, "the supply")
+        if self.pressure <= self.tank:
+            raise PartError(
+                "pressure",
+                f"pressure of the supply is {self.pressure:g} Pa, not above the tank's "
+                f"{self.tank:g} Pa, so that nothing would flow"
+                + (
+                    meant("pressure", self.pressure)
+                    or ", give a little more for a pump that rests"
+                ),
+            )
 
 
 @dataclass(frozen=True)
@@ -214,11 +238,15 @@ class Valve:
         what = f"the valve of '{self.joint}'"
         check_numbers(self, what)
         if self.full == self.neutral:
-            raise InputError(f"full and neutral of {what} are both {self.full:g}, give two")
+            text = f"full and neutral of {what} are both {self.full:g}, give two"
+            raise PartError("full", text)
         if self.dead_band >= 1:
-            raise InputError(f"dead_band of {what} is {self.dead_band:g}, it must be below 1")
+            text = f"dead_band of {what} is {self.dead_band:g}, it must be below 1"
+            if self.dead_band < 100:
+                text += f": looks like percent, write {self.dead_band / 100:g}"
+            raise PartError("dead_band", text)
         if self.rate and not self.bandwidth:
-            raise InputError(f"{what} has a rate but no bandwidth, give both")
+            raise PartError("rate", f"{what} has a rate but no bandwidth, give both")
 
     def opening(self, u: float) -> float:
         """Opening y of a spool position u."""
@@ -263,6 +291,11 @@ class Hydraulics:
     valves: Mapping[str, Valve]
     control: Mapping[str, PDGains] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        check_tank(self.supply, self.oil)
+        for cylinder in self.cylinders.values():
+            check_relief(self.supply, cylinder)
+
     @property
     def joints(self) -> tuple[str, ...]:
         """The joints that it drives."""
@@ -279,4 +312,34 @@ class Hydraulics:
             {joint: self.cylinders[joint] for joint in kept},
             {joint: self.valves[joint] for joint in kept},
             {joint: self.control[joint] for joint in kept if self.control},
+        )
+
+
+def check_tank(supply: Supply, oil: Oil) -> None:
+    """Raise where the oil boils in the tank.
+
+    Raises:
+        PartError: Of the tank's pressure.
+    """
+    if supply.tank <= oil.vapour_pressure:
+        hint = ": pressures count from a vacuum, write 1e5 for an open tank"
+        raise PartError(
+            "tank",
+            f"pressure of the tank is {supply.tank:g} Pa, the oil boils at "
+            f"{oil.vapour_pressure:g} Pa{meant('tank', supply.tank) or hint}",
+        )
+
+
+def check_relief(supply: Supply, cylinder: Cylinder) -> None:
+    """Raise where a relief valve would never close.
+
+    Raises:
+        PartError: Of the relief pressure.
+    """
+    if 0 < cylinder.relief <= supply.tank:
+        raise PartError(
+            "relief",
+            f"relief of the cylinder of '{cylinder.joint}' is {cylinder.relief:g} Pa, not above "
+            f"the tank's {supply.tank:g} Pa, so that it would never close"
+            f"{meant('relief', cylinder.relief) or ', give a higher one'}",
         )

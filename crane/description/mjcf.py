@@ -114,6 +114,7 @@ class _Reader:
             tip=self._tip(tree),
             couplings=couplings,
             where=tree.where | places,
+            motors=active or (),
         )
 
     def _name(self, kind: str, index: int) -> str:

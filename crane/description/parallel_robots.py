@@ -75,6 +75,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
         tree=tree.robot,
         loops=loops,
         active=motors,
+        motors=motors,
         friction=urdf.friction,
         tip=tree.only_leaf(),
         couplings=urdf.couplings,

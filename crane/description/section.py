@@ -87,11 +87,12 @@ class Section:
         line: Its line, if not the mapping's own.
 
     Attributes:
+        title: See above.
         complete: Whether no item of its lists had to be left out.
     """
 
     def __init__(self, data: _Map, title: str, file: Path, line: int | None = None):
-        self._data, self._title, self._file = data, title, file
+        self._data, self.title, self._file = data, title, file
         self.complete = True
         self._line = data.line if line is None else line
 
@@ -148,7 +149,7 @@ class Section:
             near = get_close_matches(key, keys, 1, 0.75)
             near = near or [known for known in keys if known.lower() == key.lower()]
             meant = bool(near) and near[0] not in self._data
-            problem = f"unknown key '{key}' in {self._title}, {known(keys, key)}"
+            problem = f"unknown key '{key}' in {self.title}, {known(keys, key)}"
             note(self.fail(key, problem), harmless=True)
             if meant:
                 self._data[near[0]] = self._data[key]
@@ -166,9 +167,9 @@ class Section:
     def _take(self, key: str, default: Any) -> Any:
         value = self._data.get(key, default)
         if value is _MISSING:
-            raise self.fail(None, f"{self._title} has no '{key}', add it")
+            raise self.fail(None, f"{self.title} has no '{key}', add it")
         if value is None and default is not None:
-            raise self.fail(key, f"'{key}' of {self._title} is empty, give its value")
+            raise self.fail(key, f"'{key}' of {self.title} is empty, give its value")
         return value
 
     @overload
@@ -189,10 +190,10 @@ class Section:
             return value
         if not isinstance(value, str) or not value.strip():
             raise self.fail(
-                key, f"'{key}' of {self._title} is {_shown(value)}, give text (or quote it)"
+                key, f"'{key}' of {self.title} is {_shown(value)}, give text (or quote it)"
             )
         if not "".join(value.split()).isprintable():
-            raise self.fail(key, f"'{key}' of {self._title} holds control characters, remove them")
+            raise self.fail(key, f"'{key}' of {self.title} holds control characters, remove them")
         return value
 
     def number(self, key: str, default: float = _MISSING, minimum: float = -math.inf) -> float:
@@ -201,7 +202,7 @@ class Section:
             number = self._number(key, self._take(key, default))
             if number < minimum:
                 raise self.fail(
-                    key, f"'{key}' of {self._title} is {number:g}, give at least {minimum:g}"
+                    key, f"'{key}' of {self.title} is {number:g}, give at least {minimum:g}"
                 )
             return number
         except DescriptionError as error:
@@ -222,16 +223,14 @@ class Section:
                 return number
             if isinstance(value, float):
                 hint = "give a finite number"
-        raise self.fail(key, f"'{key}' of {self._title} is {_shown(value)}, {hint}")
+        raise self.fail(key, f"'{key}' of {self.title} is {_shown(value)}, {hint}")
 
     def numbers(self, key: str, default: Any = _MISSING) -> tuple[float, ...]:
         """A list of finite numbers."""
         value = self._take(key, default)
         if not isinstance(value, list | tuple) or not value:
             shown = "empty" if value == [] else _shown(value)
-            raise self.fail(
-                key, f"'{key}' of {self._title} is {shown}, give a list such as [0, 1]"
-            )
+            raise self.fail(key, f"'{key}' of {self.title} is {shown}, give a list such as [0, 1]")
         return tuple(self._number(key, item) for item in value)
 
     def names(self, key: str) -> tuple[str, ...]:
@@ -239,7 +238,7 @@ class Section:
         value = self._take(key, _MISSING)
         if not isinstance(value, list):
             raise self.fail(
-                key, f"'{key}' of {self._title} is {_shown(value)}, give a list such as [q1, q2]"
+                key, f"'{key}' of {self.title} is {_shown(value)}, give a list such as [q1, q2]"
             )
         for item in value:
             if not isinstance(item, str):
@@ -255,7 +254,7 @@ class Section:
         value = self._take(key, _MISSING)
         if not isinstance(value, list):
             raise self.fail(
-                key, f"'{key}' of {self._title} is {_shown(value)}, give a list such as [a, b]"
+                key, f"'{key}' of {self.title} is {_shown(value)}, give a list such as [a, b]"
             )
         for item in value:
             if not isinstance(item, str) or not item.isprintable():
@@ -267,7 +266,7 @@ class Section:
         value = self._take(key, _MISSING)
         if not isinstance(value, list):
             raise self.fail(
-                key, f"'{key}' of {self._title} is {_shown(value)}, give a list of pairs [[a, b]]"
+                key, f"'{key}' of {self.title} is {_shown(value)}, give a list of pairs [[a, b]]"
             )
         for item in value:
             if not (isinstance(item, list) and len(item) == 2):
@@ -285,13 +284,13 @@ class Section:
         path = self._file.parent / text
         try:
             if path.is_dir():
-                raise self.fail(key, f"'{text}' of {self._title} is a folder, give a file")
+                raise self.fail(key, f"'{text}' of {self.title} is a folder, give a file")
             found = path.is_file()
         except OSError:  # a name longer than any file's
             found = False
         if not found:
             raise self.fail(
-                key, f"{self._title}: there is no file '{text}', give its path from this folder"
+                key, f"{self.title}: there is no file '{text}', give its path from this folder"
             )
         return path.resolve()
 

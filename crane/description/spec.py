@@ -269,3 +269,4 @@ class MachineSpec:
     couplings: tuple[Coupling, ...] = ()
     where: Mapping[str, str] = field(default_factory=dict)  # section -> "file:line"
     payload: Chain | None = None  # what payload.mass hangs on the tip; None: a point mass
+    motors: tuple[str, ...] = ()  # joints that the format itself says motors drive

@@ -64,6 +64,7 @@ def load(
         control=MappingProxyType(dict(spec.control)),
         hydraulics=spec.hydraulics,
         changes=MappingProxyType({name: float(value) for name, value in (changes or {}).items()}),
+        motors=spec.motors,
         locks=MappingProxyType({name: float(value) for name, value in (lock or {}).items()}),
     )
 

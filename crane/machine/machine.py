@@ -72,6 +72,7 @@ class Machine:
         tasks: Named reference motions.
         control: PI gains by active joint.
         hydraulics: The circuit that drives it, None for a machine without.
+        motors: Joints that the format of its file says motors drive (actuators of a MJCF).
         changes: Numbers that are not those of its files, by name.
         locks: Where joints are held that its files let move, by name [m], [rad].
     """
@@ -93,6 +94,7 @@ class Machine:
     tasks: Mapping[str, Task]
     control: Mapping[str, PIGains]
     hydraulics: Hydraulics | None
+    motors: tuple[str, ...]
     changes: Mapping[str, float]
     locks: Mapping[str, float]
 
@@ -111,6 +113,26 @@ class Machine:
     def home(self) -> Array:
         """(nq,) the home posture, closed."""
         return self.closure.home
+
+    @property
+    def undriven(self) -> tuple[str, ...]:
+        """Active joints that nothing is said to drive.
+
+        A joint is driven that has an `effort` above 0 in the `<limit>` of its URDF, a cylinder,
+        gains under `control`, or a motor by its file's format. All others are active because the
+        machine has their freedom: a grapple that swings.
+        """
+        driven = {
+            *self.motors,
+            *self.control,
+            *(self.hydraulics.joints if self.hydraulics else ()),
+        }
+        efforts = self.model.effortLimit[self.closure.active]
+        return tuple(
+            joint
+            for joint, effort in zip(self.active, efforts, strict=True)
+            if joint not in driven and not (np.isfinite(effort) and effort > 0)
+        )
 
     @property
     def reference(self) -> str:

@@ -8,11 +8,18 @@ import numpy as np
 
 from crane.control import PI, Traced
 from crane.dynamics import Dynamics
-from crane.errors import CraneError, CraneWarning, InputError, known
-from crane.integration import CompiledStepper, PythonStepper
+from crane.errors import (
+    ClosureError,
+    CraneError,
+    CraneWarning,
+    InputError,
+    SimulationError,
+    known,
+)
+from crane.integration import CompiledStepper, HaltedError, PythonStepper, explained
 from crane.kinematics import Kinematics
 from crane.machine import Machine, load
-from crane.paths import Path
+from crane.paths import Path, beyond_limits
 from crane.recording import FORCE_UNITS, VELOCITY_UNITS, Recording
 from crane.rig.plant import Tolerances, drawn
 from crane.rig.sensors import Sensors, default_sensors
@@ -145,6 +152,8 @@ class Rig:
                 f"the path is of {reference.shape[1]} joints, '{machine.name}' has {n}"
             )
         plant.check_limits(reference[0], "the start of the path")
+        if text := beyond_limits(machine, path):
+            warnings.warn(text, CraneWarning, stacklevel=2)
         for closure in (machine.closure, plant.closure):
             # what was solved before shows in the last bits of what is solved next: start afresh
             closure.solve(closure.home[closure.active], guess=closure.home)
@@ -220,8 +229,12 @@ class Rig:
                     done += fast.run(times[done:], state, h, rows)
                 if done < substeps:
                     # machine code stops where a step needs a closer look
-                    rate, _ = slow.observe(times[done], state)
-                    state[:] = slow.advance(times[done], state, rate, h)
+                    try:
+                        rate, _ = slow.observe(times[done], state)
+                        state[:] = slow.advance(times[done], state, rate, h)
+                    except HaltedError as halt:
+                        before = step * np.arange(k + 1.0), states[: k + 1, :nq][:, active]
+                        raise explained(plant, halt, *before, path) from None
                     done += 1
         return measured, command, force, states[:, :nq], states[:, nq:]
 
@@ -277,7 +290,13 @@ def _substeps(dynamics: Dynamics, reference: Array, step: float) -> int:
     for joint, f in machine.friction.items():
         rest = f.coulomb + f.stiction
         slopes[machine.column(joint)] = f.viscous + (rest / f.smoothing if rest else 0.0)
-    for q in machine.closure.solve(reference[:: max(1, len(reference) // 100)]):
+    # the plant goes no farther than its limits, wherever its reference is
+    within = np.clip(reference[:: max(1, len(reference) // 100)], machine.lower, machine.upper)
+    try:
+        postures = machine.closure.solve(within)
+    except ClosureError as error:
+        raise SimulationError(f"the path leads where the loops do not close: {error}") from None
+    for q in postures:
         gamma = machine.closure.gamma(q)
         damping = gamma.T @ (slopes[:, None] * gamma)
         mass = dynamics.mass_matrix(q[machine.closure.active])

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable
-from contextlib import suppress
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,30 +13,21 @@ from crane.control import (
     Free,
     Signals,
     StiffController,
-    TracedController,
     ValveDrive,
 )
 from crane.dynamics import Dynamics
 from crane.errors import ClosureError, CraneWarning, InputError, SimulationError, known
-from crane.integration import (
-    ADAPTIVE,
-    CompiledStepper,
-    PythonStepper,
-    StiffStepper,
-    integrate_adaptively,
-)
+from crane.integration import ADAPTIVE, integrate_adaptively
 from crane.machine import Machine
-from crane.paths import Path
+from crane.paths import Path, beyond_limits
 from crane.recording import Recording
 from crane.samples import Array, as_number, as_sample
 from crane.simulation.recorded import ENERGIES, imbalance, recorded
-from crane.straight import TooLongError
+from crane.simulation.steps import Progress, integrate, integrate_stiff
 
 _MOST = 4_000_000  # steps of one recording
-_CHUNK = 1000  # steps between reports of progress
 
 Force = Callable[[float, Array, Array], Array]
-Progress = Callable[[float], None]
 
 
 def simulate(
@@ -88,11 +78,20 @@ def simulate(
     Raises:
         InputError: Arguments of wrong shape or value.
         LimitError: The start lies outside of the limits.
-        SimulationError: The machine reached a posture it cannot go on from.
+        SimulationError: The machine cannot go on: the loops do not close any more, or the motion
+            explodes. Names the time, and the joint beyond its limit or a step that is short
+            enough.
+
+    A reference that leaves the limits of a joint is a warning before the first step: with an end
+    stop it can be meant.
     """
     if not (isinstance(task, str) and task.isprintable()):
         raise InputError(f"task {task!r} is not one line of text")
     control = _as_controller(controller, machine)
+    if control.path is not None:
+        until = np.inf if duration is None else as_number(duration, "the duration", "s", above=0)
+        if text := beyond_limits(machine, control.path, until):
+            warnings.warn(text, CraneWarning, stacklevel=2)
     dynamics = Dynamics(machine, formulation, path)
     _, states, seen = trajectory(dynamics, control, initial, duration, step, method, progress)
     # the energies are integrated with the motion, so they tell when the step is too long
@@ -126,9 +125,11 @@ def trajectory(
         duration = control.path.duration
     steps = _count(duration, step)
     q_a, v_a = _start(machine, initial, control.path)
-    state = np.concatenate(
-        [machine.closure.solve(q_a), v_a, control.start(q_a), np.zeros(ENERGIES)]
-    )
+    try:
+        posture, own = machine.closure.solve(q_a), control.start(q_a)
+    except ClosureError as error:
+        raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
+    state = np.concatenate([posture, v_a, own, np.zeros(ENERGIES)])
     if method is None:
         method = "rosenbrock" if isinstance(control, StiffController) else "rk4"
     if method != "rosenbrock" and isinstance(control, StiffController) and control.period:
@@ -136,123 +137,15 @@ def trajectory(
             f"method '{method}' does not call the valves' program, leave the method out"
         )
     if method == "rosenbrock" and isinstance(control, StiffController):
-        rows = _integrate_stiff(dynamics, control, state, steps, step, progress)
+        rows = integrate_stiff(dynamics, control, state, steps, step, progress)
     elif method == "rk4":
-        rows = _integrate(dynamics, control, state, steps, step, progress)
+        rows = integrate(dynamics, control, state, steps, step, progress)
     elif method in ADAPTIVE:
         rows = integrate_adaptively(dynamics, control, state, steps, step, method, progress)
     else:
         raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")
     times = step * np.arange(steps + 1, dtype=np.float64)
     return times, rows[:, : len(state)], rows[:, len(state) :]
-
-
-def _integrate(
-    dynamics: Dynamics,
-    control: Controller,
-    state: Array,
-    steps: int,
-    step: float,
-    progress: Progress | None,
-) -> Array:
-    """States and observations [tau, friction, kinetic, potential] at all instants."""
-    n = len(dynamics.machine.active)
-    size, times = len(state), step * np.arange(steps + 1, dtype=np.float64)
-    width = 2 * n + ENERGIES + len(getattr(control, "channels", ()))
-    rows = np.empty((steps + 1, size + width))
-    slow = PythonStepper(dynamics, control)
-    fast = None
-    if (
-        dynamics.path == "compiled"
-        and isinstance(control, TracedController)
-        and not isinstance(control, StiffController)
-    ):
-        try:
-            own = size - dynamics.machine.model.nq - n - ENERGIES
-            fast = CompiledStepper(dynamics, control, own)
-        except TooLongError:
-            fast = None
-    done = 0
-    while done < steps:
-        stopped = True
-        if fast is not None:
-            chunk = times[done : min(done + _CHUNK, steps)]
-            count = fast.run(chunk, state, step, rows[done:])
-            done, stopped = done + count, count < len(chunk)
-        if stopped:
-            # machine code stops where a step needs a closer look: it succeeds here or says why
-            rate, seen = slow.observe(times[done], state)
-            rows[done] = [*state, *seen]
-            state = slow.advance(times[done], state, rate, step)
-            done += 1
-        if progress is not None:
-            progress(done / (steps + 1))
-    _, seen = slow.observe(times[steps], state)
-    rows[steps] = [*state, *seen]
-    if progress is not None:
-        progress(1.0)
-    return rows
-
-
-def _integrate_stiff(
-    dynamics: Dynamics,
-    control: StiffController,
-    state: Array,
-    steps: int,
-    step: float,
-    progress: Progress | None,
-) -> Array:
-    """As `_integrate`, for a controller whose own states are stiff."""
-    period = round(control.period / step) if control.period else 0
-    if control.period and abs(period * step - control.period) > 1e-9 * control.period:
-        raise InputError(
-            f"the period {control.period:g} s of the valves' program is no whole number of steps "
-            f"of {step:g} s, change one"
-        )
-    fast = None
-    if dynamics.path == "compiled":
-        with suppress(TooLongError):
-            fast = StiffStepper(dynamics, control)
-    if fast is None:
-        if period:
-            raise InputError("a program with a period runs on the compiled path alone")
-        return integrate_adaptively(dynamics, control, state, steps, step, "BDF", progress)
-    times = step * np.arange(steps + 1, dtype=np.float64)
-    rows = np.empty((steps + 1, len(state) + fast.seen))
-    nq, n = dynamics.machine.model.nq, len(dynamics.machine.active)
-    done = 0
-    while done < steps:
-        if period:
-            control.update(times[done], state[:nq], state[nq : nq + n], state[nq + n : -2])
-        chunk = times[done : min(done + (period or _CHUNK), steps)]
-        count = fast.run(chunk, state, step, rows[done:])
-        if count < len(chunk):
-            raise _stopped(dynamics, times[done + count], state)
-        done += count
-        if progress is not None:
-            progress(done / (steps + 1))
-    slow = PythonStepper(dynamics, control)
-    rows[steps] = [*state, *slow.observe(times[steps], state)[1]]
-    if progress is not None:
-        progress(1.0)
-    return rows
-
-
-def _stopped(dynamics: Dynamics, time: float, state: Array) -> SimulationError:
-    """Why the machine cannot go on from a state."""
-    machine = dynamics.machine
-    nq, n = machine.model.nq, len(machine.active)
-    speed = np.abs(state[nq : nq + n]).max()
-    # as far as it would have come
-    q = state[:nq][machine.closure.active] + 1e-3 * state[nq : nq + n]
-    try:
-        machine.closure.solve(q, guess=state[:nq])
-    except ClosureError as error:
-        return SimulationError(f"at t = {time:.6g} s: {error}")
-    return SimulationError(
-        f"at t = {time:.6g} s the motion cannot be followed, the fastest joint moves at "
-        f"{speed:.3g} m/s or rad/s: give its end stops damping, or smooth the friction more"
-    )
 
 
 def _as_controller(

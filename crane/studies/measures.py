@@ -13,11 +13,18 @@ from crane.machine import Machine
 from crane.paths import task_path
 from crane.recording import FORCE_UNITS
 from crane.samples import Array
+from crane.workspaces.extremes import farthest
+from crane.workspaces.section import upwards
 
 _RATE = 200  # samples per second of a task
 _CELLS = 1000  # postures of the grid over the strokes that move passive joints
 _POSTURES = 5000  # with those of the other strokes
 _STEPS = 16  # from one of the grid to the next
+_DRAWN = 8  # postures at which a stroke is seen to move the tip
+_MOVES = 1e-9  # slope of the tip that it does so by [m/m], [m/rad]
+_STARTS = 12  # postures of the grid from which the farthest reach is sought
+_FEW = 4  # the same for the end of a stroke
+_APART = 0.2  # of the strokes, between two of them
 
 
 def task_measures(machine: Machine) -> dict[str, str]:
@@ -84,35 +91,58 @@ def together(tasks: Sequence[tuple[float, dict[str, float]]]) -> dict[str, float
 
 
 def of_strokes(machine: Machine) -> dict[str, float]:
-    """Where the strokes can go from home with the loops closed, on a grid over the limits.
+    """Where the strokes can go from home with the loops closed, within the limits.
 
-    range is the share of the grid that closes, lower and upper are the ends of each stroke there,
-    reach is the largest horizontal distance of the tip from the world's origin.
+    A grid over the limits finds where, and the extremes of it are improved until they are exact,
+    see `farthest`: lower and upper are the ends of each stroke, reach is the largest horizontal
+    distance of the tip from the world's origin. range is the share of the grid that closes, and as
+    fine as that.
     """
     home = machine.home[machine.closure.active]
-    gamma = machine.closure.gamma(machine.home)
-    coupled = np.abs(gamma[machine.closure.passive]).max(axis=0, initial=0.0) > 0
+    coupled = _coupled(machine)
     low, high = _ends(machine, home)
-    count = max(3, int(_CELLS ** (1 / max(1, coupled.sum()))))
+    count = _values(coupled)
     axes = [
         np.linspace(a, b, count) if moves else np.array([at])
         for a, b, at, moves in zip(low, high, home, coupled, strict=True)
     ]
     postures = _closed(machine, axes)
-    q_a = postures[:, machine.closure.active]
     found = {"range": len(postures) / int(np.prod([len(axis) for axis in axes]))}
     if not len(postures):
         return found
+    strokes = np.flatnonzero(coupled)
     for i, joint in enumerate(machine.active):
-        found[f"lower_{joint}"] = float(q_a[:, i].min() if coupled[i] else low[i])
-        found[f"upper_{joint}"] = float(q_a[:, i].max() if coupled[i] else high[i])
+        found[f"lower_{joint}"], found[f"upper_{joint}"] = float(low[i]), float(high[i])
+        if coupled[i]:
+            for name, sign in (("lower", -1.0), ("upper", 1.0)):
+                found[f"{name}_{joint}"] = _end(machine, postures, strokes, (low, high), i, sign)
     if machine.tip is not None:
-        free = np.flatnonzero(~coupled)
-        each = max(2, int((_POSTURES / len(postures)) ** (1 / max(1, len(free)))))
-        found["reach"] = _reach(
-            machine, postures, free, [np.linspace(low[i], high[i], each) for i in free]
-        )
+        found["reach"] = _reach(machine, postures, coupled, (low, high))
     return found
+
+
+def notes(machine: Machine, measures: Sequence[str]) -> tuple[str, ...]:
+    """How fine measures are that are not exact, a line each."""
+    found = []
+    if any(name in task_measures(machine) for name in measures):
+        found.append(f"forces are taken every {1e3 / _RATE:g} ms of a task")
+    if "range" in measures:
+        coupled = _coupled(machine)
+        count = int(coupled.sum())
+        strokes = f"{count} stroke{'s' * (count != 1)}"
+        found.append(f"range is counted on {_values(coupled)} values of each of {strokes}")
+    return tuple(found)
+
+
+def _coupled(machine: Machine) -> NDArray[np.bool_]:
+    """Which active joints (n,) move passive ones."""
+    gamma = machine.closure.gamma(machine.home)[machine.closure.passive]
+    return np.asarray(np.abs(gamma).max(axis=0, initial=0.0) > 0)
+
+
+def _values(coupled: NDArray[np.bool_]) -> int:
+    """How many values of each stroke the grid has."""
+    return max(3, int(_CELLS ** (1 / max(1, int(coupled.sum()))) + 1e-9))
 
 
 def _ends(machine: Machine, home: Array) -> tuple[Array, Array]:
@@ -169,17 +199,71 @@ def _beside(machine: Machine, q: Array, target: Array) -> Array | None:
         return None
 
 
-def _reach(machine: Machine, postures: Array, free: NDArray[np.intp], axes: list[Array]) -> float:
-    """Largest horizontal distance of the tip over postures and coordinates that move no loop."""
-    kinematics = Kinematics(machine)
-    gravity = machine.model.gravity.linear
-    length = float(np.linalg.norm(gravity))
-    up = -gravity / length if length > 0 else np.zeros(3)
-    columns, most = machine.closure.active[free], 0.0
-    for posture in postures:
-        q = posture.copy()
-        for values in itertools.product(*axes):
-            q[columns] = values
-            tip = kinematics.position_at(q)
-            most = max(most, float(np.linalg.norm(tip - up * (up @ tip))))
-    return most
+def _end(
+    machine: Machine,
+    postures: Array,
+    strokes: NDArray[np.intp],
+    ends: tuple[Array, Array],
+    i: int,
+    sign: float,
+) -> float:
+    """How far one stroke goes up (sign 1) or down (-1), from the closed postures of the grid."""
+    column = machine.closure.active[i]
+    limit = float(ends[int(sign > 0)][i])
+    values = sign * postures[:, column]
+    if (values >= sign * limit).any():
+        return limit
+    slope = np.zeros(machine.model.nv)
+    slope[column] = sign
+
+    def goal(q: Array) -> tuple[float, Array]:
+        return sign * float(q[column]), slope
+
+    q_a = postures[:, machine.closure.active]
+    starts = postures[_apart(values, _shares(q_a, ends))[:_FEW]]
+    return sign * max(farthest(machine, q, strokes.tolist(), ends, goal)[0] for q in starts)
+
+
+def _reach(
+    machine: Machine, postures: Array, coupled: NDArray[np.bool_], ends: tuple[Array, Array]
+) -> float:
+    """Largest horizontal distance of the tip, over all strokes."""
+    kinematics, up = Kinematics(machine), upwards(machine)
+    active = machine.closure.active
+
+    def goal(q: Array) -> tuple[float, Array]:
+        tip = kinematics.position_at(q)
+        away = tip - up * (up @ tip)
+        length = float(np.linalg.norm(away))
+        return length, (away / (length or 1.0)) @ kinematics.tree_jacobian(q)
+
+    random = np.random.default_rng(0)
+    drawn = postures[random.integers(len(postures), size=_DRAWN)]
+    drawn[:, active[~coupled]] = random.uniform(*ends, (_DRAWN, len(active)))[:, ~coupled]
+    moves = np.abs([goal(q)[1][active] for q in drawn]).max(axis=0) > _MOVES
+    free = np.flatnonzero(~coupled & moves)
+    each = max(2, int((_POSTURES / len(postures)) ** (1 / max(1, len(free)))))
+    turns = np.array(
+        list(itertools.product(*(np.linspace(ends[0][i], ends[1][i], each) for i in free)))
+    )
+    every = np.repeat(postures, len(turns), axis=0)
+    every[:, active[free]] = np.tile(turns, (len(postures), 1))
+    strokes = np.flatnonzero(coupled | moves)
+    places = _shares(every[:, active], ends)[:, strokes]
+    starts = every[_apart(np.array([goal(q)[0] for q in every]), places)]
+    return max(farthest(machine, q, strokes.tolist(), ends, goal)[0] for q in starts)
+
+
+def _shares(q_a: Array, ends: tuple[Array, Array]) -> Array:
+    """Active coordinates (N, n) as shares of the way between their ends."""
+    return (q_a - ends[0]) / (ends[1] - ends[0])
+
+
+def _apart(values: Array, places: Array) -> list[int]:
+    """Indices of the largest values (N,) whose places (N, n) are not beside each other."""
+    left = np.argsort(-values, kind="stable")
+    chosen: list[int] = []
+    while len(left) and len(chosen) < _STARTS:
+        chosen.append(int(left[0]))
+        left = left[np.abs(places[left] - places[left[0]]).max(axis=1) > _APART]
+    return chosen

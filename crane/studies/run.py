@@ -19,7 +19,14 @@ from crane.dynamics import Dynamics
 from crane.errors import CraneError, CraneWarning, InputError, at, known
 from crane.machine import Machine, load
 from crane.samples import Array, as_count, as_samples, as_seed
-from crane.studies.measures import of_strokes, of_task, stroke_measures, task_measures, together
+from crane.studies.measures import (
+    notes,
+    of_strokes,
+    of_task,
+    stroke_measures,
+    task_measures,
+    together,
+)
 from crane.studies.table import Study
 
 _MOST = 100_000  # variants
@@ -120,7 +127,9 @@ def study(
     reasons = tuple(rows[i][1] for i in range(len(jobs)))
     if all(reasons):
         raise InputError(f"none of {len(jobs)} variants can be measured, the first: {reasons[0]}")
-    return Study(name, tuple(vary), measures, tasks, units, columns, reasons, grid)
+    return Study(
+        name, tuple(vary), measures, tasks, units, columns, reasons, grid, notes(base, measures)
+    )
 
 
 def variant(job: Job) -> tuple[dict[str, float], str]:

@@ -28,6 +28,7 @@ class Study:
             TASK" for each of them. NaN where a variant could not be measured. SI units.
         reasons: Why a variant could not be measured, or "".
         grid: Numbers of values of the parameters, whose last one varies fastest; () if drawn.
+        notes: How fine measures are that are not exact.
     """
 
     machine: str
@@ -38,6 +39,7 @@ class Study:
     columns: Mapping[str, Array]
     reasons: tuple[str, ...]
     grid: tuple[int, ...]
+    notes: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """What varies, and what is measured."""
@@ -94,6 +96,7 @@ class Study:
         header = [f"{name} [{self.units[name] or '1'}]" for name in self.columns]
         with replacing(path) as part, part.open("w", newline="", encoding="utf-8") as file:
             file.write(f"# machine: {self.machine}\n")
+            file.writelines(f"# note: {note}\n" for note in self.notes)
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow([*header, "reason"])
             for row in self.rows:
@@ -117,4 +120,4 @@ class Study:
         summary = f"{len(self)} variants, best {self.measures[0]} first"
         if failed:
             summary += f"; {len(failed)} cannot be measured, the first: {failed[0]}"
-        return "\n".join([*(text if order else []), summary])
+        return "\n".join([*(text if order else []), summary, *self.notes])

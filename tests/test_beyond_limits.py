@@ -1,0 +1,178 @@
+"""References and motions beyond the limits of a joint: told before, and named where a run ends."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import crane
+from crane.control import Sampled, ValvePD
+from crane.errors import ClosureError, CraneWarning, InputError, LimitError, SimulationError
+from crane.paths import beyond_limits, polynomial
+from crane.rig import Rig
+
+TOLD = "the reference of 'X1' goes to 0.06 m at t = 0.1 s, beyond its limit 0.03 m: "
+NAMED = r"^at t = 0\.0\d+ s[: ].*; 'X1' is at 0\.04\d+ m, beyond its limit 0\.03 m"
+
+
+@pytest.fixture(scope="module")
+def free(mini):
+    """Where nothing stops X1: its loops close up to 0.0461 m, its limit is 0.03 m."""
+    return mini.replace(end_stops=())
+
+
+def to(end, duration=0.1):
+    return crane.point_to_point([0.0, 0.029, 0.0108], [0.0, end, 0.0108], duration)
+
+
+class InPython:
+    """A controller without formulas."""
+
+    def __init__(self, control):
+        self._control, self.path, self.start = control, control.path, control.start
+
+    def __call__(self, *arguments):
+        return self._control(*arguments)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [{}, {"path": "pinocchio"}, {"method": "RK45"}, {"method": "Radau"}, {"method": "LSODA"}],
+)
+@pytest.mark.parametrize("python", [False, True])
+def test_a_run_beyond_the_limits_is_told_before_and_named_after(free, how, python):
+    """By computed torque, on every path and by every method: no error of the closure itself."""
+    control = crane.ComputedTorque(free, to(0.06))
+    with warnings.catch_warnings(record=True) as caught, pytest.raises(SimulationError) as error:
+        warnings.simplefilter("always", CraneWarning)
+        crane.simulate(free, InPython(control) if python else control, step=2e-3, **how)
+    assert [str(one.message) for one in caught] == [TOLD + "keep it within, or widen the limits"]
+    text = str(error.value)
+    assert not isinstance(error.value, ClosureError) and "\n" not in text
+    assert "shorten the step" not in text
+    with pytest.raises(SimulationError, match=NAMED):
+        raise error.value
+    assert "within the limits, or give it an end stop" in text
+    if "method" not in how:
+        since = float(text.split("since t = ")[1].split(" s")[0])
+        # the reference passes the limit then
+        assert to(0.06).position(since)[1] == pytest.approx(0.03, abs=2e-3)
+        assert to(0.06).position(since - 4e-3)[1] < 0.03
+
+
+def test_pushed_beyond_the_limits_without_a_reference(free):
+    with pytest.raises(
+        SimulationError, match=r"'X1' is at 0\.046\d* m, .* since t = 0\.0\d+ s: give"
+    ):
+        crane.simulate(
+            free.replace(friction={}), lambda t, q, v: np.array([0.0, 200.0, 0.0]), duration=2.0
+        )
+
+
+@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+def test_a_step_that_is_too_long_is_told_with_one_that_is_not(mini):
+    path = crane.task_path(mini, "lift")
+    with pytest.raises(SimulationError, match=r"with a step of 0\.0025 s it goes on: shorten"):
+        crane.simulate(mini, crane.PI(mini, path), duration=0.5, step=5e-3)
+    crane.simulate(mini, crane.PI(mini, path), duration=0.5, step=2.5e-3)
+
+
+def test_an_end_stop_holds_what_the_reference_asks_for(mini):
+    """Told, and simulated: pressing against a stop can be meant."""
+    with pytest.warns(CraneWarning, match=TOLD):
+        recording = crane.simulate(mini, crane.PI(mini, to(0.06)), duration=0.3)
+    assert 0.03 < recording.q[:, 1].max() < 0.034
+
+
+def test_only_what_is_simulated_of_a_path_counts(mini):
+    path = to(0.06, 2.0)
+    assert not beyond_limits(mini, path, 0.1) and beyond_limits(mini, path, 2.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CraneWarning)
+        crane.simulate(mini, crane.PI(mini, path), duration=0.1)
+
+
+def test_short_excursions_are_found(mini):
+    """Of 6 ms and 10 um, where the velocity is zero: x = top - (t - 0.1234)^2."""
+
+    def peak(top):
+        return polynomial([[0.0], [top - 0.1234**2, 2 * 0.1234, -1.0], [0.0108]], 0.25)
+
+    assert "'X1' goes to 0.03001 m at t = 0.1234 s" in beyond_limits(mini, peak(0.03001))
+    assert not beyond_limits(mini, peak(0.03))
+
+
+def test_a_task_beyond_the_limits_is_an_error(tmp_path):
+    (tmp_path / "arm.urdf").write_text(
+        '<robot name="arm"><link name="base"/><link name="arm"><inertial><mass value="1"/>'
+        '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>'
+        '<joint name="q" type="revolute"><parent link="base"/><child link="arm"/>'
+        '<limit lower="-1" upper="1.12" effort="9" velocity="9"/></joint></robot>'
+    )
+    (tmp_path / "arm.yaml").write_text(
+        "name: arm\nchains: [{name: arm, urdf: arm.urdf}]\nactive: [q]\n"
+        "tasks:\n  far: {duration: 2, active: {q: [0, 0.65]}}\n"
+    )
+    machine = crane.load(tmp_path / "arm.yaml")
+    line = "task 'far': the reference of 'q' goes to 1.3 rad at t = 2 s, beyond its limit 1.12 rad"
+    with pytest.raises(LimitError, match=line):
+        crane.task_path(machine, "far")
+    with pytest.raises(InputError, match="none of 1 variants .* goes to 1.3 rad at t = 2 s"):
+        crane.study(tmp_path / "arm.yaml", {"arm.mass": [2.0]}, ["far"], ["peak_q"])
+
+
+def test_batches_say_it_of_each(mini, free):
+    found = crane.simulate_batch(
+        [free, mini], lambda m: crane.PI(m, to(0.06)), duration=0.2, step=1e-3
+    )
+    assert all(TOLD in text for text in found.warnings.values())
+    assert set(found.warnings) | set(found.failures) == {0, 1}
+    assert all("beyond its limit 0.03 m" in text for text in found.failures.values())
+    inside = crane.simulate_batch([mini], lambda m: crane.PI(m, to(0.028)), duration=0.05)
+    assert not inside.failures and TOLD not in inside.warnings.get(0, "")
+
+
+def test_the_rig_says_it_too(free):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        rig = Rig(free, 1)
+    told = "'X1' goes to 0.06 m at t = 2 s"
+    with pytest.warns(CraneWarning, match=told), pytest.raises(SimulationError) as error:
+        rig.run(to(0.06, 2.0))
+    assert "beyond its limit 0.03 m" in str(error.value)
+
+
+@pytest.fixture(scope="module")
+def unstopped():
+    machine = crane.load("patu655")
+    return machine.replace(end_stops=())
+
+
+@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+def test_a_rod_far_beyond_its_limit_is_named(unstopped):
+    """Valves push X_lift past its end, where its chamber has no volume left."""
+    start = unstopped.home[unstopped.closure.active]
+    start[1] = 0.5
+    end = start.copy()
+    end[1] = 0.9
+    path = crane.point_to_point(start, end, 2.0)
+    with pytest.raises(SimulationError, match=r"'X_lift' is at 0\.\d+ m, beyond its limit 0\.535"):
+        crane.simulate(unstopped, ValvePD(unstopped, path), duration=8.0, step=2e-3)
+
+
+@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+def test_programs_that_ask_where_no_posture_is(unstopped):
+    """A program of the valves that closes the loops ahead of the machine."""
+
+    def ahead(time, q_a, v_a, pressures):
+        unstopped.closure.solve(q_a + [0, 0.5 * (time > 0.05), 0, 0])
+        return [5.8] * 4
+
+    with pytest.raises(SimulationError, match=r"at t = 0\.06 s: loop 'lift_eye' cannot be closed"):
+        crane.simulate(unstopped, Sampled(ahead, unstopped), duration=0.2)
+
+
+def test_a_start_that_does_not_close_is_a_simulation_error():
+    machine = crane.load("mini_forwarder", {"link3_G.x": 0.11, "link3_G.y": -0.01})
+    with pytest.raises(SimulationError, match=r"^at t = 0 s, where the motion starts: loop 'A2_"):
+        crane.simulate(machine, None, [0.0, 0.015, 0.005], 0.1)
