@@ -146,6 +146,9 @@ def test_recordings_of_simulations_serve(mini):
     assert result.training.stacked < 5e-3
 
 
+PRIOR = "the prior's relative standard deviation"
+
+
 def test_what_cannot_be_identified(mini):
     given = motion(mini)
     recording = crane.Recording(
@@ -155,11 +158,19 @@ def test_what_cannot_be_identified(mini):
     other = crane.load("ur5_robot")
     for call, kind, message in (
         (lambda: identify(mini, given, method="lsq"), InputError, "method 'lsq' is unknown"),
-        (lambda: identify(mini, given, prior=0.0), InputError, "the prior's relative standard"),
-        (lambda: identify(mini, given, prior=1e-300), InputError, "a number above 1e-07"),
-        (lambda: identify(mini, given, prior=1e300), InputError, "from 1e-07 to 1e.06"),
+        (
+            lambda: identify(mini, given, prior=0.0),
+            InputError,
+            f"{PRIOR} is 0.0, give a number above",
+        ),
+        (lambda: identify(mini, given, prior=1e-300), InputError, f"{PRIOR} is 1e-300, give"),
+        (lambda: identify(mini, given, prior=1e300), InputError, f"{PRIOR} is 1e+300, give"),
         (lambda: identify(mini, given, bandwidth=np.nan), InputError, "the bandwidth is nan Hz"),
-        (lambda: identify(mini, given, slow={"X1": -1.0}), InputError, "it must not be negative"),
+        (
+            lambda: identify(mini, given, slow={"X1": -1.0}),
+            InputError,
+            "slow of 'X1' is -1, it must",
+        ),
         (lambda: identify(other, recording), RecordingError, "'shoulder_pan_joint', 'sho"),
         (
             lambda: identify(mini, given, feasible=True, terms=[friction(mini, "X1")]),
@@ -179,8 +190,9 @@ def test_what_cannot_be_identified(mini):
             "'q1_force' is 0.001 times the model's, it looks like kN",
         ),
     ):
-        with pytest.raises(kind, match=message):
+        with pytest.raises(kind) as caught:
             call()
+        assert str(caught.value).startswith(message), str(caught.value)
 
 
 def test_a_constant_recording_is_refused(mini):
