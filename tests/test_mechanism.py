@@ -385,3 +385,22 @@ def test_any_loop_about_a_wrong_axis_is_suspected_first(loop, axis, angle, tmp_p
     start = f"mini_forwarder.yaml:{number + 1}: loop '{loop}': its axis is {angle} degrees off "
     assert str(caught.value).startswith(start)
     assert str(caught.value).endswith("turn it to axis: [0, 0, 1]")
+
+
+@pytest.mark.parametrize("axis", ["0 0 1", "0 1 0", "1 0 0"])
+@pytest.mark.parametrize("coupled", [False, True])
+def test_one_joint_with_a_loop_is_refused_in_one_line(axis, coupled, tmp_path):
+    """Pinocchio's Jacobian of one joint is a vector."""
+    body = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    ends = '<predecessor link="base"/><successor link="arm"/>'
+    gear = f'<coupling name="gear">{ends}</coupling>' * coupled
+    path = tmp_path / "one.urdf"
+    path.write_text(
+        f'<robot name="one"><link name="base"/><link name="arm">{body}</inertial></link>'
+        '<joint name="j" type="continuous" independent="true"><parent link="base"/>'
+        '<child link="arm"/><axis xyz="0 0 1"/></joint>'
+        f'<loop name="pin" type="revolute">{ends}<axis xyz="{axis}"/></loop>{gear}</robot>'
+    )
+    with pytest.raises(CraneError) as caught:
+        crane.load(path)
+    assert str(caught.value).startswith("one.urdf") and str(caught.value).isprintable()

@@ -27,6 +27,11 @@ def turned(axis: Sequence[float]) -> Array:
     return np.column_stack([first, np.cross(third, first), third])
 
 
+def _columns(jacobian: Array) -> Array:
+    """(6, nv) also of one joint, for which Pinocchio gives (6,)."""
+    return jacobian.reshape(6, -1)
+
+
 def _cross(a: Array, b: Array) -> Array:
     """Row-wise cross product; numpy's own costs several times more on a few rows."""
     out = np.empty_like(a)
@@ -156,8 +161,7 @@ class LoopEquations:
         coupled = self.factors @ q - self.offsets
         if not self.loops:
             return coupled, self.factors.copy()
-        # of a single joint Pinocchio returns a vector, here and below
-        jacobian = pin.computeJointJacobians(self.model, self.data, q).reshape(6, -1)
+        jacobian = _columns(pin.computeJointJacobians(self.model, self.data, q))
         self._local.last = a, b, p1, p2 = self._geometry()
         phi = np.einsum("ij,ij->i", a, np.where(self._moves[:, None], p2 - p1, b))
         slopes = self._row_sign * (self._wrenches(a, b, p2) @ jacobian)
@@ -195,7 +199,7 @@ class LoopEquations:
         if not self.loops:
             return np.zeros(len(self.couplings))
         a, b, _, p2 = self._local.last
-        rate = pin.computeJointJacobiansTimeVariation(self.model, self.data, q, v).reshape(6, -1)
+        rate = _columns(pin.computeJointJacobiansTimeVariation(self.model, self.data, q, v))
         velocity = np.array([self.data.ov[joint].vector for joint, _ in self.frames])
         one = 2 * self._loop
         v2, w1, w2 = velocity[one + 1, :3], velocity[one, 3:], velocity[one + 1, 3:]
@@ -207,7 +211,7 @@ class LoopEquations:
         wrench_rate[self._moves, :3] = a_rate[self._moves]
         wrench_rate[:, 3:] = _cross(arm_rate, a) + _cross(arm, a_rate)
         split = self._row_sign * v  # (m, nv): v of frame 2 minus v of frame 1
-        relative, bias = split @ self.data.J.reshape(6, -1).T, split @ rate.T
+        relative, bias = split @ _columns(self.data.J).T, split @ rate.T
         bent = np.einsum("ij,ij->i", wrench_rate, relative) + np.einsum(
             "ij,ij->i", self._wrenches(a, b, p2), bias
         )

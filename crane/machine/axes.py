@@ -38,13 +38,13 @@ def wrong_axis(
     equations = LoopEquations(model, loops, spec.couplings)
     data = model.createData()
     # at zero a wrong axis has turned nothing out of the plane yet
-    pin.computeJointJacobians(model, data, np.zeros(model.nq))
+    jacobian = pin.computeJointJacobians(model, data, np.zeros(model.nq)).reshape(6, -1)
     sliding, names = slides(model), list(model.names)[1:]
     for index, loop in enumerate(loops):
         if loop.type not in (*_TURNING, "prismatic"):
             continue
         ring = [int(i) for i in np.flatnonzero(equations.sign[index])]
-        axes = [[data.J[:3, i] if sliding[i] else data.J[3:, i]] for i in ring]
+        axes = [[jacobian[:3, i] if sliding[i] else jacobian[3:, i]] for i in ring]
         axes.append([
             (data.oMi[joint].rotation @ place.rotation)[:, 2]
             for joint, place in equations.frames[2 * index : 2 * index + 2]

@@ -73,11 +73,11 @@ def slewing(machine: Machine, frame: str) -> tuple[int, Array] | None:
     gamma = machine.closure.gamma(machine.home)
     carrying = list(model.supports[model.frames[machine.frame(frame)].parentJoint])
     data = model.createData()
-    pin.computeJointJacobians(model, data, machine.home)
+    jacobian = pin.computeJointJacobians(model, data, machine.home).reshape(6, -1)
     for i, name in enumerate(machine.active):
         joint = model.getJointId(name)
         column = machine.column(name)
-        axis = data.J.reshape(6, -1)[3:, column]  # of a single joint it comes as a vector
+        axis = jacobian[3:, column]
         if (
             model.parents[joint] == 0
             and joint in carrying
