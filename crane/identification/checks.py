@@ -262,8 +262,8 @@ def check_forces(
             doubt(_shifted(f"{joint}_force", late, "its model"), trust)
     if doubtful:
         text = (
-            f"{', '.join(doubtful)}: friction and rotors may outweigh the bodies there, or the unit "
-            "is wrong, this recording cannot say"
+            f"{', '.join(doubtful)}: friction and rotors may outweigh the bodies there, or the "
+            "unit is wrong, this recording cannot say"
         )
         warnings.warn(text, CraneWarning, stacklevel=3)
 
