@@ -12,13 +12,14 @@ What is there is taken as it is. Everything else is a channel.
 """
 
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from crane import timeseries
-from crane.errors import ClosureError, MechanismError, RecordingError, at
+from crane.errors import ClosureError, CraneWarning, MechanismError, RecordingError, at
 from crane.machine import Machine
 from crane.recording import (
     FORCE,
@@ -36,6 +37,8 @@ _PRESSURE, _CHAMBER = "pressure_", re.compile("pressure_.+_[ab]")
 _TELLS = 1e-6  # least share of a joint's motion that others do not tell
 _SAME = 1e-6  # [m], [rad]
 _HELD = {"rad": 0.02, "m": 2e-3}  # by which a joint that is held may be off
+_AGREE = {"rad": 5e-3, "m": 5e-4}  # root mean square by which sensors of one joint may differ
+_COMPARED = 2000  # samples at which they are compared
 _SLACK = 0.1  # of a range, by which sensors may be off
 
 
@@ -55,11 +58,13 @@ def read_measured(machine: Machine, path: str | Path) -> Recording:
             what the machine cannot do.
     """
     table = timeseries.read(path)
-    if not all(x in table.units and x + FORCE in table.units for x in machine.active):
-        try:
+    full = all(x in table.units and x + FORCE in table.units for x in machine.active)
+    try:
+        if not full:
             table = _completed(machine, table)
-        except RecordingError as error:
-            raise RecordingError(at(str(path), error)) from None
+        tell_disagreement(machine, table)
+    except RecordingError as error:
+        raise RecordingError(at(str(path), error)) from None
     return Recording.from_table(table, path)
 
 
@@ -75,8 +80,19 @@ def _completed(machine: Machine, table: Table) -> Table:
     # before anything is computed from them, to name the column as it is in the file
     check_finite(dict(zip(table.units, table.values.T, strict=True)))
     check_pressures(machine, table)
-    forces = [_force(machine, joint, table) for joint in machine.active]
-    q, v = motion_of(machine, table)
+    forces, missing = [], []
+    for joint in machine.active:
+        try:
+            forces.append(_force(machine, joint, table))
+        except RecordingError as error:
+            missing.append(str(error))
+    try:
+        drives = _drives(machine, list(table.units))
+    except RecordingError as error:
+        missing.insert(0, str(error))
+    if missing:
+        raise RecordingError("; ".join(missing))
+    q, v = _motion(machine, drives, table)
     columns = {TIME: column(table, TIME)} | dict(zip(machine.active, q.T, strict=True))
     columns |= {x + VELOCITY: v[:, i] for i, x in enumerate(machine.active)}
     columns |= {x + FORCE: force for x, force in zip(machine.active, forces, strict=True)}
@@ -198,11 +214,18 @@ def _drives(machine: Machine, names: Sequence[str]) -> tuple[str, ...]:
             drives.append(joint)
     if len(drives) < len(machine.active):
         telling = [x for x in machine.joints if new(x) is not None]
-        missing = next(x for x in machine.active if x in telling)
+        missing = []
+        for joint in machine.active:  # those that suffice
+            if (direction := new(joint)) is not None:
+                told = np.vstack([told, direction])
+                missing.append(joint)
         others = ", ".join(x for x in telling if x not in machine.active)
+        one = len(missing) == 1
         raise RecordingError(
-            f"nothing tells where '{missing}' is, give '{missing} [{machine.unit(missing)}]'"
-            + (f", or a joint that moves with it ({others})" if others else "")
+            f"nothing tells where {', '.join(repr(x) for x in missing)} {'is' if one else 'are'}, "
+            f"give {', '.join(repr(f'{x} [{machine.unit(x)}]') for x in missing)}"
+            + (f", or a joint that moves with {'it' if one else 'them'} ({others})" * bool(others))
+            + f", or lock what was held ({' '.join(f'--lock {x}=VALUE' for x in missing)})"
         )
     return tuple(drives)
 
@@ -220,6 +243,48 @@ def motion_of(machine: Machine, table: Table) -> tuple[Array, Array]:
         RecordingError: It does not tell all of them, or what the machine cannot do.
     """
     return _motion(machine, _drives(machine, list(table.units)), table)
+
+
+def tell_disagreement(machine: Machine, table: Table) -> None:
+    """Warn where sensors of one quantity disagree through the machine's loops.
+
+    Joints that are recorded beside those that determine the posture, in the machine's unit, are
+    compared with where these put them.
+    """
+    drives = _drives(machine, list(table.units))
+    others = [
+        x for x in machine.joints
+        if x not in drives and table.units.get(x) == machine.unit(x)
+    ]  # fmt: skip
+    if not others:
+        return
+    chosen = slice(None, None, max(1, len(table.values) // _COMPARED))
+    time = column(table, TIME)[chosen]
+    q_b = np.column_stack([column(table, x, machine.unit(x))[chosen] for x in drives])
+    try:
+        driven = machine if set(drives) == set(machine.active) else machine.driven_by(drives)
+        order = [drives.index(x) for x in driven.active]
+        q = driven.closure.solve(q_b[:, order])
+    except (ClosureError, MechanismError):  # whoever closes the loops tells it
+        return
+    told = []
+    for joint in others:
+        unit = machine.unit(joint)
+        x = column(table, joint)[chosen]
+        off = x - q[:, driven.column(joint)]
+        if unit == "rad":
+            off -= 2 * np.pi * np.round(np.median(off) / (2 * np.pi))
+        noise = float(np.median(np.abs(np.diff(x, 2)))) if len(x) > 2 else 0.0
+        if np.sqrt(np.mean(off**2)) > max(_AGREE[unit], 2 * noise):
+            factor, shown = (180 / np.pi, "deg") if unit == "rad" else (1e3, "mm")
+            at = int(np.abs(off).argmax())
+            told.append(
+                f"'{joint}' is {factor * off.mean():+.3g} {shown} off on the mean, "
+                f"{factor * off[at]:+.3g} at most (at {time[at]:.4g} s)"
+            )
+    if told:
+        text = f"sensors disagree: by {', '.join(drives)}, which are used, {'; '.join(told)}"
+        warnings.warn(text, CraneWarning, stacklevel=3)
 
 
 def _motion(machine: Machine, drives: tuple[str, ...], table: Table) -> tuple[Array, Array]:

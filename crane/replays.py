@@ -10,14 +10,27 @@ from crane import timeseries
 from crane.control import Signals, ValveDrive
 from crane.errors import CraneWarning, InputError, RecordingError, at, known
 from crane.machine import Machine
-from crane.measured import check_pressures, column, motion_of
-from crane.recording import FORCE, FORCE_UNITS, VELOCITY, VELOCITY_UNITS, Recording
+from crane.measured import (
+    check_pressures,
+    column,
+    motion_of,
+    moved_locks,
+    tell_disagreement,
+)
+from crane.recording import (
+    FORCE,
+    FORCE_UNITS,
+    VELOCITY,
+    VELOCITY_UNITS,
+    Recording,
+    derivative,
+)
 from crane.samples import Array, Brief, as_number
 from crane.simulation import Progress, simulate
 from crane.timeseries import TIME, Table, check_unit, spellings
 
 _SIGNAL, _SUPPLY, _TANK = "voltage_", "pressure_supply", "pressure_tank"
-_FIRST = 0.1  # over which the velocity at the start is fitted [s]
+_FIRST, _LONGEST = 0.1, 1.0  # over which the start is fitted, and a rest looked for [s]
 _FEWEST = 5  # samples of that fit
 _BEYOND = 0.01  # of a range, beyond a limit, that noise does not explain
 _RESTS = 1e-12  # variation of a channel that is rounding, per its size
@@ -93,8 +106,9 @@ def replay(
     The file has a column voltage_X [V] for every valve that was moved, pressures of pump and tank
     where they were measured (pressure_supply, pressure_tank), and whatever else is to be compared:
     strokes or angles, velocities, pressures (see `crane.measured`). The simulation starts from the
-    measured posture, its velocity fitted over the first tenth of a second, and from the measured
-    pressures; where the file does not tell, from the home posture at rest, and from what holds it.
+    measured posture and velocity, at rest or fitted over the first tenth of a second, and from the
+    measured pressures; where the file does not tell, from the home posture at rest, and from what
+    holds it.
 
     Args:
         machine: The machine.
@@ -202,14 +216,17 @@ def _prepare(
     drive = ValveDrive(machine, Signals(machine, time, signals, supply, tank), pressures)
     initial = None
     if any(joint in table.units for joint in machine.joints):
+        for text in moved_locks(machine, _columns(table), table.units):
+            raise RecordingError(f"{text}, do not lock it, or lock it where it is")
+        tell_disagreement(machine, table)
         q_a, v_a = motion_of(machine, table)
         _warn_of_limits(machine, time, q_a)
-        first = time <= max(_FIRST, time[min(_FEWEST, len(time)) - 1])
-        if any(f"{joint}_velocity" in table.units for joint in machine.joints):
-            initial = q_a[0], v_a[0]
-        else:
-            slope = np.polyfit(time[first], q_a[first], 1)[0] if first.sum() > 2 else v_a[0]
-            initial = q_a[0], slope
+        steady = time <= _steady(time, list(signals.values()))
+        states = []
+        for i, joint in enumerate(machine.active):
+            rates = joint + VELOCITY in table.units or joint not in table.units
+            states.append(_start(time, q_a[:, i], v_a[:, i] if rates else None, steady))
+        initial = np.array([x for x, _ in states]), np.array([v for _, v in states])
     return time, drive, initial
 
 
@@ -229,3 +246,61 @@ def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
                 CraneWarning,
                 stacklevel=4,
             )
+
+
+def _columns(table: Table) -> dict[str, Array]:
+    return dict(zip(table.units, table.values.T, strict=True))
+
+
+def _steady(time: Array, signals: list[Array]) -> float:
+    """Until when no valve is moved [s], within bounds."""
+    moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
+    first = min(float(time[x.argmax()]) if x.any() else np.inf for x in moved)
+    least = float(time[min(_FEWEST, len(time)) - 1])
+    return max(min(first, _LONGEST), _FIRST, least)
+
+
+def _start(time: Array, x: Array, v: Array | None, steady: np.ndarray) -> tuple[float, float]:
+    """Coordinate and velocity of a joint at the first sample, from all samples near it.
+
+    At rest, if over the stretch that is steady a straight line rises by no more than three times
+    what is left about it. Else by parabolas, see `_first`: of velocities (N,) where they were
+    recorded, else of the coordinates.
+    """
+    near, place = time[steady], x[steady]
+    if len(x) < _FEWEST:
+        return float(x[0]), float(derivative(x, time)[0] if v is None else v[0])
+    line = np.polyfit(near, place, 1)
+    left = float(np.std(place - np.polyval(line, near)))
+    if abs(line[0]) * (near[-1] - near[0]) <= 3 * left or np.ptp(place) == 0:
+        return float(place.mean()), 0.0
+    return _first(time, x, 0), _first(time, x, 1) if v is None else _first(time, v, 0)
+
+
+def _first(time: Array, x: Array, order: int) -> float:
+    """Value (order 0) or rate (1) at the first sample, of parabolas over ever longer stretches.
+
+    Longer ones have less noise, as long as they agree with all shorter ones within two standard
+    deviations of both (Lepski 1990).
+    """
+    lowest, highest, found = -np.inf, np.inf, 0.0
+    if order == 0 and len(x) > _FEWEST:  # the sample itself, its noise by third differences
+        std = float(np.sqrt(np.mean(np.diff(x[time <= time[0] + _FIRST], 3) ** 2) / 20))
+        found, lowest, highest = float(x[0]), x[0] - 2 * std, x[0] + 2 * std
+    count, last = _FEWEST, np.searchsorted(time, time[0] + _FIRST, side="right")
+    while count <= max(last, _FEWEST):
+        value, std = _parabola(time[:count], x[:count], order)
+        if value + 2 * std < lowest or value - 2 * std > highest:
+            break
+        lowest, highest = max(lowest, value - 2 * std), min(highest, value + 2 * std)
+        found, count = value, count + max(1, count // 2)
+    return found
+
+
+def _parabola(time: Array, x: Array, order: int) -> tuple[float, float]:
+    """Value or rate of a parabola at the first instant, and its standard deviation."""
+    A = np.vander(time - time[0], 3)
+    values, *_ = np.linalg.lstsq(A, x, rcond=None)
+    spread = float(np.sum((x - A @ values) ** 2)) / (len(x) - 3)
+    std = np.sqrt(spread * np.diag(np.linalg.pinv(A.T @ A)))
+    return float(values[2 - order]), float(std[2 - order])

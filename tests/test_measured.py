@@ -305,12 +305,12 @@ BROKEN = {
     ),
     "no slewing angle": (
         without("q1 [deg]"),
-        "nothing tells where 'q1' is, give 'q1 [rad]'",
+        "nothing tells where 'q1' is, give 'q1 [rad]', or lock what was held (--lock q1=VALUE)",
     ),
     "one angle too few": (
         without("q2 [deg]"),
         "nothing tells where 'X1' is, give 'X1 [m]', or a joint that moves with it "
-        "(q4, q9, q2)",
+        "(q4, q9, q2), or lock what was held (--lock X1=VALUE)",
     ),
     "angle without a unit": (
         renamed("q3 [deg]", "q3"),
@@ -344,6 +344,47 @@ def test_broken_recordings(machine, columns, truth, tmp_path, change, message):
     line = str(caught.value)
     assert line.startswith(f"{file}: ") and line.count(str(file)) == 1
     assert line.endswith(message) and line.isprintable()
+
+
+def test_everything_that_is_missing_is_told_at_once(machine, columns, tmp_path):
+    for name in ("q1 [deg]", "q1_force [N m]", "q3 [deg]", "pressure_X2_a [bar]"):
+        del columns[name]
+    with pytest.raises(RecordingError) as caught:
+        read_measured(machine, write(tmp_path, columns))
+    line = str(caught.value)
+    assert "nothing tells where 'q1', 'X1' are, give 'q1 [rad]', 'X1 [m]', or a joint" in line
+    assert "(--lock q1=VALUE --lock X1=VALUE); column 'q1_force' is missing, give it in" in line
+    assert line.endswith(
+        "'pressure_X2_a' is missing beside 'pressure_X2_b', give it, or 'X2_force [N]'"
+    )
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_sensors_that_disagree_are_told(machine, columns, truth, tmp_path, full):
+    """The angle q3 beside the strokes, 3 degrees off on the mean and more where it is late."""
+    late = np.interp(truth["t"] - 0.1, truth["t"], truth["angles"]["q3"])
+    columns["q3 [deg]"] = np.rad2deg(late) + 3.0
+    columns |= {"X1 [mm]": 1e3 * truth["q"][:, 1], "X2 [mm]": 1e3 * truth["q"][:, 2]}
+    if full:
+        columns |= {f"X{i} _force [N]".replace(" ", "", 1): truth["tau"][:, i] for i in (1, 2)}
+    off = np.rad2deg(late - truth["angles"]["q3"]) + 3.0
+    at = int(np.abs(off).argmax())
+    with pytest.warns(CraneWarning) as caught:
+        read_measured(machine, write(tmp_path, columns))
+    (line,) = [str(one.message) for one in caught if "disagree" in str(one.message)]
+    assert line == (
+        f"sensors disagree: by q1, X1, X2, which are used, 'q3' is {off.mean():+.3g} deg off on "
+        f"the mean, {off[at]:+.3g} at most (at {truth['t'][at]:.4g} s)"
+    )
+
+
+def test_sensors_that_agree_within_their_noise_are_not(machine, columns, truth, tmp_path):
+    rng = np.random.default_rng(0)
+    columns["q3 [deg]"] = columns["q3 [deg]"] + 0.1 * rng.normal(size=401)
+    columns |= {"X1 [mm]": 1e3 * truth["q"][:, 1], "X2 [mm]": 1e3 * truth["q"][:, 2]}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", CraneWarning)
+        read_measured(machine, write(tmp_path, columns))
 
 
 def test_nan_in_an_npz(machine, columns, tmp_path):
@@ -408,7 +449,7 @@ def test_command_line(path, columns, tmp_path):
     identify = ("identify", path, file, "--out", "found")
     result = run(*identify, cwd=tmp_path)
     assert result.returncode == 2 and not (tmp_path / "found").exists()
-    assert f"error: {file}: nothing tells where 'q1' is, give 'q1 [rad]'\n" in result.stderr
+    assert f"error: {file}: nothing tells where 'q1' is, give 'q1 [rad]', or lock" in result.stderr
     result = run(*identify, "--lock", "q1=0", cwd=tmp_path)
     assert "nothing tells" not in result.stderr
     columns["q1 [rad]"] = columns["time [ms]"] * 1e-4

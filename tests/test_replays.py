@@ -131,6 +131,38 @@ def test_angles_serve_as_well_as_strokes(tmp_path):
     assert max(rows.values()) < 1e-4
 
 
+@pytest.mark.parametrize("rates", [True, False])
+def test_a_noisy_rest_is_a_rest(tmp_path, measured, rates):
+    """Half a second before the valve opens, 0.2 mm of noise: by differences up to 20 mm/s."""
+    machine, recording = measured
+    columns, units = columns_of(recording, every=10)
+    rest = 50
+    columns = {name: np.concatenate([np.repeat(x[:1], rest), x]) for name, x in columns.items()}
+    columns["time"] = 0.01 * np.arange(len(columns["x"]))
+    rng = np.random.default_rng(4)
+    columns["x"] += 0.2 * rng.normal(size=len(columns["x"]))  # [mm]
+    columns["x_velocity"] += 0.02 * rng.normal(size=len(columns["x"]))
+    if not rates:
+        del columns["x_velocity"]
+    path = write(tmp_path / "file.csv", columns, {name: units[name] for name in columns})
+    again, comparison = replay(machine, path)
+    assert again.v[0, 0] == 0
+    assert abs(again.q[0, 0] - recording.q[0, 0]) < 1e-4
+    x = next(channel for channel in comparison.channels if channel.name == "x")
+    assert x.rms < 4e-4
+
+
+def test_a_noisy_start_in_motion_keeps_its_velocity(tmp_path, measured):
+    machine, recording = measured
+    columns, units = columns_of(recording, start=300)
+    rng = np.random.default_rng(5)
+    columns["x"] = columns["x"] + 0.05 * rng.normal(size=len(columns["x"]))
+    columns["x_velocity"] = columns["x_velocity"] + 0.01 * rng.normal(size=len(columns["x"]))
+    again, _ = replay(machine, write(tmp_path / "file.csv", columns, units))
+    assert abs(again.v[0, 0] - recording.v[300, 0]) < 5e-3
+    assert abs(again.q[0, 0] - recording.q[300, 0]) < 2e-5
+
+
 @pytest.mark.parametrize(
     ("change", "line"),
     [

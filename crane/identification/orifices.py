@@ -59,7 +59,8 @@ class Orifices(Brief):
         covariance: (5, 5).
         freedom: Degrees of freedom of each standard error (5,).
         condition: Condition number of A with columns of length one.
-        misfit: Mean square of the residuals over what the sensors' noise explains; far above 1
+        misfit: Mean square of the residuals over what the sensors' noise explains, nan for "ls",
+            which does not follow the noise through its derivatives; far above 1
             the model is wrong or the noise stronger or not white.
         window: Length of the test functions [s].
         training: Sides of (29), one entry per recording.
@@ -107,7 +108,8 @@ class Orifices(Brief):
         """A table of the parameters."""
         lines = [
             f"cylinder of {self.joint}, method {self.method}: condition number "
-            f"{self.condition:.3g} with columns scaled, misfit {self.misfit:.3g}",
+            f"{self.condition:.3g} with columns scaled"
+            + ("" if np.isnan(self.misfit) else f", misfit {self.misfit:.3g}"),
             f"{'parameter':<10}{'value':>12}{'std':>10}{'rel. std':>10}   95 % interval",
         ]
         for name, unit, value, std, (low, high) in zip(
