@@ -81,10 +81,12 @@ def differentiate(
         passed = low_pass(time, q, cutoff)
         v = central_differences(time, passed)
         return Derivatives(passed, v, central_differences(time, v))
-    joints = [smooth(column, step) for column in q.T]
-    states, stds, noise = (np.array(part) for part in zip(*joints, strict=True))
-    position, v, a = (np.ascontiguousarray(states[:, :, i].T) for i in range(3))
-    std_v, std_a = (np.ascontiguousarray(stds[:, :, i].T) for i in (1, 2))
+    position, v, a, std_v, std_a = (np.empty(q.shape) for _ in range(5))
+    noise = np.empty(q.shape[1])
+    for i, column in enumerate(q.T):
+        states, std, noise[i] = smooth(column, step)
+        position[:, i], v[:, i], a[:, i] = states.T
+        std_v[:, i], std_a[:, i] = std.T[1:]
     return Derivatives(position, v, a, std_v, std_a, noise)
 
 
