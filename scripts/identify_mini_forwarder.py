@@ -18,7 +18,8 @@ import numpy as np
 import crane
 from crane.identification.estimators import Prior
 from crane.identification.excitation import excite
-from crane.identification.identify import identify, prior_of_bodies
+from crane.identification.identify import identify
+from crane.identification.possible import prior_of_bodies
 from crane.identification.model import Inertial, Model, Term, friction
 from crane.rig import Rig, Tolerances, default_sensors
 

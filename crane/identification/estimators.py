@@ -147,6 +147,33 @@ def instrumental(
     return rows.estimate(rows.scales)
 
 
+def judged(
+    W: Array | Regressor,
+    y: Array,
+    groups: np.ndarray,
+    samples: np.ndarray | None,
+    values: Array,
+    noise: Array,
+    pull: Array,
+) -> Estimate:
+    """How well parameters are known that are the minimum of something else than least squares.
+
+    Args:
+        W: Regressor (m, p), as an array or in blocks.
+        y: Forces (m,).
+        groups: Joint of each row (m,).
+        samples: Number of the instant of each row (m,).
+        values: Minimum (p,) of |(y - W theta) / noise|^2 + c(theta).
+        noise: Of each group (g,).
+        pull: L (k, p), L^T L half of the second derivative of c there.
+
+    Returns:
+        Theirs, with the covariance of `weighted` for a prior whose rows are L.
+    """
+    rows = _Rows(W, None, y, groups, samples, None, pull)
+    return rows.judge(values, rows.residuals(values), noise, math.inf)
+
+
 def essential(estimate: Estimate, level: float = 0.05) -> np.ndarray:
     """Parameters without which the model would be significantly worse.
 
@@ -188,10 +215,10 @@ def essential(estimate: Estimate, level: float = 0.05) -> np.ndarray:
 class _Rows:
     """Equations and how to solve them: one engine for all estimators.
 
-    With weights D = diag(1 / s^2) and prior rows L = diag(1 / std) appended to W, Z and y, the
-    estimate solves Q^T W' theta = Q^T y', where Q R = Z' are the appended and weighted Z. Of the
-    regressor, only the triangular factors of each group's rows are held: as long as all rows of a
-    group weigh the same, they tell everything but the single residuals.
+    With weights D = diag(1 / s^2) and prior rows L, such as diag(1 / std), appended to W, Z and
+    y, the estimate solves Q^T W' theta = Q^T y', where Q R = Z' are the appended and weighted Z.
+    Of the regressor, only the triangular factors of each group's rows are held: as long as all
+    rows of a group weigh the same, they tell everything but the single residuals.
     """
 
     def __init__(
@@ -202,6 +229,7 @@ class _Rows:
         groups: np.ndarray | None,
         samples: np.ndarray | None,
         prior: Prior | None,
+        pull: Array | None = None,
     ):
         count, size = np.shape(W) if isinstance(W, np.ndarray) else W.shape
         groups = np.zeros(count, int) if groups is None else np.asarray(groups)
@@ -212,11 +240,12 @@ class _Rows:
                 raise InputError(f"{name} has the shape {shape}, give ({count},)")
         if Z is not None and np.shape(Z) != (count, size):
             raise InputError(f"instruments have the shape {np.shape(Z)}, give {(count, size)}")
-        self._order = None  # in which the rows come, by time
+        self._order: np.ndarray | None = None  # in which the rows come, by time
         if isinstance(W, np.ndarray):
             if (np.diff(samples) < 0).any():
                 self._order = np.argsort(samples, kind="stable")
-                W, y, groups, samples = (x[self._order] for x in (W, y, groups, samples))
+                W, y = W[self._order], y[self._order]
+                groups, samples = groups[self._order], samples[self._order]
                 Z = None if Z is None else Z[self._order]
             W = Stored(W, samples)
         self.W, self.y, self.samples = W, y, samples
@@ -226,13 +255,14 @@ class _Rows:
         for g, rows in enumerate(self.members):
             if len(rows) < 2 or (np.diff(samples[rows]) <= 0).any():
                 raise InputError(f"samples of group {g} do not increase, sort its rows by time")
-        self.mean, self.weight = np.zeros(size), np.zeros(size)
+        self.mean = np.zeros(size)
+        self.pull = np.zeros((0, size)) if pull is None else pull
         if prior is not None:
             mean, std = (np.asarray(x, dtype=np.float64) for x in prior)
             if mean.shape != (size,) or std.shape != (size,) or not (std > 0).all():
                 raise InputError(f"the prior is not means and deviations > 0, give ({size},) each")
-            self.mean, self.weight = mean, 1 / std
-        if count + np.count_nonzero(self.weight) <= size:
+            self.mean, self.pull = mean, np.diag(1 / std)
+        if count + np.count_nonzero(self.pull) <= size:
             raise InputError(f"{count} rows for {size} parameters are too few, record longer")
         self.plain = (
             W.factors(y, groups) if Z is None else factors(W, y, groups, Z=self.Z)
@@ -274,7 +304,7 @@ class _Rows:
         return np.maximum(found, self.smallest)
 
     def residuals(self, theta: Array) -> Array:
-        """y - W theta (m,)."""
+        """Residuals y - W theta (m,)."""
         e = np.array(self.y, dtype=np.float64)
         for rows, W in self.W.blocks():
             e[rows] -= W @ theta
@@ -289,7 +319,7 @@ class _Rows:
             if round_ and np.abs(A @ (theta - before)).max() < _CONVERGED:
                 break
             s = scales(theta)
-        return self._judge(theta, self.residuals(theta), s, math.inf)
+        return self.judge(theta, self.residuals(theta), s, math.inf)
 
     def robust(self) -> Estimate:
         """The same with rows of large residuals counting less, see `huber`."""
@@ -305,7 +335,7 @@ class _Rows:
             clip = _TURN * s[self.groups]
             shares = np.minimum(1, clip / np.maximum(np.abs(e), self.smallest))
             R = factors(self.W, self.y, self.groups, np.sqrt(shares))
-        return self._judge(theta, e, s, _TURN)
+        return self.judge(theta, e, s, _TURN)
 
     def _solve(self, plain: Array, s: Array) -> tuple[Array, Array, Array]:
         """theta, R (p, p) of the weighted instruments with the prior's rows, and Q^T W.
@@ -315,9 +345,8 @@ class _Rows:
             s: Standard deviations of the groups (g,).
         """
         size = len(self.mean)
-        prior = np.diag(self.weight)
-        copies = [prior] * ((plain.shape[2] - 1) // size)
-        prior = np.column_stack([*copies, self.weight * self.mean])
+        copies = [self.pull] * ((plain.shape[2] - 1) // size)
+        prior = np.column_stack([*copies, self.pull @ self.mean])
         whole = triangular(np.vstack([*(plain / s[:, None, None]), prior]))
         R, A, right = whole[:size, :size], whole[:size, -1 - size : -1], whole[:size, -1]
         length = np.linalg.norm(R, axis=0)
@@ -328,9 +357,9 @@ class _Rows:
                 f"the {A.shape[1]} columns of the regressor depend on each other (condition "
                 f"{values[0] / max(values[-1], 1e-300):.1g}), take base parameters or a prior"
             )
-        return np.linalg.solve(A, right), R, A
+        return np.asarray(np.linalg.solve(A, right), dtype=np.float64), R, A
 
-    def _judge(self, theta: Array, e: Array, s: Array, turn: float) -> Estimate:
+    def judge(self, theta: Array, e: Array, s: Array, turn: float) -> Estimate:
         """Covariance of theta: A^-1 (sum of Q^T noise) A^-T with the noise's correlations.
 
         The noise of joint i is modelled as autoregressive, a_i(z) e_i = u_i, with covariances
@@ -357,7 +386,7 @@ class _Rows:
         known = sum(noise.known for noise in noises)
         freedom = max(known - len(theta), _LEAST_SHARE * known)
         middle *= known / freedom / unclipped
-        prior = np.linalg.solve(R.T, np.diag(self.weight))
+        prior = np.linalg.solve(R.T, self.pull.T)
         middle += prior @ prior.T
         inverse = np.linalg.inv(A)
         plain, scaled = conditions(np.vstack(list(self.plain[:, :, -1 - len(theta) : -1])))
@@ -376,7 +405,7 @@ class _Rows:
         )
 
     def _coloured(self, R: Array, s: Array, noises: list[Noise]) -> Array:
-        """Q^T (covariance of the noise) Q (p, p), Q = Z / s R^-1, from the last row to the first."""
+        """Q^T (covariance of the noise) Q (p, p), Q = Z / s R^-1, from the last row on."""
         from scipy.linalg import solve_triangular
 
         S, size = between(noises), len(R)

@@ -1,26 +1,20 @@
 """From a recording to parameters."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.errors import InputError, RecordingError, known
-from crane.identification.base import Base, base_parameters
+from crane.identification.base import base_parameters
 from crane.identification.checks import check, check_forces
+from crane.identification.equations import Equations, Progress
 from crane.identification.estimators import Prior, conditions, huber, least_squares, weighted
-from crane.identification.feasible import feasible as feasible_estimate
-from crane.identification.feasible import pseudo_inertia
-from crane.identification.model import Model, Samples, Term
-from crane.identification.result import Comparison, Identification
-from crane.identification.signals import (
-    Motion,
-    differentiate,
-    filter_rows,
-    moving,
-    resample,
-)
+from crane.identification.model import Model, Term
+from crane.identification.possible import possible, prior_of_bodies
+from crane.identification.result import Identification
+from crane.identification.signals import Motion, differentiate, resample
 from crane.machine import Machine
 from crane.recording import Recording
 from crane.samples import Array, as_number
@@ -28,35 +22,7 @@ from crane.samples import Array, as_number
 METHODS = {"ols": least_squares, "wls": weighted, "huber": huber}
 _SLOW = 0.02  # of a joint's largest velocity, below which its rows are left out
 _FAST = 40.0  # times the frequency below which 99 % of the accelerations are
-_FEWEST = 5.0  # periods of the filter's cutoff in a recording
-_EXACT = 1e-4  # of the forces, noise that a feasible estimate counts with at least
-_PRIOR = 0.3  # relative standard deviation of a body towards which a feasible estimate is drawn
-_THICKNESS = 0.05  # of a body's size, added to what is thinner in a prior
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Equations of a recording, filtered and thinned: y = W beta.
-
-    Attributes:
-        time: (M,) [s].
-        W: (M, n, r).
-        y: (M, n).
-        offset: (M, n) forces that no parameter changes, to be added to W beta.
-        moving: (M, n).
-    """
-
-    time: Array
-    W: Array
-    y: Array
-    offset: Array
-    moving: np.ndarray
-
-    def stacked(self) -> tuple[Array, Array, np.ndarray, np.ndarray]:
-        """Rows that count, joint after joint: W (m, r), y (m,), joint and instant of each."""
-        joint, instant = np.nonzero(self.moving.T)
-        _, group = np.unique(joint, return_inverse=True)
-        return self.W[instant, joint], self.y[instant, joint], group, instant
+_PART = 0.3  # of what is left to do that one pass over a recording is taken for
 
 
 def motion_of(
@@ -64,6 +30,7 @@ def motion_of(
     recording: Recording,
     derivatives: str = "kalman",
     cutoff: float | None = None,
+    progress: Progress | None = None,
 ) -> Motion:
     """Velocities and accelerations of a recording, which is checked first.
 
@@ -72,6 +39,7 @@ def motion_of(
         recording: With all active joints of the machine.
         derivatives: "kalman" or "lowpass", see `signals.differentiate`.
         cutoff: [Hz] of "lowpass".
+        progress: Takes the finished share.
 
     Raises:
         RecordingError: What is recorded cannot serve; the message names column and time.
@@ -94,11 +62,11 @@ def motion_of(
     recorded_v = v if np.any(v) else None
     check(recording.time, q, tau, machine.active, units, recorded_v, bounded)
     step = float(np.median(np.diff(recording.time)))
-    time, columns = recording.time, np.column_stack([q, tau])
+    time = recording.time
     if np.abs(np.diff(time) - step).max() > 1e-3 * step:
-        time, columns = resample(time, columns, step)
-    q, tau = np.split(columns, 2, axis=1)
-    found = differentiate(time, q, derivatives, cutoff)
+        time, columns = resample(time, np.column_stack([q, tau]), step)
+        q, tau = np.split(columns, 2, axis=1)
+    found = differentiate(time, q, derivatives, cutoff, progress)
     return Motion(time, found.q, found.v, found.a, tau)
 
 
@@ -113,6 +81,7 @@ def identify(
     terms: Sequence[Term] | None = None,
     bandwidth: float | None = None,
     slow: Mapping[str, float] | ArrayLike | None = None,
+    progress: Progress | None = None,
 ) -> Identification:
     """Base parameters of a machine from recorded strokes and forces.
 
@@ -134,6 +103,7 @@ def identify(
             Lower where the motion is measured badly, as by a coarse potentiometer.
         slow: Velocities below which rows are left out, (n,) or by joint; a share of a joint's
             largest if not given. A few times that over which friction at rest fades.
+        progress: Takes the finished share.
 
     Returns:
         Parameters, their confidence, and how well they predict both recordings.
@@ -145,85 +115,73 @@ def identify(
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
     model = Model(machine, terms)
-    motion = recording if isinstance(recording, Motion) else motion_of(machine, recording)
+    if feasible and not model.bodies:
+        raise InputError("the model has no bodies, so nothing has to be feasible")
+    if progress is not None:
+        progress = _in_parts(progress)
+    motion = _motion(machine, recording, progress)
     base = base_parameters(model)
     if bandwidth is None:
         bandwidth = _bandwidth(motion)
-    fastest = np.abs(motion.v).max(axis=0)
-    limits = _slow(machine, slow, fastest)
-    rows = _equations(model, base, motion, bandwidth, limits)
-    if model.bodies:
-        check_forces(
-            rows.time,
-            rows.y + rows.offset,
-            rows.W @ base.values(model.nominal) + rows.offset,
-            machine.active,
-        )
-    W, y, groups, instants = rows.stacked()
-    if not len(y):
+    limits = _slow(machine, slow, np.abs(motion.v).max(axis=0))
+    rows = Equations(model, base, motion, bandwidth, limits, progress)
+    if not rows.moving.any():
         raise RecordingError("no joint moves faster than what counts as standstill, move it more")
+    if model.bodies:
+        modelled = rows.compare(base.values(model.nominal)).modelled
+        check_forces(rows.time, rows.forces, modelled, machine.active)
+        del modelled
+    W = np.vstack(list(rows.factors[:, :, :-1]))  # tells of columns what all rows tell
     told = base.narrowed(W)
     picked = np.searchsorted(base.independent, told.independent)
+    selection = np.eye(base.rank)[:, picked]
     prior = prior_of_bodies(model, prior) if isinstance(prior, int | float) else prior
     parameters = None
+    if prior is None or feasible:
+        columns, given = rows.columns(selection), None
+    else:
+        columns, given = rows.columns(selection @ told.grouping), prior
+    estimate = METHODS[method](columns, rows.y, rows.groups, rows.samples, given)
+    values, covariance = estimate.values, estimate.covariance
     if feasible:
-        estimate = METHODS[method](W[:, picked], y, groups, instants)
-        parameters = _possible(model, told, W[:, picked], y, estimate.noise[groups], prior)
-        values, covariance = told.values(parameters), estimate.covariance
-    elif prior is not None:
-        estimate = METHODS[method](W[:, picked] @ told.grouping, y, groups, instants, prior)
+        estimate = possible(model, told, rows, selection, estimate, prior)
+    if feasible or prior is not None:
         plain, scaled = conditions(W[:, picked])
         estimate = replace(estimate, condition=plain, scaled_condition=scaled)
         parameters = estimate.values
         values = told.values(parameters)
         covariance = told.grouping @ estimate.covariance @ told.grouping.T
-    else:
-        estimate = METHODS[method](W[:, picked], y, groups, instants)
-        values, covariance = estimate.values, estimate.covariance
-
-    def compare(rows: _Rows) -> Comparison:
-        modelled = rows.W[:, :, picked] @ values + rows.offset
-        return Comparison(rows.time, rows.y + rows.offset, modelled, rows.moving, machine.active)
-
-    judged = None
+    training, judged = rows.compare(selection @ values), None
+    del rows, columns
     if validation is not None:
-        other = validation if isinstance(validation, Motion) else motion_of(machine, validation)
-        judged = compare(_equations(model, base, other, bandwidth, limits))
+        other = _motion(machine, validation, progress)
+        judge = Equations(model, base, other, bandwidth, limits, progress)
+        judged = judge.compare(selection @ values)
+    if progress is not None:
+        progress(1.0)
     return Identification(
-        model, told, values, covariance, parameters, estimate, method, feasible,
-        compare(rows), judged,
-    )  # fmt: skip
+        model, told, values, covariance, parameters, estimate, method, feasible, training, judged
+    )
 
 
-def _equations(
-    model: Model, base: Base, motion: Motion, bandwidth: float, slow: ArrayLike
-) -> _Rows:
-    """Both sides at the samples of a motion, filtered and thinned."""
-    from scipy.ndimage import binary_dilation
+def _motion(machine: Machine, recording: Recording | Motion, progress: Progress | None) -> Motion:
+    if isinstance(recording, Motion):
+        return recording
+    return motion_of(machine, recording, progress=progress)
 
-    at: Samples = model.samples(motion.q, motion.v, motion.a)
-    W = model.regressor(at)[:, :, base.independent]
-    offset = model.known(at)
-    step = float(motion.time[1] - motion.time[0])
-    duration = float(motion.time[-1] - motion.time[0])
-    if bandwidth * duration < _FEWEST:
-        raise InputError(
-            f"a bandwidth of {bandwidth:g} Hz leaves nothing of {duration:g} s, give at least "
-            f"{_FEWEST / duration:.2g} Hz"
-        )
-    thinning = max(1, int(0.25 / (step * bandwidth)))
-    both = np.concatenate([W, offset[:, :, None]], axis=2)
-    if bandwidth * step < 0.25:
-        both, tau = filter_rows(both, motion.tau, step, bandwidth, thinning)
-    else:
-        tau, thinning = motion.tau, 1
-    W, offset = both[:, :, :-1], both[:, :, -1]
-    # near standstill friction is none of its shapes, as far as the filter carries it
-    stuck = ~moving(motion.v, slow)
-    reach = round(0.5 / (step * bandwidth))
-    window = np.ones((2 * reach + 1, 1), dtype=bool)
-    kept = ~binary_dilation(stuck, window)[::thinning]
-    return _Rows(motion.time[::thinning], W, tau - offset, offset, kept)
+
+def _in_parts(progress: Progress) -> Progress:
+    """One bar for passes whose number is not known: each takes a share of what is left."""
+    done = 0.0
+
+    def report(share: float) -> None:
+        nonlocal done
+        now = done + _PART * (1 - done) * share
+        progress(now)
+        if share >= 1:
+            done = now
+
+    return report
 
 
 def _slow(machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastest: Array) -> Array:
@@ -255,75 +213,3 @@ def _bandwidth(motion: Motion) -> float:
         if np.ptp(a) > 0
     )
     return min(_FAST * max(last, frequency[1]), 0.24 / step)
-
-
-def prior_of_bodies(model: Model, relative: float) -> Prior:
-    """Bodies as described, each known to a share of its mass and size; of others nothing.
-
-    Returns:
-        Means (p,) and standard deviations (p,), infinite for what is no body.
-
-    Raises:
-        InputError: The share is not above zero.
-    """
-    if not relative > 0:
-        raise InputError(f"the prior's standard deviation is {relative:g}, give one above 0")
-    std = np.full(len(model.names), np.inf)
-    for i in range(len(model.bodies)):
-        mass, length = _size(model.nominal[10 * i : 10 * i + 10])
-        units = np.array([1.0, *[length] * 3, *[length**2] * 6])
-        std[10 * i : 10 * i + 10] = relative * mass * units
-    mean = np.where(np.isfinite(std), model.nominal, 0.0)
-    return mean, std
-
-
-def _size(body: Array) -> tuple[float, float]:
-    """Mass, and the root of the mean square distance of the mass from the joint's origin."""
-    P = pseudo_inertia(body)
-    return float(body[0]), float(np.sqrt(max(np.trace(P[:3, :3]), 0.0) / body[0]))
-
-
-def _possible(
-    model: Model, base: Base, W: Array, y: Array, noise: Array, prior: Prior | None
-) -> Array:
-    """All parameters, with bodies that can exist."""
-    if not model.bodies:
-        raise InputError("the model has no bodies, so nothing has to be feasible")
-    count = 10 * len(model.bodies)
-    mean, weight = model.nominal.copy(), _PRIOR**-2
-    spread = np.full(len(mean) - count, np.inf)
-    if prior is not None:
-        mean = prior[0].copy()
-        spread = prior[1][count:]
-        sizes = [_size(mean[i : i + 10])[0] for i in range(0, count, 10)]
-        weight = float(np.median(prior[1][:count:10] / sizes)) ** -2
-    for i in range(0, count, 10):
-        mean[i : i + 10] = _thick(mean[i : i + 10])
-    signs = [i for i, sign in enumerate(model.signs) if sign and i >= count]
-    size = np.sqrt(np.mean(y**2))
-    noise = np.maximum(noise, _EXACT * size)
-    # none of the others makes more than all of the force; without that, two that do the same in
-    # this motion may grow without end
-    alone = np.sqrt(np.mean((W @ base.grouping[:, count:]) ** 2, axis=0))
-    spread = np.minimum(spread, size / np.where(alone > 0, alone, size))
-    found = feasible_estimate(
-        W @ base.grouping, y, 1 / noise, model.bodies, mean, weight, spread, signs
-    )
-    return found.values
-
-
-def _thick(body: Array) -> Array:
-    """A body at least a share of its size thick in every direction.
-
-    Rods and plates without thickness lie on the edge of what can exist.
-    """
-    from crane.identification.feasible import body_parameters
-
-    P = pseudo_inertia(body)
-    mass, length = _size(body)
-    com = P[:3, 3] / mass
-    second = P[:3, :3] - mass * np.outer(com, com)
-    values, axes = np.linalg.eigh(second)
-    least = mass * (_THICKNESS * length) ** 2
-    P[:3, :3] = axes @ np.diag(np.maximum(values, least)) @ axes.T + mass * np.outer(com, com)
-    return body_parameters(P)

@@ -124,9 +124,10 @@ def likelihood(y: Array, h: float) -> tuple[float, Array, Array, float]:
     for start in range(0, reach, _AT_ONCE):
         k = np.arange(start, min(start + _AT_ONCE, reach))
         U = np.real((V[0] * _geometric(values, k)) @ left)
-        whole = np.linalg.qr(np.vstack([whole, np.column_stack([U, free[k]])]), mode="r")
+        rows = np.vstack([whole, np.column_stack([U, free[k]])])
+        whole = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
     R, rest = whole[:4, :4], whole[4:, 4]
-    mu = np.linalg.solve(R, whole[:4, 4])
+    mu = np.asarray(np.linalg.solve(R, whole[:4, 4]), dtype=np.float64)
     squares = max(float(free[reach:] @ free[reach:] + rest @ rest), float(np.finfo(float).tiny))
     freedom = len(y) - 4
     cost = freedom * math.log(squares) + 2 * np.linalg.slogdet(R)[1] - 12 * math.log(h)
