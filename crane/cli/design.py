@@ -147,12 +147,16 @@ def identify(
 
     check_folder(out, force)
     loaded = load(machine, lock)
-    learned = read_run(recording, loaded)
+    with status(f"reading {recording.name}"):
+        learned = read_run(recording, loaded)
     if bandwidth is not None:
         span = max(float(learned.time[-1] - learned.time[0]), 1e-3)
         as_number(bandwidth, "the bandwidth", "Hz", above=5 / span)
-    judge = None if validation is None else read_run(validation, loaded)
-    with status("identifying"):
+    judge = None
+    if validation is not None:
+        with status(f"reading {validation.name}"):
+            judge = read_run(validation, loaded)
+    with progress_bar("identifying") as progress:
         result = run(
             loaded,
             learned,
@@ -162,6 +166,7 @@ def identify(
             feasible,
             bandwidth=bandwidth,
             slow=by_joint("--slow", slow),
+            progress=progress,
         )
     with status("writing the report"):
         name = "" if validation is None else validation.name

@@ -42,7 +42,7 @@ class Equations:
         forces: (M, n) measured, filtered.
         offset: (M, n) of these what no parameter changes; known when all blocks have been read.
         moving: (M, n) which rows count.
-        base: See above.
+        base, bandwidth, slow: See above.
 
     Raises:
         InputError: The bandwidth leaves nothing, or something is not finite.
@@ -66,9 +66,10 @@ class Equations:
                 f"a bandwidth of {bandwidth:g} Hz leaves nothing of {duration:g} s, give at least "
                 f"{_FEWEST / duration:.2g} Hz"
             )
-        self.base, self._model, self._motion = base, model, motion
+        self.base, self.bandwidth, self.slow = base, bandwidth, slow
+        self._model, self._motion = model, motion
         self._progress = progress
-        self._step, self._bandwidth = step, bandwidth
+        self._step = step
         self._thinning, self._reach = 1, 0
         if bandwidth * step < 0.25:
             self._thinning = max(1, int(0.25 / (step * bandwidth)))
@@ -110,7 +111,7 @@ class Equations:
         both = self._unfiltered(number, start, stop)
         tau = motion.tau[start:stop]
         if self._reach:
-            both, tau = filter_rows(both, tau, self._step, self._bandwidth, thinning)
+            both, tau = filter_rows(both, tau, self._step, self.bandwidth, thinning)
         here = slice(span.start - start // thinning, span.stop - start // thinning)
         self.forces[span], self.offset[span] = tau[here], both[here, :, -1]
         return np.ascontiguousarray(both[here, :, :-1])
@@ -176,14 +177,24 @@ class Equations:
     @cached_property
     def factors(self) -> Array:
         """(g, r + 1, r + 1) triangular factors of [W y] of each joint's rows that count."""
+        return self.segments(1)[0]
+
+    def segments(self, count: int) -> Array:
+        """The same of so many equal parts of the time, one after the other (count, g, k, k)."""
         joints = np.flatnonzero(self.moving.any(axis=0))
-        out = np.zeros((len(joints), self.base.rank + 1, self.base.rank + 1))
+        out = np.zeros((count, len(joints), self.base.rank + 1, self.base.rank + 1))
+        part = np.arange(len(self.time)) * count // len(self.time)
         for span, W in self.blocks():
             y = self.forces[span] - self.offset[span]
-            for R, joint in zip(out, joints.tolist(), strict=True):
-                kept = self.moving[span, joint]
-                add_rows(R, np.column_stack([W[kept, joint], y[kept, joint]]))
+            for i in np.unique(part[span]).tolist():
+                for R, joint in zip(out[i], joints.tolist(), strict=True):
+                    kept = self.moving[span, joint] & (part[span] == i)
+                    add_rows(R, np.column_stack([W[kept, joint], y[kept, joint]]))
         return out
+
+    def selection(self, base: Base) -> Array:
+        """(r, s) that picks the columns of a narrower base."""
+        return np.eye(self.base.rank)[:, np.searchsorted(self.base.independent, base.independent)]
 
     def columns(self, T: Array) -> "Columns":
         """W T, the rows that count, for T (r, p)."""

@@ -55,6 +55,12 @@ def pseudo_inertia(parameters: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def body_size(body: Array) -> tuple[float, float]:
+    """Mass [kg], and root of the mean square distance of the mass from the origin [m]."""
+    P = pseudo_inertia(body)
+    return float(body[0]), float(np.sqrt(max(np.trace(P[:3, :3]), 0.0) / body[0]))
+
+
 def body_parameters(P: Array) -> Array:
     """The ten parameters (..., 10) from P (..., 4, 4): the inverse of `pseudo_inertia`."""
     P = np.asarray(P)

@@ -1,14 +1,16 @@
 """From a recording to parameters."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.errors import InputError, RecordingError, known
-from crane.identification.base import base_parameters
+from crane.errors import CraneWarning, InputError, RecordingError, known
+from crane.identification.base import Base, base_parameters
 from crane.identification.checks import check, check_forces
+from crane.identification.determined import advice, magnitudes
 from crane.identification.equations import Equations, Progress
 from crane.identification.estimators import Prior, conditions, huber, least_squares, weighted
 from crane.identification.model import Model, Term
@@ -120,38 +122,32 @@ def identify(
     if progress is not None:
         progress = _in_parts(progress)
     motion = _motion(machine, recording, progress)
-    base = base_parameters(model)
-    if bandwidth is None:
-        bandwidth = _bandwidth(motion)
-    limits = _slow(machine, slow, np.abs(motion.v).max(axis=0))
-    rows = Equations(model, base, motion, bandwidth, limits, progress)
-    if not rows.moving.any():
-        raise RecordingError("no joint moves faster than what counts as standstill, move it more")
+    rows, told = equations_of(model, motion, bandwidth, slow, progress)
     if model.bodies:
-        modelled = rows.compare(base.values(model.nominal)).modelled
+        modelled = rows.compare(rows.base.values(model.nominal)).modelled
         check_forces(rows.time, rows.forces, modelled, machine.active)
         del modelled
-    W = np.vstack(list(rows.factors[:, :, :-1]))  # tells of columns what all rows tell
-    told = base.narrowed(W)
-    picked = np.searchsorted(base.independent, told.independent)
-    selection = np.eye(base.rank)[:, picked]
+    selection = rows.selection(told)
     prior = prior_of_bodies(model, prior) if isinstance(prior, int | float) else prior
     parameters = None
+    columns = rows.columns(selection)
     if prior is None or feasible:
-        columns, given = rows.columns(selection), None
+        estimate = METHODS[method](columns, rows.y, rows.groups, rows.samples)
     else:
-        columns, given = rows.columns(selection @ told.grouping), prior
-    estimate = METHODS[method](columns, rows.y, rows.groups, rows.samples, given)
+        every = rows.columns(selection @ told.grouping)
+        estimate = METHODS[method](every, rows.y, rows.groups, rows.samples, prior)
     values, covariance = estimate.values, estimate.covariance
     if feasible:
         estimate = possible(model, told, rows, selection, estimate, prior)
     if feasible or prior is not None:
-        plain, scaled = conditions(W[:, picked])
+        plain, scaled = conditions(np.vstack(list(rows.factors[:, :, :-1] @ selection)))
         estimate = replace(estimate, condition=plain, scaled_condition=scaled)
         parameters = estimate.values
         values = told.values(parameters)
         covariance = told.grouping @ estimate.covariance @ told.grouping.T
     training, judged = rows.compare(selection @ values), None
+    size = magnitudes(model, told, columns.factors(rows.y, rows.groups))
+    base, bandwidth, limits = rows.base, rows.bandwidth, rows.slow
     del rows, columns
     if validation is not None:
         other = _motion(machine, validation, progress)
@@ -159,9 +155,34 @@ def identify(
         judged = judge.compare(selection @ values)
     if progress is not None:
         progress(1.0)
-    return Identification(
-        model, told, values, covariance, parameters, estimate, method, feasible, training, judged
-    )
+    found = Identification(
+        model, told, values, covariance, parameters, estimate, method, feasible, training, size,
+        advice(machine, motion), judged,
+    )  # fmt: skip
+    if found.doubt:
+        warnings.warn(found.doubt, CraneWarning, stacklevel=2)
+    return found
+
+
+def equations_of(
+    model: Model,
+    motion: Motion,
+    bandwidth: float | None = None,
+    slow: Mapping[str, float] | ArrayLike | None = None,
+    progress: Progress | None = None,
+) -> tuple[Equations, Base]:
+    """Equations of a motion, and what of the base parameters it tells.
+
+    Arguments and errors as for `identify`.
+    """
+    if bandwidth is None:
+        bandwidth = _bandwidth(motion)
+    limits = _slow(model.machine, slow, np.abs(motion.v).max(axis=0))
+    rows = Equations(model, base_parameters(model), motion, bandwidth, limits, progress)
+    if not rows.moving.any():
+        raise RecordingError("no joint moves faster than what counts as standstill, move it more")
+    # of columns, the triangular factors tell what all rows tell
+    return rows, rows.base.narrowed(np.vstack(list(rows.factors[:, :, :-1])))
 
 
 def _motion(machine: Machine, recording: Recording | Motion, progress: Progress | None) -> Motion:

@@ -6,7 +6,13 @@ from crane.errors import InputError
 from crane.identification.base import Base
 from crane.identification.equations import Equations
 from crane.identification.estimators import Estimate, Prior, judged
-from crane.identification.feasible import body_parameters, curvature, feasible, pseudo_inertia
+from crane.identification.feasible import (
+    body_parameters,
+    body_size,
+    curvature,
+    feasible,
+    pseudo_inertia,
+)
 from crane.identification.model import Model
 from crane.samples import Array
 
@@ -95,12 +101,6 @@ def possible(
     pull *= np.sqrt(weight)
     pull[-len(spread) :, count:] = np.diag(1 / spread)
     return judged(rows.columns(K), rows.y, rows.groups, rows.samples, found.values, noise, pull)
-
-
-def body_size(body: Array) -> tuple[float, float]:
-    """Mass, and the root of the mean square distance of the mass from the joint's origin."""
-    P = pseudo_inertia(body)
-    return float(body[0]), float(np.sqrt(max(np.trace(P[:3, :3]), 0.0) / body[0]))
 
 
 def _thick(body: Array) -> Array:
