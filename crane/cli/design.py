@@ -142,11 +142,14 @@ def identify(
 ) -> None:
     """Find a machine's parameters from a recording, and how well they predict."""
     from crane.identification.identify import identify as run
+    from crane.identification.write import check_rewritable
     from crane.runs import check_folder, read_run, write_identification
     from crane.samples import as_number
 
     check_folder(out, force)
     loaded = load(machine, lock)
+    if feasible:
+        check_rewritable(loaded)
     with status(f"reading {recording.name}"):
         learned = read_run(recording, loaded)
     if bandwidth is not None:
@@ -189,7 +192,8 @@ def payload(
     from crane.runs import read_run
 
     loaded = load(machine, lock)
-    carried = read_run(recording, loaded)
-    with status("estimating"):
-        estimate = estimate_payload(loaded, carried, frame, method)
+    with status(f"reading {recording.name}"):
+        carried = read_run(recording, loaded)
+    with progress_bar("estimating") as progress:
+        estimate = estimate_payload(loaded, carried, frame, method, progress=progress)
     print(estimate.to_text(), end="")

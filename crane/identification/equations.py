@@ -128,14 +128,14 @@ class Equations:
         both = np.empty((stop - start, self._motion.q.shape[1], self.base.rank + 1))
         edges = sorted(cuts)
         for low, high in zip(edges[:-1], edges[1:], strict=True):
-            if low == first:
-                self._memories.setdefault(following, dict(memory))
             q, v, a = (x[low:high] for x in (self._motion.q, self._motion.v, self._motion.a))
             at = self._model.samples(q, v, a, starts=(0,) if low == 0 else ())
             at = dataclasses.replace(at, memory=memory)
             part = both[low - start : high - start]
             part[:, :, :-1] = self._model.regressor(at)[:, :, self.base.independent]
             part[:, :, -1] = self._model.known(at)
+            if high == first:
+                self._memories.setdefault(following, dict(memory))
         return both
 
     def modelled(self, values: Array) -> Array:

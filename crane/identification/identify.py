@@ -63,6 +63,7 @@ def motion_of(
     units = {joint: machine.unit(joint) for joint in machine.active}
     recorded_v = v if np.any(v) else None
     check(recording.time, q, tau, machine.active, units, recorded_v, bounded)
+    del v, recorded_v
     step = float(np.median(np.diff(recording.time)))
     time = recording.time
     if np.abs(np.diff(time) - step).max() > 1e-3 * step:

@@ -69,6 +69,7 @@ def smooth(y: Array, step: float) -> tuple[Array, Array, float]:
         column += gain * innovations
     C = solve(P, F @ update @ P).T  # P_filtered F^T P^-1
     states = _backwards(C, F, filtered)[:, :3]
+    del filtered, innovations  # an hour at 1 kHz is some 100 MB here
 
     # Away from the ends the covariance is stationary; there, add what the end and mu do.
     end = update @ P
@@ -84,8 +85,11 @@ def smooth(y: Array, step: float) -> tuple[Array, Array, float]:
 
     units = (h / step) ** np.arange(3)
     sigma = math.sqrt(variance)
-    states = states * units + [mean, 0, 0]
-    return states, sigma * np.sqrt(np.maximum(covariance, 0)) * units, sigma
+    states *= units
+    states[:, 0] += mean
+    std = np.sqrt(np.maximum(covariance, 0, out=covariance), out=covariance)
+    std *= sigma * units
+    return states, std, sigma
 
 
 def _stationary(h: float) -> tuple[Array, Array, Array]:
