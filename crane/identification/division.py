@@ -6,8 +6,11 @@ from crane.dynamics import Dynamics
 from crane.errors import InputError
 from crane.identification.feasible import body_parameters, pseudo_inertia
 from crane.identification.model import body_names
+from crane.identification.possible import thick
 from crane.machine import Machine
 from crane.samples import Array
+
+_FLAT = 1e-6  # smallest eigenvalue of a flat body's pseudo-inertia, its diagonal scaled to one
 
 
 def divided(machine: Machine, parameters: Array, whole: Machine) -> dict[str, Array]:
@@ -19,8 +22,8 @@ def divided(machine: Machine, parameters: Array, whole: Machine) -> dict[str, Ar
         P_k = T D_k T^T,   T = L L_D^-1,   P = L L^T,  D = L_D L_D^T,
 
     all in the frame of the body's joint: the parts add up to P, each is as possible as its
-    description, and all are the described ones where P is D. Links that the locks fix to the
-    ground stay as described.
+    description, and all are the described ones where P is D. Descriptions of rods and plates
+    without thickness count with some. Links that the locks fix to the ground stay as described.
 
     Args:
         machine: With locked joints.
@@ -39,7 +42,8 @@ def divided(machine: Machine, parameters: Array, whole: Machine) -> dict[str, Ar
         if frame.parentJoint == 0:
             out[name] = body
         else:
-            places.setdefault(frame.parentJoint - 1, []).append((name, A, pseudo_inertia(body)))
+            P = pseudo_inertia(body if is_solid(body) else thick(body))
+            places.setdefault(frame.parentJoint - 1, []).append((name, A, P))
     for i, links in places.items():
         given = parameters[10 * i : 10 * i + 10]
         if len(links) == 1:
@@ -51,11 +55,17 @@ def divided(machine: Machine, parameters: Array, whole: Machine) -> dict[str, Ar
         except np.linalg.LinAlgError:
             names = ", ".join(f"'{name}'" for name, *_ in links)
             raise InputError(
-                f"what the locks make one body of {names} cannot exist, or is described as flat, "
-                "give feasible=True, or lock less"
+                f"what the locks make one body of {names} cannot exist, give feasible=True"
             ) from None
         T = L @ np.linalg.inv(D)
         for name, A, P in links:
             back = np.linalg.inv(A) @ T @ A
             out[name] = body_parameters(back @ P @ back.T)
     return out
+
+
+def is_solid(body: Array) -> bool:
+    """Whether a body of parameters (10,) has mass in all directions, far above rounding."""
+    P = pseudo_inertia(body)
+    units = np.sqrt(np.maximum(np.diag(P), np.finfo(float).tiny))
+    return bool(np.linalg.eigvalsh(P / np.outer(units, units))[0] > _FLAT)

@@ -175,16 +175,15 @@ def feasible(
     )
 
 
-def curvature(body: Array, prior: Array) -> Array:
+def curvature(body: Array) -> Array:
     """L (16, 10) with L^T L the second derivative of d(P, P0) by the parameters of a body.
 
-    d = tr X - log det X - 4 with X = L0^-1 P L0^-T, P0 = L0 L0^T, so d'' = |X^-1/2 dX X^-1/2|^2.
+    d = tr(P0^-1 P) - log det(P0^-1 P) - 4, so d'' = |P^-1/2 dP P^-1/2|^2, whatever P0 is.
 
     Args:
         body: Parameters (10,), of P.
-        prior: Those of P0.
     """
-    half = np.linalg.cholesky(pseudo_inertia(body))  # P = half half^T: |half^-1 dP half^-T|^2
+    half = np.linalg.cholesky(pseudo_inertia(body))
     first = np.linalg.solve(half, pseudo_inertia(np.eye(10)))
     whole = np.linalg.solve(half, np.swapaxes(first, 1, 2))
     return whole.reshape(10, 16).T

@@ -120,8 +120,7 @@ def identify(
     model = Model(machine, terms)
     if feasible and not model.bodies:
         raise InputError("the model has no bodies, so nothing has to be feasible")
-    if progress is not None:
-        progress = _in_parts(progress)
+    finished, progress = progress, in_parts(progress)
     motion = _motion(machine, recording, progress)
     rows, told = equations_of(model, motion, bandwidth, slow, progress)
     if model.bodies:
@@ -154,8 +153,8 @@ def identify(
         other = _motion(machine, validation, progress)
         judge = Equations(model, base, other, bandwidth, limits, progress)
         judged = judge.compare(selection @ values)
-    if progress is not None:
-        progress(1.0)
+    if finished is not None:
+        finished(1.0)
     found = Identification(
         model, told, values, covariance, parameters, estimate, method, feasible, training, size,
         advice(machine, motion), judged,
@@ -192,8 +191,10 @@ def _motion(machine: Machine, recording: Recording | Motion, progress: Progress 
     return motion_of(machine, recording, progress=progress)
 
 
-def _in_parts(progress: Progress) -> Progress:
+def in_parts(progress: Progress | None) -> Progress | None:
     """One bar for passes whose number is not known: each takes a share of what is left."""
+    if progress is None:
+        return None
     done = 0.0
 
     def report(share: float) -> None:

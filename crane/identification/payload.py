@@ -11,7 +11,7 @@ from crane.identification.base import Base
 from crane.identification.checks import check_forces
 from crane.identification.equations import Equations, Progress
 from crane.identification.feasible import body_parameters, pseudo_inertia
-from crane.identification.identify import METHODS, equations_of, motion_of
+from crane.identification.identify import METHODS, equations_of, in_parts, motion_of
 from crane.identification.model import PER_BODY, Model, Samples, friction
 from crane.identification.regressor import triangular
 from crane.identification.result import Comparison, aligned
@@ -182,7 +182,7 @@ def estimate_payload(
     if frame is None and machine.tip is None:
         raise InputError(f"'{machine.name}' has no tip, give the frame that holds the load")
     frame = frame or str(machine.tip)
-    motion = recording
+    motion, progress = recording, in_parts(progress)
     if not isinstance(motion, Motion):
         motion = motion_of(machine, motion, progress=progress)
     load = Load(machine, frame, inertia)

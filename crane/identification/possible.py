@@ -80,7 +80,7 @@ def possible(
         sizes = [body_size(mean[i : i + 10])[0] for i in range(0, count, 10)]
         weight = float(np.median(prior[1][:count:10] / sizes)) ** -2
     for i in range(0, count, 10):
-        mean[i : i + 10] = _thick(mean[i : i + 10])
+        mean[i : i + 10] = thick(mean[i : i + 10])
     signs = [i for i, sign in enumerate(model.signs) if sign and i >= count]
     # the triangular factors of the joints' rows instead of the rows: their columns have the same
     # lengths and angles
@@ -97,13 +97,13 @@ def possible(
     pull = np.zeros((16 * len(model.bodies) + len(spread), len(mean)))
     for i in range(len(model.bodies)):
         body = slice(10 * i, 10 * i + 10)
-        pull[16 * i : 16 * i + 16, body] = curvature(found.values[body], mean[body])
+        pull[16 * i : 16 * i + 16, body] = curvature(found.values[body])
     pull *= np.sqrt(weight)
     pull[-len(spread) :, count:] = np.diag(1 / spread)
     return judged(rows.columns(K), rows.y, rows.groups, rows.samples, found.values, noise, pull)
 
 
-def _thick(body: Array) -> Array:
+def thick(body: Array) -> Array:
     """A body at least a share of its size thick in every direction.
 
     Rods and plates without thickness lie on the edge of what can exist.

@@ -139,6 +139,13 @@ class Identification:
         return weak_directions(self.names, self.covariance, self.magnitude)
 
     @property
+    def remedy(self) -> str:
+        """What would determine more."""
+        if self.parameters is not None:
+            return f"{self.advice}, or leave such terms out"
+        return f"{self.advice}, or give a prior or feasible=True (--prior, --feasible)"
+
+    @property
     def doubt(self) -> str:
         """One line on what is not determined or impossible, "" where nothing is."""
         vague, wrong = (
@@ -149,9 +156,8 @@ class Identification:
         if vague or self.undetermined:
             weakest = self.undetermined[0][1] if self.undetermined else vague[0]
             parts.append(
-                f"{len(vague)} of {len(self.names)} base parameters are not determined by this "
-                f"motion, the least {weakest}: {self.advice}, or give a prior or feasible=True "
-                "(--prior, --feasible)"
+                f"this motion does not determine {len(vague)} of {len(self.names)} base "
+                f"parameters, the least {weakest}: {self.remedy}"
             )
         if wrong:
             parts.append(
@@ -216,7 +222,7 @@ class Identification:
             lines += [f"  +- {std:.2g}  {words}" for std, words in self.undetermined[:_SHOWN]]
             if more := len(self.undetermined[_SHOWN:]):
                 lines.append(f"  and {more} more directions")
-            lines.append(f"{self.advice}, or give a prior or feasible=True (--prior, --feasible)")
+            lines.append(self.remedy)
         return "\n".join(lines) + "\n"
 
 
