@@ -241,6 +241,7 @@ def test_the_parameters_as_a_table(found, tmp_path):
         rows = list(csv.DictReader(file))
     assert [row["parameter"] for row in rows] == list(found.names)
     np.testing.assert_array_equal([float(row["value"]) for row in rows], found.values)
+    assert [row["mark"] for row in rows] == list(found.marks)
     np.testing.assert_array_equal([float(row["lower"]) for row in rows], found.interval()[:, 0])
 
 

@@ -28,7 +28,7 @@ _FRICTION = tuple(item.name for item in dataclasses.fields(Friction))
 
 
 def write_parameters(result: Identification, path: str | Path) -> None:
-    """Write the base parameters as CSV: value, standard deviation, 95 % interval, description.
+    """Write the base parameters as CSV: value, deviation, 95 % interval, description, mark.
 
     Raises:
         OutputError: It cannot be written there.
@@ -36,11 +36,14 @@ def write_parameters(result: Identification, path: str | Path) -> None:
     columns = [result.values, result.std, *result.interval().T, result.nominal]
     with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
-        table.writerow(["parameter", "value", "std", "lower", "upper", "description", "group"])
-        for name, numbers, words in zip(
-            result.names, np.column_stack(columns).tolist(), result.base.groups, strict=True
-        ):
-            table.writerow([name, *map(repr, numbers), words])
+        table.writerow(
+            ["parameter", "value", "std", "lower", "upper", "description", "mark", "group"]
+        )
+        for name, numbers, mark, words in zip(
+            result.names, np.column_stack(columns).tolist(), result.marks, result.base.groups,
+            strict=True,
+        ):  # fmt: skip
+            table.writerow([name, *map(repr, numbers), mark, words])
 
 
 def write_machine(result: Identification, folder: str | Path) -> Path:
