@@ -158,12 +158,10 @@ class Recording:
         )
 
     def columns(self) -> dict[str, Array]:
-        """All columns (N,) by name, as they are written."""
-        return dict(zip(self._names(), self._values().T, strict=True))
-
-    def _values(self) -> Array:
-        """All columns (N, 1 + 3 n + channels)."""
-        return np.column_stack([self.time, self.q, self.v, self.tau, *self.channels.values()])
+        """All columns (N,) by name, as they are written; views, not copies."""
+        joints = [*self.q.T, *self.v.T, *self.tau.T]
+        columns = [self.time, *joints, *self.channels.values()]
+        return dict(zip(self._names(), columns, strict=True))
 
     def to_csv(self, path: str | Path) -> None:
         """Write the recording as CSV, whole or not at all.
@@ -174,7 +172,7 @@ class Recording:
         notes = {"crane recording": "", "machine": self.machine, "task": self.task}
         if self.controller:
             notes["controller"] = self.controller
-        timeseries.write(path, Table(self._units(), self._values(), notes))
+        timeseries.write_columns(path, self._units(), list(self.columns().values()), notes)
 
     @classmethod
     def from_csv(cls, path: str | Path) -> "Recording":

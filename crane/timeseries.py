@@ -93,13 +93,24 @@ def write(path: str | Path, table: Table) -> None:
     Raises:
         OutputError: It cannot be written there.
     """
-    head = [f"# {key}: {value}" if value else f"# {key}" for key, value in table.notes.items()]
-    head.append(",".join(f"{x} [{unit}]" if unit else x for x, unit in table.units.items()))
+    write_columns(path, table.units, list(table.values.T), table.notes)
+
+
+def write_columns(
+    path: str | Path, units: Mapping[str, str], columns: Sequence[Array], notes: Mapping[str, str]
+) -> None:
+    """The same of single columns (N,), of which no table has to be made.
+
+    Raises:
+        OutputError: It cannot be written there.
+    """
+    head = [f"# {key}: {value}" if value else f"# {key}" for key, value in notes.items()]
+    head.append(",".join(f"{x} [{unit}]" if unit else x for x, unit in units.items()))
     with replacing(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(head) + "\n")
-        for start in range(0, len(table.values), _ROWS_AT_ONCE):
-            rows = table.values[start : start + _ROWS_AT_ONCE].tolist()
-            file.write("".join([",".join(map(repr, row)) + "\n" for row in rows]))
+        for start in range(0, len(columns[0]), _ROWS_AT_ONCE):
+            rows = np.column_stack([x[start : start + _ROWS_AT_ONCE] for x in columns])
+            file.write("".join([",".join(map(repr, row)) + "\n" for row in rows.tolist()]))
 
 
 def read(path: str | Path) -> Table:

@@ -107,9 +107,14 @@ class Memory:
 
         v = at.v_a[:, self._column]
         w = np.empty_like(v)
-        ends = [*at.starts[1:], len(v)]
-        for start, end in zip(at.starts, ends, strict=True):
-            w[start:end] = lfilter([self._share], [1, self._share - 1], np.abs(v[start:end]))
+        state = at.memory.get(self, np.zeros(1))
+        edges = sorted({0, *at.starts, len(v)})
+        for start, end in zip(edges[:-1], edges[1:], strict=True):
+            if start in at.starts:
+                state = np.zeros(1)
+            part = np.abs(v[start:end])
+            w[start:end], state = lfilter([self._share], [1, self._share - 1], part, zi=state)
+        at.memory[self] = state
         out = np.zeros((*at.v_a.shape, 1))
         out[:, self._column, 0] = np.sign(v) * np.exp(-w / self._speed)
         return out

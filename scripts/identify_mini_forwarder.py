@@ -18,8 +18,9 @@ import numpy as np
 import crane
 from crane.identification.estimators import Prior
 from crane.identification.excitation import excite
-from crane.identification.identify import identify, prior_of_bodies
+from crane.identification.identify import identify
 from crane.identification.model import Inertial, Model, Term, friction
+from crane.identification.possible import prior_of_bodies
 from crane.rig import Rig, Tolerances, default_sensors
 
 SLOW = (0.05, 0.004, 0.004)  # beyond Stribeck velocities [rad/s], [m/s]: below, friction sticks

@@ -144,17 +144,24 @@ def identify(
 ) -> None:
     """Find a machine's parameters from a recording, and how well they predict."""
     from crane.identification.identify import identify as run
+    from crane.identification.write import check_rewritable
     from crane.runs import check_folder, read_run, write_identification
     from crane.samples import as_number
 
     check_folder(out, force)
     loaded = load(machine, lock)
-    learned = read_run(recording, loaded)
+    if feasible:
+        check_rewritable(loaded)
+    with status(f"reading {recording.name}"):
+        learned = read_run(recording, loaded)
     if bandwidth is not None:
         span = max(float(learned.time[-1] - learned.time[0]), 1e-3)
         as_number(bandwidth, "the bandwidth", "Hz", above=5 / span)
-    judge = None if validation is None else read_run(validation, loaded)
-    with status("identifying"):
+    judge = None
+    if validation is not None:
+        with status(f"reading {validation.name}"):
+            judge = read_run(validation, loaded)
+    with progress_bar("identifying") as progress:
         result = run(
             loaded,
             learned,
@@ -165,6 +172,7 @@ def identify(
             bandwidth=bandwidth,
             slow=by_joint("--slow", slow),
             trust=trust,
+            progress=progress,
         )
     with status("writing the report"):
         name = "" if validation is None else validation.name
@@ -188,7 +196,8 @@ def payload(
     from crane.runs import read_run
 
     loaded = load(machine, lock)
-    carried = read_run(recording, loaded)
-    with status("estimating"):
-        estimate = estimate_payload(loaded, carried, frame, method, trust=trust)
+    with status(f"reading {recording.name}"):
+        carried = read_run(recording, loaded)
+    with progress_bar("estimating") as progress:
+        estimate = estimate_payload(loaded, carried, frame, method, trust=trust, progress=progress)
     print(estimate.to_text(), end="")

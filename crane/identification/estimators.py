@@ -1,7 +1,8 @@
 """Parameters theta of y = W theta + noise, and how well they are known.
 
 Rows come from joints (`groups`) at instants (`samples`); rows may be missing. The noise of a
-joint may be correlated in time, and with that of the other joints at the same instant.
+joint may be correlated in time, and with that of the other joints at the same instant. The
+regressor is read in blocks of rows, see `rows.Regressor`, and may be larger than the memory.
 """
 
 import math
@@ -11,6 +12,7 @@ import numpy as np
 
 from crane.errors import InputError
 from crane.identification.noise import Noise, between
+from crane.identification.regressor import Regressor, Stored, factors, triangular
 from crane.samples import Array, Brief
 
 Prior = tuple[Array, Array]
@@ -21,6 +23,7 @@ _MAD = 1.482602218505602  # standard deviation over median absolute deviation of
 _CONVERGED = 1e-6  # standard deviations
 _ROUNDING = 1e-10  # of the forces
 _ROUNDS = 100
+_WAITING = 4096  # instants without rows that are passed at once
 _LEAST_SHARE = 0.2  # of the degrees of freedom, however many parameters take theirs
 
 
@@ -66,7 +69,7 @@ class Estimate(Brief):
 
 
 def least_squares(
-    W: Array,
+    W: Array | Regressor,
     y: Array,
     groups: np.ndarray | None = None,
     samples: np.ndarray | None = None,
@@ -77,7 +80,7 @@ def least_squares(
     The noise against which a prior counts is one number for all rows, taken from the residuals.
 
     Args:
-        W: Regressor (m, p).
+        W: Regressor (m, p), as an array or in blocks.
         y: Forces (m,).
         groups: Joint of each row (m,), 0, 1, ...; they differ in what their noise is like.
         samples: Number of the instant of each row (m,), increasing within a group.
@@ -86,12 +89,12 @@ def least_squares(
     Raises:
         InputError: Shapes, too few rows, or columns that depend on each other.
     """
-    rows = _Rows(W, W, y, groups, samples, prior)
-    return rows.estimate(lambda e: np.full(len(e), max(_rms(e), rows.smallest)))
+    rows = _Rows(W, None, y, groups, samples, prior)
+    return rows.estimate(rows.common)
 
 
 def weighted(
-    W: Array,
+    W: Array | Regressor,
     y: Array,
     groups: np.ndarray,
     samples: np.ndarray | None = None,
@@ -101,12 +104,12 @@ def weighted(
 
     Arguments and errors as for `least_squares`.
     """
-    rows = _Rows(W, W, y, groups, samples, prior)
+    rows = _Rows(W, None, y, groups, samples, prior)
     return rows.estimate(rows.scales)
 
 
 def huber(
-    W: Array,
+    W: Array | Regressor,
     y: Array,
     groups: np.ndarray | None = None,
     samples: np.ndarray | None = None,
@@ -120,8 +123,7 @@ def huber(
 
     Arguments and errors as for `least_squares`.
     """
-    rows = _Rows(W, W, y, groups, samples, prior)
-    return rows.estimate(rows.robust_scales, _TURN)
+    return _Rows(W, None, y, groups, samples, prior).robust()
 
 
 def instrumental(
@@ -143,6 +145,33 @@ def instrumental(
     """
     rows = _Rows(W, Z, y, groups, samples, prior)
     return rows.estimate(rows.scales)
+
+
+def judged(
+    W: Array | Regressor,
+    y: Array,
+    groups: np.ndarray,
+    samples: np.ndarray | None,
+    values: Array,
+    noise: Array,
+    pull: Array,
+) -> Estimate:
+    """How well parameters are known that are the minimum of something else than least squares.
+
+    Args:
+        W: Regressor (m, p), as an array or in blocks.
+        y: Forces (m,).
+        groups: Joint of each row (m,).
+        samples: Number of the instant of each row (m,).
+        values: Minimum (p,) of |(y - W theta) / noise|^2 + c(theta).
+        noise: Of each group (g,).
+        pull: L (k, p), L^T L half of the second derivative of c there.
+
+    Returns:
+        Theirs, with the covariance of `weighted` for a prior whose rows are L.
+    """
+    rows = _Rows(W, None, y, groups, samples, None, pull)
+    return rows.judge(values, rows.residuals(values), noise, math.inf)
 
 
 def essential(estimate: Estimate, level: float = 0.05) -> np.ndarray:
@@ -186,39 +215,48 @@ def essential(estimate: Estimate, level: float = 0.05) -> np.ndarray:
 class _Rows:
     """Equations and how to solve them: one engine for all estimators.
 
-    With weights D = diag(1 / s^2) and prior rows L = diag(1 / std) appended to W, Z and y, the
-    estimate solves Q^T W' theta = Q^T y', where Q R = Z' are the appended and weighted Z.
+    With weights D = diag(1 / s^2) and prior rows L, such as diag(1 / std), appended to W, Z and
+    y, the estimate solves Q^T W' theta = Q^T y', where Q R = Z' are the appended and weighted Z.
+    Of the regressor, only the triangular factors of each group's rows are held: as long as all
+    rows of a group weigh the same, they tell everything but the single residuals.
     """
 
     def __init__(
         self,
-        W: Array,
-        Z: Array,
+        W: Array | Regressor,
+        Z: Array | None,
         y: Array,
         groups: np.ndarray | None,
         samples: np.ndarray | None,
         prior: Prior | None,
+        pull: Array | None = None,
     ):
-        count, size = np.shape(W)
+        count, size = np.shape(W) if isinstance(W, np.ndarray) else W.shape
         groups = np.zeros(count, int) if groups is None else np.asarray(groups)
         samples = np.arange(count) if samples is None else np.asarray(samples)
         shapes = {"y": np.shape(y), "groups": groups.shape, "samples": samples.shape}
         for name, shape in shapes.items():
             if shape != (count,):
                 raise InputError(f"{name} has the shape {shape}, give ({count},)")
-        if np.shape(Z) != (count, size):
+        if Z is not None and np.shape(Z) != (count, size):
             raise InputError(f"instruments have the shape {np.shape(Z)}, give {(count, size)}")
-        for name, array in (("regressor", W), ("instruments", Z), ("forces", y)):
-            if not np.isfinite(array).all():
-                at = int(np.argwhere(~np.isfinite(array))[0, 0])
-                raise InputError(f"{name} not finite in row {at}, leave such rows out")
-        self.W, self.Z, self.y = W, Z, y
+        self._order: np.ndarray | None = None  # in which the rows come, by time
+        if isinstance(W, np.ndarray):
+            if (np.diff(samples) < 0).any():
+                self._order = np.argsort(samples, kind="stable")
+                W, y = W[self._order], y[self._order]
+                groups, samples = groups[self._order], samples[self._order]
+                Z = None if Z is None else Z[self._order]
+            W = Stored(W, samples)
+        self.W, self.y, self.samples = W, y, samples
+        self.Z = W if Z is None else Stored(Z, samples)
         self.members = [np.flatnonzero(groups == g) for g in range(int(groups.max()) + 1)]
-        self.samples = samples
+        self.groups = groups
         for g, rows in enumerate(self.members):
             if len(rows) < 2 or (np.diff(samples[rows]) <= 0).any():
                 raise InputError(f"samples of group {g} do not increase, sort its rows by time")
-        self.mean, self.weight = np.zeros(size), np.zeros(size)
+        self.mean = np.zeros(size)
+        self.pull = np.zeros((0, size)) if pull is None else pull
         if prior is not None:
             mean, std = (np.asarray(x, dtype=np.float64) for x in prior)
             if mean.shape != (size,) or std.shape != (size,):
@@ -228,51 +266,96 @@ class _Rows:
                 )
             if not (std > 0).all():
                 raise InputError(f"the prior has the deviation {std.min():g}, give one above 0")
-            self.mean, self.weight = mean, 1 / std
-        if count + np.count_nonzero(self.weight) <= size:
+            self.mean, self.pull = mean, np.diag(1 / std)
+        if count + np.count_nonzero(self.pull) <= size:
             raise InputError(f"{count} rows for {size} parameters are too few, record longer")
+        self.plain = (
+            W.factors(y, groups) if Z is None else factors(W, y, groups, Z=self.Z)
+        )  # of unweighted rows (g, k, k)
+        if not np.isfinite(self.plain).all():
+            self._refuse_not_finite()
         # of what counts as noise, so that equations that hold to rounding settle
         self.smallest = _ROUNDING * max(_rms(y), np.finfo(float).tiny)
 
-    def scales(self, e: Array) -> Array:
-        """Standard deviation of each row's group (m,)."""
-        return self._per_group(e, _rms)
+    def _refuse_not_finite(self) -> None:
+        order = np.arange(len(self.y)) if self._order is None else self._order
+        for name, matrix in (("regressor", self.W), ("instruments", self.Z)):
+            bad = [order[rows][~np.isfinite(W).all(axis=1)] for rows, W in matrix.blocks()]
+            if (at := np.concatenate(bad)).size:
+                raise InputError(f"{name} not finite in row {at.min()}, leave such rows out")
+        at = order[~np.isfinite(self.y)]
+        raise InputError(f"forces not finite in row {at.min()}, leave such rows out")
 
-    def robust_scales(self, e: Array) -> Array:
-        """The same from medians."""
-        return self._per_group(e, lambda x: _MAD * float(np.median(np.abs(x))))
+    def common(self, theta: Array) -> Array:
+        """One standard deviation for all rows, at each group (g,)."""
+        left = np.linalg.norm(self._left(theta)) / math.sqrt(len(self.y))
+        return np.full(len(self.members), max(float(left), self.smallest))
 
-    def _per_group(self, e: Array, scale) -> Array:  # type: ignore[no-untyped-def]
-        out = np.empty(len(e))
-        for rows in self.members:
-            out[rows] = max(scale(e[rows]), self.smallest)
-        return out
+    def scales(self, theta: Array) -> Array:
+        """Standard deviation of each group (g,)."""
+        counts = np.array([len(rows) for rows in self.members])
+        return np.maximum(self._left(theta) / np.sqrt(counts), self.smallest)
 
-    def estimate(self, scales, turn: float = math.inf) -> Estimate:  # type: ignore[no-untyped-def]
-        """Solve with the scales that the residuals ask for, until nothing changes."""
-        s = scales(self.y)
-        shares = np.ones(len(s))
-        theta = np.full(len(self.mean), np.inf)
-        for _ in range(_ROUNDS):
+    def _left(self, theta: Array) -> Array:
+        """|y - W theta| of each group (g,), from the triangular factors."""
+        size = len(self.mean)
+        return np.linalg.norm(
+            self.plain[:, :, -1] - self.plain[:, :, -1 - size : -1] @ theta, axis=1
+        )
+
+    def _robust_scales(self, e: Array) -> Array:
+        """The same from medians of residuals (m,)."""
+        found = [_MAD * float(np.median(np.abs(e[rows]))) for rows in self.members]
+        return np.maximum(found, self.smallest)
+
+    def residuals(self, theta: Array) -> Array:
+        """Residuals y - W theta (m,)."""
+        e = np.array(self.y, dtype=np.float64)
+        for rows, W in self.W.blocks():
+            e[rows] -= W @ theta
+        return e
+
+    def estimate(self, scales) -> Estimate:  # type: ignore[no-untyped-def]
+        """Solve with the scales of the groups that the residuals ask for, until both agree."""
+        theta, s = np.zeros(len(self.mean)), scales(np.zeros(len(self.mean)))
+        for round_ in range(_ROUNDS):
             before = theta
-            theta, Q, A = self._solve(s / np.sqrt(shares))
-            e = self.y - self.W @ theta
-            with np.errstate(invalid="ignore"):
-                if np.abs(A @ (theta - before)).max() < _CONVERGED:
-                    break
-            s = scales(e)
-            shares = np.minimum(1, turn * s / np.maximum(np.abs(e), self.smallest))
-        return self._judge(theta, e, s, turn)
+            theta, _, A = self._solve(self.plain, s)
+            if round_ and np.abs(A @ (theta - before)).max() < _CONVERGED:
+                break
+            s = scales(theta)
+        return self.judge(theta, self.residuals(theta), s, math.inf)
 
-    def _solve(self, s: Array) -> tuple[Array, Array, Array]:
-        """theta, orthonormal Q of the instruments (m + p, p), and Q^T W."""
-        prior = np.diag(self.weight)
-        W, Z = (np.vstack([X / s[:, None], prior]) for X in (self.W, self.Z))
-        y = np.concatenate([self.y / s, self.weight * self.mean])
-        length = np.linalg.norm(Z, axis=0)
+    def robust(self) -> Estimate:
+        """The same with rows of large residuals counting less, see `huber`."""
+        e, R = self.y, self.plain
+        s, theta = self._robust_scales(e), np.zeros(len(self.mean))
+        for round_ in range(_ROUNDS):
+            before = theta
+            theta, _, A = self._solve(R, s)
+            e = self.residuals(theta)
+            if round_ and np.abs(A @ (theta - before)).max() < _CONVERGED:
+                break
+            s = self._robust_scales(e)
+            clip = _TURN * s[self.groups]
+            shares = np.minimum(1, clip / np.maximum(np.abs(e), self.smallest))
+            R = factors(self.W, self.y, self.groups, np.sqrt(shares))
+        return self.judge(theta, e, s, _TURN)
+
+    def _solve(self, plain: Array, s: Array) -> tuple[Array, Array, Array]:
+        """theta, R (p, p) of the weighted instruments with the prior's rows, and Q^T W.
+
+        Args:
+            plain: Triangular factors of [W y], or of [Z W y], of the groups (g, k, k).
+            s: Standard deviations of the groups (g,).
+        """
+        size = len(self.mean)
+        copies = [self.pull] * ((plain.shape[2] - 1) // size)
+        prior = np.column_stack([*copies, self.pull @ self.mean])
+        whole = triangular(np.vstack([*(plain / s[:, None, None]), prior]))
+        R, A, right = whole[:size, :size], whole[:size, -1 - size : -1], whole[:size, -1]
+        length = np.linalg.norm(R, axis=0)
         length[length == 0] = 1.0
-        Q, R = np.linalg.qr(Z / length)
-        A = R * length if self.W is self.Z else Q.T @ W
         values = np.linalg.svd(A / length, compute_uv=False)
         if values[-1] < np.finfo(float).eps * len(A) * values[0]:
             raise InputError(
@@ -280,9 +363,9 @@ class _Rows:
                 f"{values[0] / max(values[-1], 1e-300):.1g}), take base parameters, or a prior "
                 "with finite deviations of those that do"
             )
-        return np.linalg.solve(A, Q.T @ y), Q, A
+        return np.asarray(np.linalg.solve(A, right), dtype=np.float64), R, A
 
-    def _judge(self, theta: Array, e: Array, s: Array, turn: float) -> Estimate:
+    def judge(self, theta: Array, e: Array, s: Array, turn: float) -> Estimate:
         """Covariance of theta: A^-1 (sum of Q^T noise) A^-T with the noise's correlations.
 
         The noise of joint i is modelled as autoregressive, a_i(z) e_i = u_i, with covariances
@@ -294,52 +377,81 @@ class _Rows:
         of freedom f (`Noise.known`, m for white noise), of which the fit takes p: the
         covariance is multiplied by f / (f - p), and f - p are those of the intervals.
         """
-        clipped = np.clip(e, -turn * s, turn * s) / s
-        unclipped = float(np.mean(np.abs(e) <= turn * s))
-        Q, A = self._solve(s / math.sqrt(unclipped))[1:]
-        inner = Q[: len(e)]
+        every = s[self.groups]
+        clipped = np.clip(e, -turn * every, turn * every)
+        unclipped = float(np.mean(np.abs(e) <= turn * every))
+        count, inflated = len(e), math.sqrt(len(e) / max(len(e) - len(theta), 1))
+        noise = inflated * np.array([_rms(clipped[rows]) for rows in self.members])
+        clipped /= every
+        del every
         noises = [Noise.of(clipped[rows], self.samples[rows]) for rows in self.members]
-        span = int(self.samples.min()), int(self.samples.max())
-        memory = max(noise.memory for noise in noises)
-        filtered = [
-            noise.spread(inner[rows], self.samples[rows] - span[0], span[1] - span[0] + 1, memory)
-            for noise, rows in zip(noises, self.members, strict=True)
-        ]
-        S = between(noises)
-        middle = np.zeros((len(theta), len(theta)))
-        for i, one in enumerate(filtered):
-            other = sum(S[i, j] * filtered[j] for j in range(len(filtered)))
-            middle += one.T @ other
+        del clipped
+        weights = s / math.sqrt(unclipped)
+        _, R, A = self._solve(self.plain, weights)
+        middle = self._coloured(R, weights, noises)
         known = sum(noise.known for noise in noises)
         freedom = max(known - len(theta), _LEAST_SHARE * known)
         middle *= known / freedom / unclipped
-        middle += Q[len(e) :].T @ Q[len(e) :]
+        prior = np.linalg.solve(R.T, self.pull.T)
+        middle += prior @ prior.T
         inverse = np.linalg.inv(A)
-        plain, scaled = conditions(self.W)
-        inflated = math.sqrt(len(e) / max(len(e) - len(theta), 1))
+        plain, scaled = conditions(np.vstack(list(self.plain[:, :, -1 - len(theta) : -1])))
+        if self._order is not None:
+            e, ordered = np.empty(count), e
+            e[self._order] = ordered
         return Estimate(
             values=theta,
             covariance=inverse @ (0.5 * (middle + middle.T)) @ inverse.T,
             residuals=e,
-            noise=inflated * np.array([_rms((clipped * s)[rows]) for rows in self.members]),
+            noise=noise,
             effective=np.array([noise.effective for noise in noises]),
             freedom=freedom,
             condition=plain,
             scaled_condition=scaled,
         )
 
+    def _coloured(self, R: Array, s: Array, noises: list[Noise]) -> Array:
+        """Q^T (covariance of the noise) Q (p, p), Q = Z / s R^-1, from the last row on."""
+        from scipy.linalg import solve_triangular
+
+        S, size = between(noises), len(R)
+        carried = [noise.at_rest(size) for noise in noises]
+        middle = np.zeros((size, size))
+
+        def pass_on(count: int, at: np.ndarray, groups: np.ndarray, Q: Array) -> None:
+            """So many instants, the last of which is 0, the one before it 1; Q (p, rows)."""
+            filtered = []
+            for i, noise in enumerate(noises):
+                dense = np.zeros((size, count))
+                dense[:, at[groups == i]] = Q[:, groups == i]
+                out, carried[i] = noise.pass_on(dense, carried[i])
+                filtered.append(out)
+            for i, one in enumerate(filtered):
+                middle[:] += one @ sum(S[i, j] * other.T for j, other in enumerate(filtered))
+
+        def wait(count: int) -> None:
+            nothing = np.zeros(0, dtype=np.intp)
+            for start in range(0, count, _WAITING):
+                pass_on(min(_WAITING, count - start), nothing, nothing, np.zeros((size, 0)))
+
+        last = int(self.samples[-1]) + 1
+        for rows, block in self.Z.blocks(backwards=True):
+            at, groups = self.samples[rows], self.groups[rows]
+            Q = solve_triangular(R, (block / s[groups, None]).T, trans="T")
+            wait(last - 1 - int(at[-1]))
+            pass_on(int(at[-1] - at[0]) + 1, at[-1] - at, groups, Q)
+            last = int(at[0])
+        wait(max(noise.memory for noise in noises))
+        return middle
+
 
 def _rms(e: Array) -> float:
     return math.sqrt(np.mean(np.square(e)))
 
 
-def _lengths(W: Array) -> Array:
-    return np.linalg.norm(W, axis=0)
-
-
 def conditions(W: Array) -> tuple[float, float]:
-    """Condition numbers of W, and of W with columns of length one."""
-    return _condition(W), _condition(W / np.maximum(_lengths(W), 1e-300))
+    """Condition numbers of W, or of its triangular factor, and with columns of length one."""
+    return _condition(W), _condition(W / np.maximum(np.linalg.norm(W, axis=0), 1e-300))
 
 
 def _condition(W: Array) -> float:

@@ -55,6 +55,12 @@ def pseudo_inertia(parameters: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
+def body_size(body: Array) -> tuple[float, float]:
+    """Mass [kg], and root of the mean square distance of the mass from the origin [m]."""
+    P = pseudo_inertia(body)
+    return float(body[0]), float(np.sqrt(max(np.trace(P[:3, :3]), 0.0) / body[0]))
+
+
 def body_parameters(P: Array) -> Array:
     """The ten parameters (..., 10) from P (..., 4, 4): the inverse of `pseudo_inertia`."""
     P = np.asarray(P)
@@ -167,6 +173,20 @@ def feasible(
             ]
         ),
     )
+
+
+def curvature(body: Array) -> Array:
+    """L (16, 10) with L^T L the second derivative of d(P, P0) by the parameters of a body.
+
+    d = tr(P0^-1 P) - log det(P0^-1 P) - 4, so d'' = |P^-1/2 dP P^-1/2|^2, whatever P0 is.
+
+    Args:
+        body: Parameters (10,), of P.
+    """
+    half = np.linalg.cholesky(pseudo_inertia(body))
+    first = np.linalg.solve(half, pseudo_inertia(np.eye(10)))
+    whole = np.linalg.solve(half, np.swapaxes(first, 1, 2))
+    return whole.reshape(10, 16).T
 
 
 def _check_arguments(

@@ -1,12 +1,13 @@
 """From a recording to parameters."""
 
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.errors import InputError, RecordingError, known
+from crane.errors import CraneWarning, InputError, RecordingError, known
 from crane.identification.base import Base, base_parameters
 from crane.identification.checks import (
     check,
@@ -19,20 +20,15 @@ from crane.identification.checks import (
     without_outliers,
 )
 from crane.identification.delays import delays, motion_frequency
+from crane.identification.determined import advice, magnitudes
+from crane.identification.equations import Equations, Progress
 from crane.identification.estimators import Prior, conditions, huber, least_squares, weighted
-from crane.identification.feasible import feasible as feasible_estimate
-from crane.identification.feasible import pseudo_inertia
-from crane.identification.model import Model, Samples, Term
+from crane.identification.model import Model, Term
 from crane.identification.outliers import outliers, repaired
+from crane.identification.possible import possible, prior_of_bodies
 from crane.identification.priors import check_told, checked
-from crane.identification.result import Comparison, Identification
-from crane.identification.signals import (
-    Motion,
-    differentiate,
-    filter_rows,
-    moving,
-    resample,
-)
+from crane.identification.result import Identification
+from crane.identification.signals import Motion, differentiate, resample
 from crane.machine import Machine
 from crane.measured import moved_locks
 from crane.recording import FORCE, Recording
@@ -41,37 +37,8 @@ from crane.samples import Array, as_number
 METHODS = {"ols": least_squares, "wls": weighted, "huber": huber}
 _SLOW = 0.02  # of a joint's largest velocity, below which its rows are left out
 _FAST = 40.0  # times the frequency below which 99 % of the accelerations are
-_FEWEST = 5.0  # periods of the filter's cutoff in a recording
 _MOVES = 10.0  # times the frequency of the motion, above which a line in a spectrum is hum
-_EXACT = 1e-4  # of the forces, noise that a feasible estimate counts with at least
-_PRIORS = 1e-7, 1e6  # above and up to which a relative standard deviation lies
-_PRIOR = 0.3  # relative standard deviation of a body towards which a feasible estimate is drawn
-_THICKNESS = 0.05  # of a body's size, added to what is thinner in a prior
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """Equations of a recording, filtered and thinned: y = W beta.
-
-    Attributes:
-        time: (M,) [s].
-        W: (M, n, r).
-        y: (M, n).
-        offset: (M, n) forces that no parameter changes, to be added to W beta.
-        moving: (M, n).
-    """
-
-    time: Array
-    W: Array
-    y: Array
-    offset: Array
-    moving: np.ndarray
-
-    def stacked(self) -> tuple[Array, Array, np.ndarray, np.ndarray]:
-        """Rows that count, joint after joint: W (m, r), y (m,), joint and instant of each."""
-        joint, instant = np.nonzero(self.moving.T)
-        _, group = np.unique(joint, return_inverse=True)
-        return self.W[instant, joint], self.y[instant, joint], group, instant
+_PART = 0.3  # of what is left to do that one pass over a recording is taken for
 
 
 def motion_of(
@@ -80,6 +47,7 @@ def motion_of(
     derivatives: str = "kalman",
     cutoff: float | None = None,
     trust: bool = False,
+    progress: Progress | None = None,
 ) -> Motion:
     """Velocities and accelerations of a recording, which is checked first.
 
@@ -92,6 +60,7 @@ def motion_of(
         cutoff: [Hz] of "lowpass".
         trust: Whether what is most likely wrong with the recording is only told, and outliers
             are left in.
+        progress: Takes the finished share.
 
     Raises:
         RecordingError: What is recorded cannot serve; the message names column and time.
@@ -126,6 +95,7 @@ def motion_of(
     if np.any(v):  # only compared; where no velocities were recorded, derivatives of outliers
         v = np.column_stack([repaired(x, outliers(x)) for x in v.T])
     check(time, q, tau, machine.active, units, v if np.any(v) else None, bounded, trust=trust)
+    del v, raw
     step = float(np.median(np.diff(time)))
     columns = np.column_stack([q, tau])
     if np.abs(np.diff(time) - step).max() > 1e-3 * step:
@@ -133,7 +103,7 @@ def motion_of(
     q, tau = np.split(columns, 2, axis=1)
     lowest = _MOVES * motion_frequency(q, step)
     tell_hum(time, dict(zip(names, columns.T, strict=True)), lowest)
-    found = differentiate(time, q, derivatives, cutoff)
+    found = differentiate(time, q, derivatives, cutoff, progress)
     return Motion(time, found.q, found.v, found.a, tau)
 
 
@@ -149,6 +119,7 @@ def identify(
     bandwidth: float | None = None,
     slow: Mapping[str, float] | ArrayLike | None = None,
     trust: bool = False,
+    progress: Progress | None = None,
 ) -> Identification:
     """Base parameters of a machine from recorded strokes and forces.
 
@@ -172,6 +143,7 @@ def identify(
             largest if not given. A few times that over which friction at rest fades.
         trust: Whether a recording that is most likely wrong is taken nevertheless: why it is so
             is told as a warning, and outliers are left in.
+        progress: Takes the finished share.
 
     Returns:
         Parameters, their confidence, and how well they predict both recordings.
@@ -183,105 +155,111 @@ def identify(
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
     model = Model(machine, terms)
-    motion = _motion(machine, recording, trust)
-    base = base_parameters(model)
-    if bandwidth is None:
-        bandwidth = _bandwidth(motion)
-    bandwidth = as_number(bandwidth, "the bandwidth", "Hz", above=0)
-    fastest = np.abs(motion.v).max(axis=0)
-    limits = _slow(machine, slow, fastest)
-    rows = _equations(model, base, motion, bandwidth, limits)
+    if feasible and not model.bodies:
+        raise InputError("the model has no bodies, so nothing has to be feasible")
+    finished, progress = progress, in_parts(progress)
+    motion = _motion(machine, recording, trust, progress)
+    rows, told = equations_of(model, motion, bandwidth, slow, progress)
     if model.bodies:
-        _check_forces(model, base, motion, rows, limits, trust)
-    W, y, groups, instants = rows.stacked()
-    if not len(y):
-        raise RecordingError("no joint moves faster than what counts as standstill, move it more")
-    told = base.narrowed(W)
-    picked = np.searchsorted(base.independent, told.independent)
+        _check_forces(model, motion, rows, trust)
+    selection = rows.selection(told)
     if isinstance(prior, int | float):
         prior = prior_of_bodies(model, prior)
     elif prior is not None:
-        prior = checked(model, base, prior, feasible)
+        prior = checked(model, rows.base, prior, feasible)
     parameters = None
+    columns = rows.columns(selection)
+    if prior is None or feasible:
+        estimate = METHODS[method](columns, rows.y, rows.groups, rows.samples)
+    else:
+        every = rows.columns(selection @ told.grouping)
+        told_by = np.vstack(list(rows.factors[:, :, :-1] @ selection @ told.grouping))
+        check_told(model.names, told_by, prior)
+        estimate = METHODS[method](every, rows.y, rows.groups, rows.samples, prior)
+    values, covariance = estimate.values, estimate.covariance
     if feasible:
-        estimate = METHODS[method](W[:, picked], y, groups, instants)
-        parameters = _possible(model, told, W[:, picked], y, estimate.noise[groups], prior)
-        values, covariance = told.values(parameters), estimate.covariance
-    elif prior is not None:
-        check_told(model.names, W[:, picked] @ told.grouping, prior)
-        estimate = METHODS[method](W[:, picked] @ told.grouping, y, groups, instants, prior)
-        plain, scaled = conditions(W[:, picked])
+        estimate = possible(model, told, rows, selection, estimate, prior)
+    if feasible or prior is not None:
+        plain, scaled = conditions(np.vstack(list(rows.factors[:, :, :-1] @ selection)))
         estimate = replace(estimate, condition=plain, scaled_condition=scaled)
         parameters = estimate.values
         values = told.values(parameters)
         covariance = told.grouping @ estimate.covariance @ told.grouping.T
-    else:
-        estimate = METHODS[method](W[:, picked], y, groups, instants)
-        values, covariance = estimate.values, estimate.covariance
-
-    def compare(rows: _Rows) -> Comparison:
-        modelled = rows.W[:, :, picked] @ values + rows.offset
-        return Comparison(rows.time, rows.y + rows.offset, modelled, rows.moving, machine.active)
-
-    judged = None
+    training, judged = rows.compare(selection @ values), None
+    size = magnitudes(model, told, columns.factors(rows.y, rows.groups))
+    base, bandwidth, limits = rows.base, rows.bandwidth, rows.slow
+    del rows, columns
     if validation is not None:
-        other = _motion(machine, validation, trust)
-        judged = compare(_equations(model, base, other, bandwidth, limits))
-        tell_validation(compare(rows), judged)
-    return Identification(
-        model, told, values, covariance, parameters, estimate, method, feasible,
-        compare(rows), judged,
+        other = _motion(machine, validation, trust, progress)
+        judge = Equations(model, base, other, bandwidth, limits, progress)
+        judged = judge.compare(selection @ values)
+        tell_validation(training, judged)
+    if finished is not None:
+        finished(1.0)
+    found = Identification(
+        model, told, values, covariance, parameters, estimate, method, feasible, training, size,
+        advice(machine, motion), judged,
     )  # fmt: skip
+    if found.doubt:
+        warnings.warn(found.doubt, CraneWarning, stacklevel=2)
+    return found
 
 
-def _motion(machine: Machine, recording: Recording | Motion, trust: bool) -> Motion:
+def equations_of(
+    model: Model,
+    motion: Motion,
+    bandwidth: float | None = None,
+    slow: Mapping[str, float] | ArrayLike | None = None,
+    progress: Progress | None = None,
+) -> tuple[Equations, Base]:
+    """Equations of a motion, and what of the base parameters it tells.
+
+    Arguments and errors as for `identify`.
+    """
+    if bandwidth is None:
+        bandwidth = _bandwidth(motion)
+    bandwidth = as_number(bandwidth, "the bandwidth", "Hz", above=0)
+    limits = _slow(model.machine, slow, np.abs(motion.v).max(axis=0))
+    rows = Equations(model, base_parameters(model), motion, bandwidth, limits, progress)
+    if not rows.moving.any():
+        raise RecordingError("no joint moves faster than what counts as standstill, move it more")
+    # of columns, the triangular factors tell what all rows tell
+    return rows, rows.base.narrowed(np.vstack(list(rows.factors[:, :, :-1])))
+
+
+def _motion(
+    machine: Machine, recording: Recording | Motion, trust: bool, progress: Progress | None
+) -> Motion:
     if isinstance(recording, Motion):
         return recording
-    return motion_of(machine, recording, trust=trust)
+    return motion_of(machine, recording, trust=trust, progress=progress)
 
 
-def _check_forces(
-    model: Model, base: Base, motion: Motion, rows: _Rows, slow: Array, trust: bool
-) -> None:
+def _check_forces(model: Model, motion: Motion, rows: Equations, trust: bool) -> None:
     """Doubts about the forces of a recording, by what the model can say."""
     every = max(1, round((rows.time[1] - rows.time[0]) / (motion.time[1] - motion.time[0])))
-    thinned = Motion(
-        rows.time, motion.q[::every], motion.v[::every], motion.a[::every], rows.y + rows.offset
+    parts = (x[::every] for x in (motion.q, motion.v, motion.a))
+    modelled = rows.compare(rows.base.values(model.nominal)).modelled
+    check_forces(
+        Motion(rows.time, *parts, rows.forces), modelled, model.machine.active, trust=trust
     )
-    modelled = rows.W @ base.values(model.nominal) + rows.offset
-    check_forces(thinned, modelled, model.machine.active, trust=trust)
-    tell_delays(model.machine.active, *delays(model, base, motion, slow))
+    tell_delays(model.machine.active, *delays(model, rows.base, motion, rows.slow))
 
 
-def _equations(
-    model: Model, base: Base, motion: Motion, bandwidth: float, slow: ArrayLike
-) -> _Rows:
-    """Both sides at the samples of a motion, filtered and thinned."""
-    from scipy.ndimage import binary_dilation
+def in_parts(progress: Progress | None) -> Progress | None:
+    """One bar for passes whose number is not known: each takes a share of what is left."""
+    if progress is None:
+        return None
+    done = 0.0
 
-    at: Samples = model.samples(motion.q, motion.v, motion.a)
-    W = model.regressor(at)[:, :, base.independent]
-    offset = model.known(at)
-    step = float(motion.time[1] - motion.time[0])
-    duration = float(motion.time[-1] - motion.time[0])
-    if bandwidth * duration < _FEWEST:
-        raise InputError(
-            f"a bandwidth of {bandwidth:g} Hz leaves nothing of {duration:g} s, give at least "
-            f"{_FEWEST / duration:.2g} Hz"
-        )
-    thinning = max(1, int(0.25 / (step * bandwidth)))
-    both = np.concatenate([W, offset[:, :, None]], axis=2)
-    if bandwidth * step < 0.25:
-        both, tau = filter_rows(both, motion.tau, step, bandwidth, thinning)
-    else:
-        tau, thinning = motion.tau, 1
-    W, offset = both[:, :, :-1], both[:, :, -1]
-    # near standstill friction is none of its shapes, as far as the filter carries it
-    stuck = ~moving(motion.v, slow)
-    reach = round(0.5 / (step * bandwidth))
-    window = np.ones((2 * reach + 1, 1), dtype=bool)
-    kept = ~binary_dilation(stuck, window)[::thinning]
-    return _Rows(motion.time[::thinning], W, tau - offset, offset, kept)
+    def report(share: float) -> None:
+        nonlocal done
+        now = done + _PART * (1 - done) * share
+        progress(now)
+        if share >= 1:
+            done = now
+
+    return report
 
 
 def _slow(machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastest: Array) -> Array:
@@ -315,74 +293,3 @@ def _bandwidth(motion: Motion) -> float:
         if np.ptp(a) > 0
     )
     return min(_FAST * max(last, frequency[1]), 0.24 / step)
-
-
-def prior_of_bodies(model: Model, relative: float) -> Prior:
-    """Bodies as described, each known to a share of its mass and size; of others nothing.
-
-    Returns:
-        Means (p,) and standard deviations (p,), infinite for what is no body.
-
-    Raises:
-        InputError: The share is not from 1e-7 to 1e6.
-    """
-    relative = as_number(relative, "the prior's relative standard deviation", "", *_PRIORS)
-    std = np.full(len(model.names), np.inf)
-    for i in range(len(model.bodies)):
-        mass, length = _size(model.nominal[10 * i : 10 * i + 10])
-        units = np.array([1.0, *[length] * 3, *[length**2] * 6])
-        std[10 * i : 10 * i + 10] = relative * mass * units
-    mean = np.where(np.isfinite(std), model.nominal, 0.0)
-    return mean, std
-
-
-def _size(body: Array) -> tuple[float, float]:
-    """Mass, and the root of the mean square distance of the mass from the joint's origin."""
-    P = pseudo_inertia(body)
-    return float(body[0]), float(np.sqrt(max(np.trace(P[:3, :3]), 0.0) / body[0]))
-
-
-def _possible(
-    model: Model, base: Base, W: Array, y: Array, noise: Array, prior: Prior | None
-) -> Array:
-    """All parameters, with bodies that can exist."""
-    if not model.bodies:
-        raise InputError("the model has no bodies, so nothing has to be feasible")
-    count = 10 * len(model.bodies)
-    mean, weight = model.nominal.copy(), _PRIOR**-2
-    spread = np.full(len(mean) - count, np.inf)
-    if prior is not None:
-        mean = prior[0].copy()
-        spread = prior[1][count:]
-        sizes = [_size(mean[i : i + 10])[0] for i in range(0, count, 10)]
-        weight = float(np.median(prior[1][:count:10] / sizes)) ** -2
-    for i in range(0, count, 10):
-        mean[i : i + 10] = _thick(mean[i : i + 10])
-    signs = [i for i, sign in enumerate(model.signs) if sign and i >= count]
-    size = np.sqrt(np.mean(y**2))
-    noise = np.maximum(noise, _EXACT * size)
-    # none of the others makes more than all of the force; without that, two that do the same in
-    # this motion may grow without end
-    alone = np.sqrt(np.mean((W @ base.grouping[:, count:]) ** 2, axis=0))
-    spread = np.minimum(spread, size / np.where(alone > 0, alone, size))
-    found = feasible_estimate(
-        W @ base.grouping, y, 1 / noise, model.bodies, mean, weight, spread, signs
-    )
-    return found.values
-
-
-def _thick(body: Array) -> Array:
-    """A body at least a share of its size thick in every direction.
-
-    Rods and plates without thickness lie on the edge of what can exist.
-    """
-    from crane.identification.feasible import body_parameters
-
-    P = pseudo_inertia(body)
-    mass, length = _size(body)
-    com = P[:3, 3] / mass
-    second = P[:3, :3] - mass * np.outer(com, com)
-    values, axes = np.linalg.eigh(second)
-    least = mass * (_THICKNESS * length) ** 2
-    P[:3, :3] = axes @ np.diag(np.maximum(values, least)) @ axes.T + mass * np.outer(com, com)
-    return body_parameters(P)

@@ -1,8 +1,8 @@
 """tau = W beta: the drives' forces as linear functions of a machine's parameters."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,6 +28,8 @@ class Samples(Brief):
         q: (N, nq) all coordinates.
         gamma: (N, nv, n).
         starts: Indices where recordings begin: what depends on the past starts anew there.
+        memory: Of a part of a longer motion, what each term that depends on the past has kept of
+            the part before, by term; it puts there (anew, not in place) what the next one needs.
     """
 
     q_a: Array
@@ -36,6 +38,7 @@ class Samples(Brief):
     q: Array
     gamma: Array
     starts: Sequence[int] = (0,)
+    memory: dict[object, Any] = field(default_factory=dict)
 
 
 class Term(Protocol):
@@ -220,9 +223,10 @@ class Presliding:
             way = at.q[:, self._machine.column(self._direction.name)]
         else:
             way = np.einsum("ij,ij->i", rows, at.q_a)
-        steps = np.diff(way, prepend=way[0]) / self._length
+        state, last = at.memory.get(self, (0.0, way[0]))
+        steps = np.diff(way, prepend=last) / self._length
         steps[list(at.starts)] = 0.0
-        z, state = np.empty(len(way)), 0.0
+        z = np.empty(len(way))
         fresh = set(at.starts)
         for i, step in enumerate(steps.tolist()):
             if i in fresh:
@@ -230,6 +234,7 @@ class Presliding:
             end = 1.0 if step > 0 else -1.0
             state = end + (state - end) * np.exp(-abs(step))  # exact for a steady direction
             z[i] = state
+        at.memory[self] = (state, way[-1])
         return rows[:, :, None] * z[:, None, None]
 
 

@@ -52,20 +52,23 @@ class Noise:
         largest = np.abs(np.roots(a)).max() if len(a) > 1 else 0.0
         memory = min(math.ceil(-20 / math.log(largest)) if largest > 1e-3 else 3, len(series))
         answer = lfilter([1.0], a, np.eye(1, 4 * memory)[0])  # of e to an impulse in u
-        spectrum = np.abs(np.fft.rfft(answer, 16 * memory)) ** 2
-        spectrum = np.concatenate([spectrum, spectrum[-2:0:-1]])
-        mean = spectrum.mean()
-        effective = float(len(e) * mean / spectrum[0])
+        # mean of its spectrum, by Parseval, over the spectrum at zero
+        effective = float(len(e) * (answer @ answer) / answer.sum() ** 2)
         known = min(effective, len(e) / (len(a) - 1)) / 2 if len(a) > 1 else len(e)
         return cls(a, series, int(samples[0]), effective, known, memory)
 
-    def spread(self, Q: Array, at: np.ndarray, count: int, memory: int) -> Array:
-        """a^-1 backwards in time on rows at these instants of `count`, and `memory` before."""
+    def at_rest(self, count: int) -> Array:
+        """What `pass_on` starts from, for so many signals."""
+        return np.zeros((count, len(self.a) - 1))
+
+    def pass_on(self, x: Array, state: Array) -> tuple[Array, Array]:
+        """a^-1 of signals (count, N), and the state to go on from."""
         from scipy.signal import lfilter
 
-        dense = np.zeros((Q.shape[1], count + memory))
-        dense[:, count - 1 - at] = Q.T
-        return np.asarray(lfilter([1.0], self.a, dense)).T
+        if len(self.a) == 1:
+            return x, state
+        out, state = lfilter([1.0], self.a, x, zi=state)
+        return out, state
 
 
 def _burg(runs: list[Array]) -> Array:

@@ -1,23 +1,32 @@
 """Mass and centre of mass of a load from a recording of a machine that is known."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NoReturn
 
 import numpy as np
 
 from crane.dynamics import Dynamics
-from crane.errors import InputError, RecordingError
+from crane.errors import InputError, RecordingError, known
 from crane.identification.base import Base
 from crane.identification.checks import check_forces
+from crane.identification.equations import Equations, Progress
 from crane.identification.feasible import body_parameters, pseudo_inertia
-from crane.identification.identify import identify, motion_of
-from crane.identification.model import PER_BODY, Samples
-from crane.identification.result import Comparison
-from crane.identification.signals import Motion
+from crane.identification.identify import METHODS, equations_of, in_parts, motion_of
+from crane.identification.model import PER_BODY, Model, Samples, friction
+from crane.identification.regressor import triangular
+from crane.identification.result import Comparison, aligned
+from crane.identification.signals import Motion, moving
 from crane.machine import Machine
 from crane.recording import Recording
 from crane.samples import Array, Brief
 
 _TOLD = 1e-6  # what of a direction may be missing from those that forces tell
+_SEGMENTS = 10  # of a recording, that are left out one by one
+_ONE_WAY = 0.1  # of a drive's way, that it goes back at least
+_VAGUE = 0.1  # of the machine's moving mass, that half of an interval may be at most
+_REST = 0.05  # of a joint's largest velocity, below which it rests
+_RESTS = 0.25  # s of rest, that tell a mass
+_LEAST_BAND = 0.01  # of a drive's force, that its friction and its sensor may hide at rest
 
 
 class Load:
@@ -56,10 +65,15 @@ class PayloadEstimate(Brief):
         frame: A link of the machine.
         mass: [kg].
         com: (3,) centre of mass in the frame [m]; nan along axes that the motion does not tell.
-        covariance: (4, 4) of mass and com, to first order; nan as `com`.
-        freedom: Degrees of freedom behind it.
+        covariance: (4, 4) of mass and com, to first order; nan as `com`. The larger of what the
+            noise makes and of what leaving out a tenth of the recording changes (jackknife).
+        freedom: (4,) degrees of freedom behind each.
         directions: (k, 3) orthonormal directions of the frame along which the motion tells where
             the centre of mass is.
+        friction: By drive, Coulomb friction that the machine's own lacks [N], [N m], of those
+            that moved both ways.
+        static: Mass that the forces at rest tell with that centre of mass, and by how much
+            friction may be in it [kg]; None where nothing rests, or the centre is not told.
         fit: What of the forces is not the machine's, and what the load explains.
     """
 
@@ -67,8 +81,10 @@ class PayloadEstimate(Brief):
     mass: float
     com: Array
     covariance: Array
-    freedom: float
+    freedom: Array
     directions: Array
+    friction: dict[str, float]
+    static: tuple[float, float] | None
     fit: Comparison
 
     @property
@@ -89,22 +105,40 @@ class PayloadEstimate(Brief):
         values = np.append(self.mass, self.com)
         return np.column_stack([values - half, values + half])
 
+    @property
+    def doubt(self) -> str:
+        """Why the mass should not be believed, "" where nothing is against it."""
+        low, high = self.interval()[0].tolist()
+        if self.static is None:
+            return ""
+        mass, band = self.static
+        if low - band <= mass <= high + band:
+            return ""
+        return (
+            f"the forces at rest say {mass:.4g} +- {band:.2g} kg (friction): the machine is not "
+            "as described, identify it without the load first"
+        )
+
     def to_text(self) -> str:
         """A table of mass and centre of mass."""
-        lines = [f"load on {self.frame}", f"{'':<8}{'value':>12}{'std':>11}   95 % interval"]
+        rows = [["", "value", "std", "95 % interval", ""]]
         values, names = np.append(self.mass, self.com), ("mass", "com x", "com y", "com z")
         units = ("kg", "m", "m", "m")
         std = np.sqrt(np.diag(self.covariance))
-        rows = zip(names, units, values, std, self.interval(), strict=True)
-        for name, unit, value, deviation, (low, high) in rows:
+        table = zip(names, units, values, std, self.interval(), strict=True)
+        for name, unit, value, deviation, (low, high) in table:
             if np.isnan(value):
-                lines.append(f"{name:<8}{'-':>12}   not told by this motion")
+                rows.append([name, "-", "", "not told by this motion", ""])
                 continue
-            lines.append(
-                f"{name:<8}{value:>12.5g}{deviation:>11.2g}   {low:.5g} to {high:.5g} {unit}"
-            )
+            told = f"{low:.5g} to {high:.5g} {unit}"
+            rows.append([name, f"{value:.5g}", f"{deviation:.2g}", told, ""])
+        lines = [f"load on {self.frame}", *aligned(rows, (0, 3))]
         if self.interval()[0, 0] <= 0:
             lines.append("the mass may be zero: do not trust its centre")
+        if self.static is not None:
+            lines.append("mass by the forces at rest: {:.5g} +- {:.2g} kg".format(*self.static))
+        if self.doubt:
+            lines.append(f"do not trust this: {self.doubt}")
         lines.append(
             f"forces left unexplained: {100 * self.fit.stacked:.3g} % of the load's share"
         )
@@ -118,12 +152,16 @@ def estimate_payload(
     method: str = "wls",
     inertia: bool = True,
     trust: bool = False,
+    progress: Progress | None = None,
 ) -> PayloadEstimate:
     """What a machine carries, from the forces that are not its own.
 
-    tau_A - (M_A a_A + bias + friction) = Y_b T phi, with Y_b the columns of the body that the
-    frame is on, phi the load's ten parameters about the frame, T their change of frame. The
-    machine counts as known: its errors are not in the standard deviations.
+    tau_A - (M_A a_A + bias + friction) = Y_b T phi + sum_j c_j sign(v_j), with Y_b the columns of
+    the body that the frame is on, phi the load's ten parameters about the frame, T their change of
+    frame, and c_j what Coulomb friction of drive j differs from the described one: it depends on
+    load, temperature and wear, and looks like weight where a drive moves one way only. Else the
+    machine counts as known; what it is not as described shows as parts of the recording that tell
+    different loads, which widens the intervals (delete-one jackknife over ten parts).
 
     Args:
         machine: Without the load, identified.
@@ -132,18 +170,23 @@ def estimate_payload(
         method: As of `identify`.
         inertia: Whether the load's inertia about the frame is estimated too, or neglected.
         trust: As of `identify`.
+        progress: Takes the finished share.
 
     Raises:
         InputError: An unknown frame or method, or one that does not move.
-        RecordingError: A recording that cannot serve, or does not tell the mass.
+        RecordingError: A recording that cannot serve, or does not tell the mass, or not even to a
+            tenth of the machine's own and to itself.
+
+    Source: Efron, Stein 1981, Annals of Statistics 9(3), the jackknife.
     """
+    if method not in METHODS:
+        raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
     if frame is None and machine.tip is None:
         raise InputError(f"'{machine.name}' has no tip, give the frame that holds the load")
     frame = frame or str(machine.tip)
-    if isinstance(recording, Motion):
-        motion = recording
-    else:
-        motion = motion_of(machine, recording, trust=trust)
+    motion, progress = recording, in_parts(progress)
+    if not isinstance(motion, Motion):
+        motion = motion_of(machine, motion, trust=trust, progress=progress)
     load = Load(machine, frame, inertia)
     own = Dynamics(machine).inverse(motion.q, motion.v, motion.a, friction=True)
     moves = np.flatnonzero(np.ptp(motion.v, axis=0) > 0)
@@ -152,21 +195,122 @@ def estimate_payload(
     check_forces(Motion(motion.time, *parts), own[:, moves], names, trust=trust)
     rest = Motion(motion.time, motion.q, motion.v, motion.a, motion.tau - own)
     bare = machine.replace(friction={}, forces=(), gas_springs=(), end_stops=())
-    result = identify(bare, rest, method=method, terms=[load])
-    told, directions = _told(result.base)
+    extra = [friction(bare, joint, ("coulomb",), smoothing=0.0) for joint in names]
+    model = Model(bare, [load, *extra])
+    rows, base = equations_of(model, rest, progress=progress)
+    columns = rows.selection(base)
+    found = METHODS[method](rows.columns(columns), rows.y, rows.groups, rows.samples)
+    told, directions = _told(base)
     if not told[:, 0].any():
         raise RecordingError("this motion does not tell the mass, move all joints")
-    mass, *first = (told.T @ result.values).tolist()
+    mass, *first = (told.T @ found.values).tolist()
     com = np.where(told[:, 1:].any(axis=0), np.array(first) / mass, np.nan)
     change = np.eye(4)  # derivatives of mass and com by mass and first moments
     change[1:] /= mass
     change[1:, 0] = -np.nan_to_num(com) / mass
-    covariance = change @ (told.T @ result.covariance @ told) @ change.T
+    change = change @ told.T
+    covariance = change @ found.covariance @ change.T
+    parts = np.diag(change @ _left_out(rows, columns, found.noise) @ change.T)
+    more = parts / np.maximum(np.diag(covariance), np.finfo(float).tiny)
+    scale = np.sqrt(np.maximum(more, 1.0))
+    covariance *= np.outer(scale, scale)
     unknown = np.append(False, np.isnan(com))
     covariance[unknown] = covariance[:, unknown] = np.nan
-    return PayloadEstimate(
-        frame, mass, com, covariance, result.estimate.freedom, directions, result.training
-    )
+    freedom = np.where(more > 1, _SEGMENTS - 1, found.freedom)
+    there = {base.names[i]: float(x) for i, x in zip(base.independent, found.values, strict=True)}
+    one_way = [joint for joint, v in zip(names, motion.v.T[moves], strict=True) if _one_way(v)]
+    corrections = {
+        joint: there[f"{joint}.coulomb"]
+        for joint in names
+        if f"{joint}.coulomb" in there and joint not in one_way
+    }
+    estimate = PayloadEstimate(
+        frame, mass, com, covariance, freedom, directions, corrections, None,
+        rows.compare(columns @ found.values),
+    )  # fmt: skip
+    low, high = estimate.interval()[0].tolist()
+    own_mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
+    if not high - low <= 2 * max(abs(mass), _VAGUE * own_mass):
+        _refuse(one_way, estimate, _static(machine, load, motion, corrections, np.zeros(3)))
+    if low <= 0 <= high:
+        return estimate
+    static = _static(machine, load, motion, corrections, np.nan_to_num(com))
+    return replace(estimate, static=static)
+
+
+def _refuse(
+    one_way: list[str], estimate: PayloadEstimate, static: tuple[float, float] | None
+) -> NoReturn:
+    low, high = estimate.interval()[0].tolist()
+    text = f"this recording does not tell the mass ({low:.3g} to {high:.3g} kg): "
+    if one_way:
+        names = ", ".join(f"'{joint}'" for joint in one_way)
+        text += f"{names} moved one way only, where friction looks like weight, record both ways"
+    else:
+        text += "its parts tell different loads, identify the machine without a load first"
+    if static is not None:
+        text += (
+            f"; with its centre at '{estimate.frame}' the forces at rest hold {static[0]:.4g} +- "
+            f"{static[1]:.2g} kg, by the described friction"
+        )
+    raise RecordingError(text)
+
+
+def _static(
+    machine: Machine, load: Load, motion: Motion, friction: dict[str, float], com: Array
+) -> tuple[float, float] | None:
+    """Mass by the forces at rest, and how much friction may hold of it; None if nothing rests.
+
+    Each drive counts by its friction, described and found, as by a standard deviation.
+    """
+    step = float(motion.time[1] - motion.time[0])
+    still = ~moving(motion.v, _REST * np.abs(motion.v).max(axis=0)).any(axis=1)
+    edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=0, append=0))
+    runs = [(i, j) for i, j in edges.reshape(-1, 2).tolist() if (j - i) * step >= _RESTS]
+    if not runs:
+        return None
+    q = np.array([motion.q[i:j].mean(axis=0) for i, j in runs])
+    tau = np.array([motion.tau[i:j].mean(axis=0) for i, j in runs])
+    zero = np.zeros_like(q)
+    tau = tau - Dynamics(machine).inverse(q, zero, zero)
+    at = Model(machine, [load]).samples(q, zero, zero)
+    each = load.columns(at)[:, :, :4] @ np.append(1.0, com)
+    band = np.array([_sticking(machine, joint) for joint in machine.active])
+    band += [abs(friction.get(joint, 0.0)) for joint in machine.active]
+    band = np.maximum(band, _LEAST_BAND * np.sqrt(np.mean(motion.tau**2, axis=0)))
+    information = ((each / band) ** 2).sum()
+    if not information > 0:
+        return None
+    mass = float((each * tau / band**2).sum() / information)
+    # where drives disagree by more than their friction, what they say is worth less
+    misfit = float((((tau - each * mass) / band) ** 2).sum()) / max(each.size - 1, 1)
+    return mass, float(np.sqrt(max(misfit, 1.0) * len(runs) / information))
+
+
+def _sticking(machine: Machine, joint: str) -> float:
+    """Largest friction of a joint at rest [N], [N m]."""
+    law = machine.friction.get(joint)
+    return 0.0 if law is None else law.coulomb + law.stiction + abs(law.coulomb_offset)
+
+
+def _left_out(rows: Equations, columns: Array, noise: Array) -> Array:
+    """Covariance (s, s) of parameters by what leaving out each part of the recording changes."""
+    size = columns.shape[1]
+    T = np.zeros((len(columns) + 1, size + 1))
+    T[:-1, :-1], T[-1, -1] = columns, 1.0
+    parts = rows.segments(_SEGMENTS) @ T / noise[:, None, None]
+    found = []
+    for i in range(_SEGMENTS):
+        R = triangular(np.delete(parts, i, axis=0).reshape(-1, size + 1))
+        found.append(np.linalg.lstsq(R[:-1, :-1], R[:-1, -1])[0])
+    spread = np.array(found) - np.mean(found, axis=0)
+    return np.asarray((_SEGMENTS - 1) / _SEGMENTS * spread.T @ spread)
+
+
+def _one_way(v: Array) -> bool:
+    """Whether a drive of velocity (N,) goes hardly any way back."""
+    ways = np.maximum(v, 0).sum(), np.maximum(-v, 0).sum()
+    return bool(min(ways) < _ONE_WAY * max(ways))
 
 
 def _told(base: Base) -> tuple[Array, Array]:

@@ -1,5 +1,6 @@
 """What an identification found, and how well it predicts."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -7,10 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.identification.base import Base
+from crane.identification.determined import weak_directions
 from crane.identification.estimators import Estimate
 from crane.identification.model import Model
 from crane.machine import Machine
 from crane.samples import Array, Brief
+
+_IMPOSSIBLE = 10.0  # times its magnitude, what a parameter cannot be
+_SHOWN = 3  # directions that a table names
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,10 +79,13 @@ class Identification:
         covariance: (r, r).
         parameters: (p,) values of all parameters, where a prior or feasibility asked for them;
             else None: forces determine the base parameters only.
-        estimate: Of the estimator, with noise and condition numbers.
+        estimate: Of the estimator, with noise and condition numbers; of all parameters where
+            those are known.
         method: Name of the estimator.
         feasible: Whether every body of `parameters` can exist.
         training: On the recording it was identified from.
+        magnitude: (r,) how large they can be on such a machine, see `determined.magnitudes`.
+        advice: What motion would tell what this one does not.
         validation: On another one, if there was one.
     """
 
@@ -90,6 +98,8 @@ class Identification:
     method: str
     feasible: bool
     training: Comparison
+    magnitude: Array
+    advice: str
     validation: Comparison | None = None
 
     def __repr__(self) -> str:
@@ -117,6 +127,53 @@ class Identification:
 
         half = t.ppf(0.5 + 0.5 * level, self.estimate.freedom) * self.std
         return np.column_stack([self.values - half, self.values + half])
+
+    @cached_property
+    def marks(self) -> tuple[str, ...]:
+        """(r,) what is wrong with each: "not determined", "impossible", or "".
+
+        Not determined is what has a standard deviation above its magnitude: the recording tells
+        less than the description of the machine does. Impossible is what is beyond ten times its
+        magnitude by more than two standard deviations.
+        """
+        beyond = np.abs(self.values) - 2 * self.std > _IMPOSSIBLE * self.magnitude
+        return tuple(
+            "not determined" if vague else "impossible" if far else ""
+            for vague, far in zip(self.std > self.magnitude, beyond, strict=True)
+        )
+
+    @cached_property
+    def undetermined(self) -> list[tuple[float, str]]:
+        """Directions that the recording does not determine, see `determined.weak_directions`."""
+        return weak_directions(self.names, self.covariance, self.magnitude)
+
+    @property
+    def remedy(self) -> str:
+        """What would determine more."""
+        if self.parameters is not None:
+            return f"{self.advice}, or leave such terms out"
+        return f"{self.advice}, or give a prior or feasible=True (--prior, --feasible)"
+
+    @property
+    def doubt(self) -> str:
+        """One line on what is not determined or impossible, "" where nothing is."""
+        vague, wrong = (
+            [name for name, mark in zip(self.names, self.marks, strict=True) if mark == kind]
+            for kind in ("not determined", "impossible")
+        )
+        parts = []
+        if vague or self.undetermined:
+            weakest = self.undetermined[0][1] if self.undetermined else vague[0]
+            parts.append(
+                f"this motion does not determine {len(vague)} of {len(self.names)} base "
+                f"parameters, the least {weakest}: {self.remedy}"
+            )
+        if wrong:
+            parts.append(
+                f"{', '.join(wrong[:_SHOWN])} {'is' if len(wrong) == 1 else 'are'} beyond what "
+                f"such a machine can have: look at units, signs and zeros of the recording"
+            )
+        return "; ".join(parts)
 
     @cached_property
     def nominal(self) -> Array:
@@ -151,23 +208,46 @@ class Identification:
             f"{self.estimate.condition:.3g}, columns scaled {self.estimate.scaled_condition:.3g}",
             "",
         ]
-        head = f"{'force':<16}{'RMS error':>12}{'relative':>10}{'PE (9)':>9}"
         for title, fit in (("training", self.training), ("validation", self.validation)):
             if fit is None:
                 continue
-            lines += [f"{title}, moving rows", head]
+            rows = [["force", "RMS error", "", "relative", "PE (9)"]]
             for i, joint in enumerate(fit.joints):
                 unit = "N" if self.machine.unit(joint) == "m" else "N m"
-                lines.append(
-                    f"{joint:<16}{fit.rmse[i]:>9.4g} {unit:<3}{100 * fit.relative[i]:>8.2f} %"
-                    f"{fit.percentage_error[i]:>7.3f} %"
-                )
-            lines += [f"all, stacked{'':>19}{100 * fit.stacked:>8.2f} %", ""]
-        head = f"{'parameter':<28}{'value':>13}{'std':>12}{'rel. std':>10}{'description':>14}"
-        lines.append(head)
-        for name, value, std, before in zip(
-            self.names, self.values, self.std, self.nominal, strict=True
+                relative = f"{100 * fit.relative[i]:.2f} %"
+                squared = f"{fit.percentage_error[i]:.3f} %"
+                rows.append([joint, f"{fit.rmse[i]:.4g}", unit, relative, squared])
+            rows.append(["all, stacked", "", "", f"{100 * fit.stacked:.2f} %", ""])
+            lines += [f"{title}, moving rows", *aligned(rows, (0, 2)), ""]
+        rows = [["parameter", "value", "std", "rel. std", "description", ""]]
+        for name, value, std, before, mark in zip(
+            self.names, self.values, self.std, self.nominal, self.marks, strict=True
         ):
-            share = f"{100 * std / abs(value):.1f} %" if value else "-"
-            lines.append(f"{name:<28}{value:>13.6g}{std:>12.2g}{share:>10}{before:>14.6g}")
+            share = f"{100 * std / abs(value):.1f} %" if std < 10 * abs(value) else "-"
+            rows.append([name, f"{value:.6g}", f"{std:.2g}", share, f"{before:.6g}", mark])
+        lines += aligned(rows, (0, 5))
+        if self.undetermined:
+            lines += ["", "not determined by this motion, in units of what can be:"]
+            lines += [f"  +- {std:.2g}  {words}" for std, words in self.undetermined[:_SHOWN]]
+            if more := len(self.undetermined[_SHOWN:]):
+                lines.append(f"  and {more} more directions")
+            lines.append(self.remedy)
         return "\n".join(lines) + "\n"
+
+
+def aligned(rows: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> list[str]:
+    """Lines of a table whose columns are as wide as what is in them, two blanks between.
+
+    Args:
+        rows: Cells, as many in each row.
+        left: Columns that are aligned left, the others right.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = [
+            cell.ljust(width) if i in left else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return lines

@@ -1,6 +1,7 @@
 """From recorded samples to velocities, accelerations and thinned equations."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,7 +57,11 @@ class Derivatives(Brief):
 
 
 def differentiate(
-    time: Array, q: Array, method: str = "kalman", cutoff: float | None = None
+    time: Array,
+    q: Array,
+    method: str = "kalman",
+    cutoff: float | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Derivatives:
     """Velocities and accelerations from measured coordinates.
 
@@ -66,6 +71,7 @@ def differentiate(
         method: "kalman" smooths each joint, see `smoother.smooth`; "lowpass" takes central
             differences, twice for the acceleration, of what `low_pass` lets through.
         cutoff: [Hz] of "lowpass".
+        progress: Takes the finished share of "kalman".
 
     Raises:
         InputError: An unknown method, or a cutoff too much or too little.
@@ -81,10 +87,14 @@ def differentiate(
         passed = low_pass(time, q, cutoff)
         v = central_differences(time, passed)
         return Derivatives(passed, v, central_differences(time, v))
-    joints = [smooth(column, step) for column in q.T]
-    states, stds, noise = (np.array(part) for part in zip(*joints, strict=True))
-    position, v, a = (np.ascontiguousarray(states[:, :, i].T) for i in range(3))
-    std_v, std_a = (np.ascontiguousarray(stds[:, :, i].T) for i in (1, 2))
+    position, v, a, std_v, std_a = (np.empty(q.shape) for _ in range(5))
+    noise = np.empty(q.shape[1])
+    for i, column in enumerate(q.T):
+        states, std, noise[i] = smooth(column, step)
+        position[:, i], v[:, i], a[:, i] = states.T
+        std_v[:, i], std_a[:, i] = std.T[1:]
+        if progress is not None:
+            progress((i + 1) / q.shape[1])
     return Derivatives(position, v, a, std_v, std_a, noise)
 
 
@@ -153,6 +163,17 @@ def low_pass(time: Array, x: Array, cutoff: float, order: int = 4) -> Array:
     if not 0 < cutoff < 0.5 / step:
         raise InputError(f"cutoff is {cutoff:g} Hz, give one between 0 and {0.5 / step:g} Hz")
     return np.asarray(sosfiltfilt(butter(order, cutoff, output="sos", fs=1 / step), x, axis=0))
+
+
+def filter_reach(step: float, cutoff: float, order: int = 4) -> int:
+    """Samples after which what `low_pass` answers to an impulse is below rounding, e^-40 = 4e-18.
+
+    It decays, both ways, like the largest of the filter's poles to the power of the samples.
+    """
+    from scipy.signal import butter
+
+    slowest = float(np.abs(butter(order, cutoff, output="zpk", fs=1 / step)[1]).max())
+    return math.ceil(-40 / math.log(slowest))
 
 
 def central_differences(time: Array, x: Array) -> Array:

@@ -7,6 +7,7 @@ import numpy as np
 from crane.samples import Array, solve
 
 _BOUNDS = (8.0, 10.0)  # of h N and h in the search for the smoother's noise ratio
+_AT_ONCE = 1 << 16  # samples whose complex modes are held
 
 
 def smooth(y: Array, step: float) -> tuple[Array, Array, float]:
@@ -62,27 +63,33 @@ def smooth(y: Array, step: float) -> tuple[Array, Array, float]:
     F, P, K = _stationary(h)
     update = np.eye(4)
     update[:, 0] -= K
-    predicted = _recursion(F @ update, np.outer(y[:-1], F @ K), mu)
-    filtered = predicted + np.outer(y - predicted[:, 0], K)
+    filtered = _recursion(F @ update, F @ K[:, None], y[:-1, None], mu)  # predicted, so far
+    innovations = y - filtered[:, 0]
+    for column, gain in zip(filtered.T, K, strict=True):
+        column += gain * innovations
     C = solve(P, F @ update @ P).T  # P_filtered F^T P^-1
-    states = _backwards(C, F, filtered)
+    states = _backwards(C, F, filtered)[:, :3]
+    del filtered, innovations  # an hour at 1 kHz is some 100 MB here
 
     # Away from the ends the covariance is stationary; there, add what the end and mu do.
     end = update @ P
     interior = _stein(C, end - C @ P @ C.T)
     reach = _reach(np.linalg.eigvals(C), len(y))
     powers = _powers(C, reach)
-    covariance = np.repeat(np.diag(interior)[None], len(y), axis=0)
-    at_end = np.einsum("kij,jl,kil->ki", powers, end - interior, powers)
+    covariance = np.repeat(np.diag(interior)[None, :3], len(y), axis=0)
+    at_end = np.einsum("kij,jl,kil->ki", powers, end - interior, powers)[:, :3]
     covariance[len(y) - reach :] += at_end[::-1]
     forced = update @ _powers(F @ update, reach)
     G = np.stack([_backwards(C, F, forced[:, :, i]) for i in range(4)], axis=2)
-    covariance[:reach] += np.einsum("kij,jl,kil->ki", G, cov_mu, G)
+    covariance[:reach] += np.einsum("kij,jl,kil->ki", G, cov_mu, G)[:, :3]
 
     units = (h / step) ** np.arange(3)
     sigma = math.sqrt(variance)
-    states = states[:, :3] * units + [mean, 0, 0]
-    return states, sigma * np.sqrt(np.maximum(covariance[:, :3], 0)) * units, sigma
+    states *= units
+    states[:, 0] += mean
+    std = np.sqrt(np.maximum(covariance, 0, out=covariance), out=covariance)
+    std *= sigma * units
+    return states, std, sigma
 
 
 def _stationary(h: float) -> tuple[Array, Array, Array]:
@@ -116,11 +123,16 @@ def likelihood(y: Array, h: float) -> tuple[float, Array, Array, float]:
     F, P, K = _stationary(h)
     values, V = np.linalg.eig(F - np.outer(F @ K, [1, 0, 0, 0]))
     free = sosfilt(zpk2sos(np.ones(4), values, 1.0), y)
-    reach = _reach(values, len(y))
-    U, R = np.linalg.qr(np.real((V[0] * _geometric(values, reach)) @ np.linalg.inv(V)))
-    mu = np.linalg.solve(R, U.T @ free[:reach])
-    free[:reach] -= U @ (R @ mu)
-    squares = max(float(free @ free), float(np.finfo(float).tiny))
+    reach, left = _reach(values, len(y)), np.linalg.inv(V)
+    whole = np.zeros((0, 5))  # triangular factor of [U e(0)]
+    for start in range(0, reach, _AT_ONCE):
+        k = np.arange(start, min(start + _AT_ONCE, reach))
+        U = np.real((V[0] * _geometric(values, k)) @ left)
+        rows = np.vstack([whole, np.column_stack([U, free[k]])])
+        whole = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
+    R, rest = whole[:4, :4], whole[4:, 4]
+    mu = np.asarray(np.linalg.solve(R, whole[:4, 4]), dtype=np.float64)
+    squares = max(float(free[reach:] @ free[reach:] + rest @ rest), float(np.finfo(float).tiny))
     freedom = len(y) - 4
     cost = freedom * math.log(squares) + 2 * np.linalg.slogdet(R)[1] - 12 * math.log(h)
     inverse = np.linalg.inv(R)
@@ -133,32 +145,37 @@ def _reach(values: np.ndarray, count: int) -> int:
     return min(count, math.ceil(-40 / math.log(np.abs(values).max())))
 
 
-def _geometric(values: np.ndarray, count: int) -> Array:
-    """values^k (count, n) for k = 0, 1, ..."""
-    return np.exp(np.arange(count)[:, None] * np.log(values.astype(complex)))
+def _geometric(values: np.ndarray, k: np.ndarray) -> Array:
+    """values^k (N, n) for powers k (N,)."""
+    return np.exp(k[:, None] * np.log(values.astype(complex)))
 
 
 def _powers(A: Array, count: int) -> Array:
     """A^0, ..., A^(count - 1), (count, n, n)."""
     values, V = np.linalg.eig(A)
-    return np.real((V * _geometric(values, count)[:, None]) @ np.linalg.inv(V))
+    return np.real((V * _geometric(values, np.arange(count))[:, None]) @ np.linalg.inv(V))
 
 
-def _recursion(A: Array, u: Array, start: Array) -> Array:
-    """x_0 = start, x_k+1 = A x_k + u_k as (N + 1, n), mode by mode."""
+def _recursion(A: Array, B: Array, u: Array, start: Array) -> Array:
+    """x_0 = start, x_k+1 = A x_k + B u_k as (N + 1, n) from u (N, m), mode by mode."""
     from scipy.signal import lfilter
 
     values, V = np.linalg.eig(A)
-    modes = np.linalg.inv(V) @ np.column_stack([start, u.T])
-    for mode, value in zip(modes, values, strict=True):
-        mode[:] = lfilter([1.0], [1.0, -value], mode)
-    return np.real(V @ modes).T
+    left = np.linalg.inv(V)
+    out = np.empty((len(u) + 1, len(A)))
+    out[0], state = start, left @ start.astype(complex)
+    for at in range(0, len(u), _AT_ONCE):
+        modes = (left @ B) @ u[at : at + _AT_ONCE].T.astype(complex)
+        for i, (mode, value) in enumerate(zip(modes, values, strict=True)):
+            mode[:] = lfilter([1.0], [1.0, -value], mode, zi=[value * state[i]])[0]
+        out[at + 1 : at + 1 + modes.shape[1]] = np.real(V @ modes).T
+        state = modes[:, -1]
+    return out
 
 
 def _backwards(C: Array, F: Array, filtered: Array) -> Array:
     """x_k = filtered_k + C (x_k+1 - F filtered_k), from the last sample to the first."""
-    inputs = filtered[:-1] @ (np.eye(4) - C @ F).T
-    return _recursion(C, inputs[::-1], filtered[-1])[::-1]
+    return _recursion(C, np.eye(4) - C @ F, filtered[-2::-1], filtered[-1])[::-1]
 
 
 def _stein(A: Array, B: Array) -> Array:

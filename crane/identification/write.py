@@ -16,6 +16,7 @@ from crane.description.parallel_robots import is_parallel_robot
 from crane.dynamics import Dynamics
 from crane.errors import CraneError, CraneWarning, InputError, OutputError
 from crane.identification.base import random_samples
+from crane.identification.division import divided
 from crane.identification.model import PER_BODY
 from crane.identification.result import Identification
 from crane.identification.urdf import changed_urdf
@@ -27,7 +28,7 @@ _FRICTION = tuple(item.name for item in dataclasses.fields(Friction))
 
 
 def write_parameters(result: Identification, path: str | Path) -> None:
-    """Write the base parameters as CSV: value, standard deviation, 95 % interval, description.
+    """Write the base parameters as CSV: value, deviation, 95 % interval, description, mark.
 
     Raises:
         OutputError: It cannot be written there.
@@ -35,11 +36,14 @@ def write_parameters(result: Identification, path: str | Path) -> None:
     columns = [result.values, result.std, *result.interval().T, result.nominal]
     with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as file:
         table = csv.writer(file, lineterminator="\n")
-        table.writerow(["parameter", "value", "std", "lower", "upper", "description", "group"])
-        for name, numbers, words in zip(
-            result.names, np.column_stack(columns).tolist(), result.base.groups, strict=True
-        ):
-            table.writerow([name, *map(repr, numbers), words])
+        table.writerow(
+            ["parameter", "value", "std", "lower", "upper", "description", "mark", "group"]
+        )
+        for name, numbers, mark, words in zip(
+            result.names, np.column_stack(columns).tolist(), result.marks, result.base.groups,
+            strict=True,
+        ):  # fmt: skip
+            table.writerow([name, *map(repr, numbers), mark, words])
 
 
 def write_machine(result: Identification, folder: str | Path) -> Path:
@@ -47,8 +51,10 @@ def write_machine(result: Identification, folder: str | Path) -> Path:
 
     Each body's parameters stand in the link that its joint moves, and the inertials of links
     fixed to it are removed. Friction is the identified one, passive forces are the machine's.
-    Everything else is as in the files that the machine was read from; what they draw is found
-    where it is. The written files are loaded and compared before they are put in place.
+    What locked joints made one body is divided among its links as they are described, see
+    `division.divided`. Everything else is as in the files that the machine was read from; what
+    they draw is found where it is. The written files are loaded, and compared where the machine
+    was locked, before they are put in place.
 
     Args:
         result: With `parameters`, so of a prior or a feasible estimate.
@@ -64,29 +70,14 @@ def write_machine(result: Identification, folder: str | Path) -> Path:
         OutputError: The folder cannot be written, or holds the files that the machine came from.
     """
     machine, parameters = result.machine, result.parameters
-    if not _rewritable(machine):
-        raise InputError(
-            f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
-            f"one: crane convert {machine.path.name} FOLDER"
-        )
+    check_rewritable(machine)
     if parameters is None or not result.model.bodies:
         raise InputError("forces determine base parameters only: give prior or feasible=True")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)  # told when the machine was loaded
         spec = read(machine.path)
-    moved = {
-        joint.get("name"): joint.find("child").get("link")
-        for joint in spec.tree.iterfind("joint")
-        if joint.get("type") != "fixed"
-    }
-    if machine.changes or moved.keys() != set(machine.joints):
-        raise InputError(
-            f"'{machine.name}' was loaded with changed numbers or locked joints, identify it as "
-            "its files describe it"
-        )
-    bodies = {
-        moved[joint]: parameters[10 * i : 10 * i + 10] for i, joint in enumerate(machine.joints)
-    }
+        whole = load(machine.path) if machine.locks else machine
+    bodies = divided(machine, parameters, whole)
     names = _names(spec)
     file = f"{machine.path.stem}.yaml"
     originals = {machine.path, *(chain.urdf for chain in _files(spec))}
@@ -109,11 +100,25 @@ def write_machine(result: Identification, folder: str | Path) -> Path:
     return Path(folder) / file
 
 
-def _rewritable(machine: Machine) -> bool:
-    """Whether the files of a machine can be written again with other numbers in them."""
-    if any(chain.urdf.suffix.lower() != ".urdf" for chain in machine.chains):
-        return False
-    return machine.path.suffix.lower() == ".urdf" or not is_parallel_robot(machine.path)
+def check_rewritable(machine: Machine) -> None:
+    """See that the files of a machine can be written again with other numbers in them.
+
+    Raises:
+        InputError: They cannot.
+    """
+    urdf = machine.path.suffix.lower() == ".urdf"
+    if any(chain.urdf.suffix.lower() != ".urdf" for chain in machine.chains) or (
+        not urdf and is_parallel_robot(machine.path)
+    ):
+        raise InputError(
+            f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
+            f"one: crane convert {machine.path.name} FOLDER"
+        )
+    if machine.changes:
+        raise InputError(
+            f"'{machine.name}' was loaded with changed numbers, identify it as its files "
+            "describe it"
+        )
 
 
 def _names(spec: MachineSpec) -> dict[str, str]:
@@ -158,7 +163,7 @@ def _content(result: Identification, spec: MachineSpec, names: Mapping[str, str]
         data |= {"loops": [{k: v for k, v in loop.items() if k != "where"} for loop in loops]}
         for loop in data["loops"]:
             loop["axis"] = list(loop["axis"])
-        data |= {"active": list(machine.active)}
+        data |= {"active": list(spec.active if spec.active is not None else machine.active)}
         if machine.tip is not None:
             data["tip"] = machine.tip
     else:
@@ -169,14 +174,20 @@ def _content(result: Identification, spec: MachineSpec, names: Mapping[str, str]
     if spec.payload is not None:
         data["payload"] = {"urdf": names[spec.payload.name]}
     data["friction"], scales = _identified(result, spec)
-    data["forces"] = [_numbers(item) for item in machine.forces]
+    held = set(machine.locks)
+    data["forces"] = [
+        _numbers(x) for x in (*machine.forces, *(x for x in spec.forces if x.joint in held))
+    ]
     data["gas_springs"] = {
         item.joint: _numbers(
             item, joint=None, pressure=item.pressure * scales.get(item.joint, 1.0)
         )
-        for item in machine.gas_springs
+        for item in (*machine.gas_springs, *(x for x in spec.gas_springs if x.joint in held))
     }
-    data["end_stops"] = {item.joint: _numbers(item, joint=None) for item in machine.end_stops}
+    data["end_stops"] = {
+        item.joint: _numbers(item, joint=None)
+        for item in (*machine.end_stops, *(x for x in spec.end_stops if x.joint in held))
+    }
     for key in ("loops", "forces", "gas_springs", "end_stops"):
         if not data.get(key):
             data.pop(key, None)
@@ -205,7 +216,9 @@ def _identified(
             found.setdefault(joint, {})[kind] = value
         elif kind == "gas_scale":
             scales[joint] = value
-    friction = {}
+    friction = {
+        joint: _numbers(spec.friction[joint]) for joint in spec.friction if joint in machine.locks
+    }
     for joint in machine.joints:
         if joint in found:
             # a joint without friction of its own is identified with a sign that jumps
@@ -236,7 +249,7 @@ def _check(result: Identification, file: Path) -> None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CraneWarning)
-            written = load(file)
+            written = load(file, lock=dict(result.machine.locks))
     except CraneError as error:
         hint = "" if result.feasible else ", give feasible=True"
         raise InputError(f"the identified machine cannot be: {error}{hint}") from None

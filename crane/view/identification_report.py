@@ -199,6 +199,7 @@ def _forces(result: Identification) -> str:
 
 def _parameters(result: Identification) -> str:
     told = dataclasses.replace(result.estimate, values=result.values, covariance=result.covariance)
+    doubt = f"<p><b>{escape(result.doubt)}</b></p>" if result.doubt else ""
     kept = set(essential(told).tolist())
     rows, classes = [], []
     low, high = result.interval().T
@@ -206,6 +207,7 @@ def _parameters(result: Identification) -> str:
         value, std = result.values[i], result.std[i]
         zero = low[i] <= 0 <= high[i]
         marks = ["essential"] * (i in kept) + ["zero in interval"] * bool(zero)
+        marks += [result.marks[i]] * bool(result.marks[i])
         rest = words.removeprefix(name).strip()
         rows.append(
             [
@@ -223,13 +225,14 @@ def _parameters(result: Identification) -> str:
     text = (
         f"<p>{len(kept)} of {len(result.names)} are essential: without the others, which are "
         "grey, the forces are not explained significantly worse. The intervals cover the truth "
-        "with 95 % confidence, by what the forces alone tell. A base parameter is the one that "
+        "with 95 % confidence. Not determined are those whose deviation exceeds what such a "
+        "machine can have. A base parameter is the one that "
         "it is named after together with others that act alike.</p>"
     )
     head = [
         "parameter*", "value", "from", "to", "rel. std", "description", "marks*", "together with*",
     ]  # fmt: skip
-    return text + _table(head, rows, classes)
+    return doubt + text + _table(head, rows, classes)
 
 
 def _percent(part: float, whole: float) -> str:
