@@ -37,7 +37,13 @@ class InPython:
 
 @pytest.mark.parametrize(
     "how",
-    [{}, {"path": "pinocchio"}, {"method": "RK45"}, {"method": "Radau"}, {"method": "LSODA"}],
+    [
+        {},
+        {"method": "RK45"},
+        pytest.param({"path": "pinocchio"}, marks=pytest.mark.slow),
+        pytest.param({"method": "Radau"}, marks=pytest.mark.slow),
+        pytest.param({"method": "LSODA"}, marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.parametrize("python", [False, True])
 def test_a_run_beyond_the_limits_is_told_before_and_named_after(free, how, python):

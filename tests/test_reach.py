@@ -114,6 +114,7 @@ def test_a_study_orders_by_the_true_reach(arm):
     assert found.order("reach") == best.tolist()
 
 
+@pytest.mark.slow
 def test_equal_reach_gives_equal_numbers(arm):
     study = crane.study(arm, {"barrel3.z": np.linspace(0.52, 0.57, 5)}, measures=["reach"])
     assert np.ptp(study.columns["reach"]) < 1e-9
@@ -136,6 +137,7 @@ def test_ends_of_strokes_are_where_the_branch_ends():
     assert found["upper_X2"] == 0.03 and found["lower_X1"] == 0.0
 
 
+@pytest.mark.slow
 def test_reach_of_the_big_crane_is_that_of_its_workspace():
     machine = crane.load("patu655")
     space = crane.workspace(machine, 1000)
@@ -148,3 +150,45 @@ def test_the_share_says_how_fine_it_is(arm):
     study = crane.study(arm, {"X2.upper": [0.1, 0.2]}, measures=["range"])
     assert "range is counted on 10 values of each of 3 strokes" in study.to_text()
     assert "range" not in crane.study(arm, {"X2.upper": [0.1]}, measures=["reach"]).to_text()
+
+
+def test_reach_ends_with_the_branch(tmp_path):
+    """A slider pulls a crank into its dead centre: a tip on the crank would go on beyond it.
+
+    The tip, at the angle 0.5 from the crank, is farthest from the axis' vertical plane where the
+    crank is in line, x = 0.4 cos 0.5; on the other branch it would reach 0.4.
+    """
+    crank, rod, home = 0.3, 0.7, 0.8
+
+    def slide(turn):
+        return crank * np.cos(turn) + np.sqrt(rod**2 - (crank * np.sin(turn)) ** 2)
+
+    lean = -np.arcsin(crank * np.sin(home) / rod)
+    mass = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'  # noqa: E501
+    tip = 0.4 * np.array([np.cos(0.5), np.sin(0.5)])
+    (tmp_path / "slider.urdf").write_text(
+        f'<robot name="slider"><link name="ground"/><link name="crank">{mass}</link>'
+        f'<link name="rod">{mass}</link><link name="block">{mass}</link><link name="tip"/>'
+        '<joint name="phi" type="continuous"><parent link="ground"/><child link="crank"/>'
+        '<axis xyz="0 0 1"/></joint>'
+        f'<joint name="psi" type="continuous"><origin xyz="{crank} 0 0"/><parent link="crank"/>'
+        '<child link="rod"/><axis xyz="0 0 1"/></joint>'
+        '<joint name="s" type="prismatic" independent="true"><parent link="ground"/>'
+        f'<child link="block"/><axis xyz="1 0 0"/><limit lower="{slide(1.0)}" upper="1.2" '
+        'effort="9" velocity="9"/></joint>'
+        f'<joint name="tip_fixed" type="fixed"><origin xyz="{tip[0]} {tip[1]} 0"/>'
+        '<parent link="crank"/><child link="tip"/></joint>'
+        '<end_effector name="tip" group="tip" parent_link="tip"/>'
+        f'<loop name="pin" type="revolute"><predecessor link="rod"><origin xyz="{rod} 0 0"/>'
+        '</predecessor><successor link="block"/><axis xyz="0 0 1"/></loop>'
+        f'<group_state name="home"><joint name="phi" value="{home}"/>'
+        f'<joint name="psi" value="{lean - home}"/><joint name="s" value="{slide(home)}"/>'
+        "</group_state></robot>"
+    )
+    machine = crane.load(tmp_path / "slider.urdf")
+    # the horizontal distance is the same for all: it is seen along x, gravity taken as along y
+    machine.model.gravity.linear = np.array([0.0, -9.81, 0.0])
+    found = of_strokes(machine)
+    assert found["reach"] == pytest.approx(0.4 * np.cos(0.5), abs=1e-9)
+    assert found["upper_s"] == pytest.approx(crank + rod, abs=1e-9)
+    assert found["lower_s"] == slide(1.0)
