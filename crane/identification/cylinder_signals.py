@@ -8,6 +8,7 @@ from crane.description.hydraulics import Cylinder, Valve
 from crane.errors import InputError, RecordingError, known
 from crane.identification.signals import average_periods, differentiate, sampling
 from crane.machine import Machine
+from crane.measured import moved_locks
 from crane.recording import Recording
 from crane.samples import Array
 
@@ -122,6 +123,10 @@ def cylinder_signals(
             not equidistant.
     """
     _, valve = parts(machine, joint)
+    for text in moved_locks(
+        machine, recording.columns(), recording.units | recording.channel_units
+    ):
+        raise RecordingError(f"{text}, do not lock it, or lock it where it is")
     q = recording.q[:, column(recording, joint)]
     index = machine.active.index(joint)
     lower, upper = float(machine.lower[index]), float(machine.upper[index])
