@@ -74,7 +74,7 @@ def test_prior(estimator):
     W, y = white(3000)
     W[:, 2] = 0
     y = y - white(3000)[0][:, 2] * 3
-    mean, std = np.array([1.5, 0, 7, 0]), np.array([0.01, np.inf, 0.2, np.inf])
+    mean, std = np.array([1.01, 0, 7, 0]), np.array([0.01, np.inf, 0.2, np.inf])
     kind = {"groups": np.zeros(3000, int), "prior": (mean, std)}
     found = estimator(W, y, W, **kind) if estimator is instrumental else estimator(W, y, **kind)
     assert found.values[2] == pytest.approx(7)

@@ -91,7 +91,7 @@ def fixed(monkeypatch):
 @pytest.mark.parametrize("count", [60, 100])
 def test_smoother_is_the_solution_of_all_equations_at_once(fixed, h, count):
     y = np.random.default_rng(1).standard_normal(count).cumsum()
-    states, stds, sigma = fixed(y, 0.01, h)
+    states, stds, sigma, _ = fixed(y, 0.01, h)
     exact, variances = whole(y, h)
     units = (h / 0.01) ** np.arange(3)
     np.testing.assert_allclose(states, exact[:, :3] * units, atol=1e-7 * units.max(), rtol=1e-7)
@@ -101,7 +101,7 @@ def test_smoother_is_the_solution_of_all_equations_at_once(fixed, h, count):
 def test_smoother_agrees_with_the_textbook_recursion(fixed):
     """Within what its wide prior costs in rounding and bias."""
     h, y = 0.5, np.random.default_rng(2).standard_normal(1500).cumsum()
-    states, stds, sigma = fixed(y, 0.01, h)
+    states, stds, sigma, _ = fixed(y, 0.01, h)
     exact, P = rts(y, h)
     units = (h / 0.01) ** np.arange(3)
     np.testing.assert_allclose(states / units, exact[:, :3], atol=1e-4)

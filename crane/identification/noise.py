@@ -19,9 +19,8 @@ class Noise:
         innovations: u (T,) over all instants from the first to the last, nan where unknown.
         first: Number of the first instant.
         effective: See `Estimate`.
-        known: Degrees of freedom of the spectral density at zero: 2 over the variance of its
-            logarithm, which is 4 order / N for high orders (Berk 1974), and 4 / `effective` for
-            the first order.
+        correlated: Samples over which it is correlated, (sum |g|)^2 / sum g^2 of its answer g to
+            one innovation: 1 for white noise, (1 + c) / (1 - c) where a = (1, -c).
         memory: Samples until the noise has forgotten its past.
     """
 
@@ -29,7 +28,7 @@ class Noise:
     innovations: Array
     first: int
     effective: float
-    known: float
+    correlated: float
     memory: int
 
     @classmethod
@@ -54,8 +53,8 @@ class Noise:
         answer = lfilter([1.0], a, np.eye(1, 4 * memory)[0])  # of e to an impulse in u
         # mean of its spectrum, by Parseval, over the spectrum at zero
         effective = float(len(e) * (answer @ answer) / answer.sum() ** 2)
-        known = min(effective, len(e) / (len(a) - 1)) / 2 if len(a) > 1 else len(e)
-        return cls(a, series, int(samples[0]), effective, known, memory)
+        correlated = float(np.abs(answer).sum() ** 2 / (answer @ answer))
+        return cls(a, series, int(samples[0]), effective, correlated, memory)
 
     def at_rest(self, count: int) -> Array:
         """What `pass_on` starts from, for so many signals."""
