@@ -191,8 +191,8 @@ def estimate_payload(
     own = Dynamics(machine).inverse(motion.q, motion.v, motion.a, friction=True)
     moves = np.flatnonzero(np.ptp(motion.v, axis=0) > 0)
     names = [machine.active[i] for i in moves]
-    driven = (x[:, moves] for x in (motion.q, motion.v, motion.a, motion.tau))
-    check_forces(Motion(motion.time, *driven), own[:, moves], names, trust=trust)
+    q, v, a, tau = (x[:, moves] for x in (motion.q, motion.v, motion.a, motion.tau))
+    check_forces(Motion(motion.time, q, v, a, tau), own[:, moves], names, trust=trust)
     rest = Motion(motion.time, motion.q, motion.v, motion.a, motion.tau - own)
     bare = machine.replace(friction={}, forces=(), gas_springs=(), end_stops=())
     extra = [friction(bare, joint, ("coulomb",), smoothing=0.0) for joint in names]
