@@ -7,9 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import crane
+import crane.codegen.program
 import crane.integration
 import crane.simulation.run
-import crane.straight.machine_code
 from crane.errors import CraneWarning, SimulationError
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
@@ -316,7 +316,7 @@ def test_a_step_that_fails_after_a_whole_chunk_is_told(forwarder, steps, monkeyp
 def test_long_formulas_step_in_python(steps, monkeypatch):
     machine = crane.load("mini_forwarder")  # with nothing compiled yet
     start = np.array([0.1, 0.012, 0.016])
-    monkeypatch.setattr(crane.straight.machine_code, "MOST", 10)
+    monkeypatch.setattr(crane.codegen.program, "MOST", 10)
     monkeypatch.setattr(crane.closure.compiled, "_SHARED", {})
     slow = crane.simulate(machine, None, start, duration=0.02)
     assert steps == {"compiled": 0, "python": 20}

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.codegen import Number
 from crane.control.base import Traced
 from crane.description import PIGains
 from crane.dynamics import Dynamics
@@ -12,7 +13,6 @@ from crane.errors import InputError
 from crane.machine import Machine
 from crane.paths import Path
 from crane.samples import Array, as_number, as_sample
-from crane.straight import Number
 
 
 class PI:

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.codegen import TooLongError
 from crane.dynamics.compiled import Formula
 from crane.dynamics.elements import JointForces
 from crane.dynamics.formulation import carriers
@@ -11,7 +12,6 @@ from crane.dynamics.tree import TreeDynamics
 from crane.errors import InputError, known
 from crane.machine import Machine
 from crane.samples import Array, as_samples
-from crane.straight import TooLongError
 
 PATHS = ("compiled", "pinocchio")
 

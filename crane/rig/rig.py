@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from crane.codegen import Number, TooLongError
 from crane.control import PI, Traced
 from crane.dynamics import Dynamics
 from crane.errors import CraneError, CraneWarning, InputError, known
@@ -17,7 +18,6 @@ from crane.recording import FORCE_UNITS, VELOCITY_UNITS, Recording
 from crane.rig.plant import Tolerances, drawn
 from crane.rig.sensors import Sensors, default_sensors
 from crane.samples import Array, as_number
-from crane.straight import Number, TooLongError
 
 _STABLE = 2.0  # fastest rate times substep; Runge-Kutta of fourth order bears 2.785
 _CUTOFF = 5.0  # [Hz] of the measured velocity

@@ -7,6 +7,7 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.codegen import TooLongError
 from crane.control import (
     Command,
     Controller,
@@ -31,7 +32,6 @@ from crane.paths import Path
 from crane.recording import Recording
 from crane.samples import Array, as_number, as_sample
 from crane.simulation.recorded import ENERGIES, imbalance, recorded
-from crane.straight import TooLongError
 
 _MOST = 4_000_000  # steps of one recording
 _CHUNK = 1000  # steps between reports of progress
@@ -218,7 +218,7 @@ def _integrate_stiff(
             raise InputError("a program with a period runs on the compiled path alone")
         return integrate_adaptively(dynamics, control, state, steps, step, "BDF", progress)
     times = step * np.arange(steps + 1, dtype=np.float64)
-    rows = np.empty((steps + 1, len(state) + fast.seen))
+    rows = np.empty((steps + 1, fast.width))
     nq, n = dynamics.machine.model.nq, len(dynamics.machine.active)
     done = 0
     while done < steps:
