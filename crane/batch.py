@@ -15,6 +15,8 @@ from crane.machine import Machine
 from crane.samples import Array
 from crane.simulation import Progress, imbalance, trajectory
 
+_Result = tuple[Array, Array, Array, Array, Array, str]
+
 
 @dataclass(frozen=True, eq=False)
 class Batch:
@@ -84,16 +86,15 @@ def simulate_batch(
                 f"{', '.join(active)}: simulate them apart"
             )
 
-    def run(i: int) -> tuple[Array, ...]:
+    def run(i: int) -> _Result:
         machine = machines[i]
         control = None if controller is None else controller(machine)
-        time, states, seen = trajectory(Dynamics(machine), control, starts[i], duration, step)
-        nq, n = machine.model.nq, len(active)
-        energy = np.column_stack([seen[:, 2 * n : 2 * n + 2], states[:, -2:]])
-        q_a = states[:, :nq][:, machine.closure.active]
-        return time, q_a, states[:, nq : nq + n], seen[:, :n], energy
+        time, rows = trajectory(Dynamics(machine), control, starts[i], duration, step)
+        energy = np.hstack([rows.kinetic, rows.potential, rows.work, rows.lost])
+        q_a = rows.q[:, machine.closure.active]
+        return time, q_a, rows.v_a, rows.tau, energy, imbalance(rows, step)
 
-    results: dict[int, tuple[Array, ...]] = {}
+    results: dict[int, _Result] = {}
     failures: dict[int, str] = {}
     # one first, so that the others find their machine code made
     waiting = list(range(len(machines)))
@@ -110,11 +111,13 @@ def simulate_batch(
                     progress((len(results) + len(failures)) / len(machines))
     if not results:
         raise InputError(f"all {len(machines)} simulations failed, the first: {failures[0]}")
-    return _stack(results, failures, len(machines), step)
+    return _stack(results, failures, len(machines))
 
 
 def _stack(
-    results: dict[int, tuple[Array, ...]], failures: dict[int, str], count: int, step: float
+    results: dict[int, _Result],
+    failures: dict[int, str],
+    count: int,
 ) -> Batch:
     lengths = {len(result[0]) for result in results.values()}
     if len(lengths) > 1:
@@ -122,16 +125,10 @@ def _stack(
             f"the paths give recordings of {sorted(lengths)} samples, give one duration for all"
         )
     first = next(iter(results.values()))
-    stacks = []
-    for k in range(1, len(first)):
-        stack = np.full((count, *first[k].shape), np.nan)
-        for i, result in results.items():
-            stack[i] = result[k]
-        stacks.append(stack)
+    stacks = [np.full((count, *part.shape), np.nan) for part in first[1:5]]
+    for i, result in results.items():
+        for stack, part in zip(stacks, result[1:5], strict=True):
+            stack[i] = part
     q, v, tau, energy = stacks
-    doubts = {
-        i: text
-        for i in sorted(results)
-        if (text := imbalance(energy[i, :, 2], energy[i, :, :2], energy[i, :, 3], step))
-    }
+    doubts = {i: results[i][5] for i in sorted(results) if results[i][5]}
     return Batch(first[0], q, v, tau, energy, dict(sorted(failures.items())), doubts)

@@ -53,7 +53,18 @@ class Kinematics:
         Returns:
             (3,) or (N, 3) [m].
         """
-        q = self.machine.closure.solve(q_a)
+        return self.positions(self.machine.closure.solve(q_a))
+
+    def positions(self, q: ArrayLike) -> Array:
+        """Position in the world at postures that are closed already.
+
+        Args:
+            q: (nq,) or (N, nq) [m], [rad].
+
+        Returns:
+            (3,) or (N, 3) [m].
+        """
+        q = as_samples(q, self._model.nq, "q", self.machine.joints)
         if q.ndim == 2 and self._fast is not None:
             return self._fast.rows(q)[:, :3]
         return per_sample(self.position_at, q)

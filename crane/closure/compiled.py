@@ -275,17 +275,17 @@ class FastClosure:
         rows: list[list[Number]] = [[0.0] * n for _ in range(self._nq)]
         for k, column in enumerate(self._active):
             rows[column][k] = 1.0
-        for i, column in enumerate(self._passive):
-            rows[column] = tape.loads(0, result.start("gamma") + i * n, n)
+        for row, column in enumerate(self._passive):
+            rows[column] = tape.loads(0, result.start("gamma") + row * n, n)
         program.add("whole", 1, [entry for row in rows for entry in row])
         arrays = ("numbers", "q", "out")
         with program.routine("gammas", counts=("count",), arrays=arrays) as r:
             work = r.array("work", result)
-            with r.loop(r.count) as i:
-                r.call("newton", r.numbers, r.q.row(i, self._nq), work)
+            with r.loop(r.count) as sample:
+                r.call("newton", r.numbers, r.q.row(sample, self._nq), work)
                 with r.when(~(work["regular"] > 0.0)):
-                    r.give(i)
-                r.call("whole", work, r.out.row(i, self._nq * n))
+                    r.give(sample)
+                r.call("whole", work, r.out.row(sample, self._nq * n))
             r.give(r.count)
 
     def _signs(self, home: ClosedPosture) -> Array:

@@ -224,7 +224,7 @@ class Formula:
     @property
     def kinds(self) -> tuple[ArgumentKind, ...]:
         """Of the arguments."""
-        return ("array",) * (self.arrays + 1)
+        return tuple("array" for _ in range(self.arrays + 1))
 
 
 class Routine:
@@ -272,11 +272,10 @@ class Routine:
     @property
     def kinds(self) -> tuple[ArgumentKind, ...]:
         """Of the arguments, in their order."""
-        return (
-            *(("count",) * len(self.counts)),
-            *(("function",) * len(self.functions)),
-            *(("array",) * len(self.arrays)),
-        )
+        kinds: list[ArgumentKind] = ["count" for _ in self.counts]
+        kinds += ["function" for _ in self.functions]
+        kinds += ["array" for _ in self.arrays]
+        return tuple(kinds)
 
     def array(self, name: str, layout: Layout | int) -> Array:
         """An array of its own."""

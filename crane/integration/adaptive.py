@@ -1,69 +1,63 @@
 """Motion in time by scipy's adaptive methods."""
 
-from collections.abc import Callable
 from typing import Any
-
-import numpy as np
 
 from crane.control import Controller
 from crane.dynamics import Dynamics
 from crane.errors import SimulationError
-from crane.integration.stepwise import PythonStepper
+from crane.integration.stepwise import Progress, PythonStepper
 from crane.samples import Array
 
 ADAPTIVE = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 
 
-def integrate_adaptively(
-    dynamics: Dynamics,
-    control: Controller,
-    state: Array,
-    steps: int,
-    step: float,
-    method: str,
-    progress: Callable[[float], None] | None = None,
-) -> Array:
-    """States and observations every `step` by an adaptive method with dense output.
-
-    The loops are closed to rounding at the recorded instants.
+class AdaptiveSteps:
+    """An adaptive method with dense output, loops closed to rounding at the recorded instants.
 
     Args:
         dynamics: The machine.
         control: Its controller.
-        state: At the start.
-        steps: Number of recorded intervals.
-        step: [s].
+        own: Number of the controller's states.
         method: One of `ADAPTIVE`.
-        progress: Called with the finished share, 0 to 1.
 
-    Returns:
-        (steps + 1, .) rows as `CompiledStepper.run` writes them.
-
-    Raises:
-        SimulationError: The method gives up, or the loops cannot be closed any more.
+    Attributes:
+        slow: Observes.
     """
-    from scipy.integrate import solve_ivp
 
-    stepper = PythonStepper(dynamics, control)
-    times = step * np.arange(steps + 1, dtype=np.float64)
+    def __init__(self, dynamics: Dynamics, control: Controller, own: int, method: str):
+        self.slow = PythonStepper(dynamics, control, own)
+        self._closure, self._method = dynamics.machine.closure, method
 
-    def rate(time: float, state: Array) -> Array:
-        if progress is not None:
-            progress(min(time / times[-1], 1.0))
-        return stepper.observe(time, state)[0]
+    def run(
+        self, times: Array, state: Array, step: float, rows: Array, progress: Progress = None
+    ) -> None:
+        """See `Steps.run`.
 
-    chosen: Any = method
-    result = solve_ivp(
-        rate, (0.0, times[-1]), state, method=chosen, t_eval=times, rtol=1e-9, atol=1e-11
-    )
-    if not result.success:
-        raise SimulationError(
-            f"at t = {result.t[-1] if len(result.t) else 0.0:.6g} s {method} gives up: "
-            f"{result.message.rstrip('.').lower()}, try another method"
-        )
-    closure, nq = dynamics.machine.closure, dynamics.machine.model.nq
-    rows = []
-    for time, sample in zip(times, result.y.T, strict=True):
-        sample[:nq] = closure.solve(sample[:nq][closure.active], guess=sample[:nq])
-        rows.append(np.concatenate([sample, stepper.observe(time, sample)[1]]))
-    return np.array(rows)
+        Raises:
+            SimulationError: The method gives up, or the loops cannot be closed any more.
+        """
+        from scipy.integrate import solve_ivp
+
+        end = times[0] + step * len(times)
+
+        def rate(time: float, state: Array) -> Array:
+            if progress is not None:
+                progress(int(min(max(time - times[0], 0.0) / step, len(times))))
+            return self.slow.observe(time, state)[0]
+
+        method: Any = self._method
+        result = solve_ivp(
+            rate, (times[0], end), state, method=method, t_eval=[*times, end],
+            rtol=1e-9, atol=1e-11,
+        )  # fmt: skip
+        if not result.success:
+            raise SimulationError(
+                f"at t = {result.t[-1] if len(result.t) else 0.0:.6g} s {self._method} gives up: "
+                f"{result.message.rstrip('.').lower()}, try another method"
+            )
+        for i, sample in enumerate(result.y.T):
+            q = self.slow.layout.view(sample).q
+            q[:] = self._closure.solve(q[self._closure.active], guess=q)
+            if i < len(times):
+                rows[i] = [*sample, *self.slow.observe(times[i], sample)[1]]
+        state[:] = result.y[:, -1]

@@ -88,11 +88,6 @@ class StiffStepper:
         )
         self._lengths = np.zeros(2)
 
-    @property
-    def width(self) -> int:
-        """Length of a row: the state, and what is observed."""
-        return self._state.size + self._seen.size
-
     def run(self, times: Array, state: Array, step: float, out: Array) -> int:
         """See `CompiledStepper.run`."""
         halves = times[0] + 0.5 * step * np.arange(2 * len(times) + 1)

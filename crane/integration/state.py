@@ -15,3 +15,8 @@ def seen_layout(machine: Machine, control: Controller) -> Layout:
     n = len(machine.active)
     channels = len(control.channels) if isinstance(control, StiffController) else 0
     return Layout(tau=n, friction=n, kinetic=1, potential=1, channels=channels)
+
+
+def row_layout(machine: Machine, control: Controller, own: int) -> Layout:
+    """Both, as they are recorded at an instant."""
+    return Layout(**state_layout(machine, own).parts, **seen_layout(machine, control).parts)

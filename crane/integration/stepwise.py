@@ -1,13 +1,19 @@
 """Steps of the classical Runge-Kutta method in Python."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from crane.control import Controller, StiffController
 from crane.dynamics import Dynamics
 from crane.errors import ClosureError, SimulationError
+from crane.integration.state import state_layout
 from crane.samples import Array
 
 _OR = ", or shorten the step"
+
+Progress = Callable[[int], None] | None
+"""What is told the number of finished steps."""
 
 
 class PythonStepper:
@@ -16,23 +22,26 @@ class PythonStepper:
     Args:
         dynamics: The machine.
         control: Its controller.
+        own: Number of the controller's states.
+
+    Attributes:
+        layout: Parts of the state.
     """
 
-    def __init__(self, dynamics: Dynamics, control: Controller):
+    def __init__(self, dynamics: Dynamics, control: Controller, own: int):
         self._dynamics, self._control = dynamics, control
-        machine = dynamics.machine
-        self._nq, self._active = machine.model.nq, machine.closure.active
-        self._speeds = slice(self._nq, self._nq + len(machine.active))
+        self._active = dynamics.machine.closure.active
+        self.layout = state_layout(dynamics.machine, own)
 
     def observe(self, time: float, state: Array) -> tuple[Array, Array]:
         """Rate of the state, and [tau, friction, kinetic, potential, its channels]."""
         rate, tau = self._rate(time, state)
-        q, v_a = state[: self._nq], state[self._speeds]
-        seen = self._dynamics.at("observation", q, v_a, tau)
-        own: Array = np.zeros(0)
+        at = self.layout.view(state)
+        seen = self._dynamics.at("observation", at.q, at.v_a, tau)
+        more: Array = np.zeros(0)
         if isinstance(self._control, StiffController):
-            own = self._control.observe(time, q[self._active], v_a, state[self._speeds.stop : -2])
-        return rate, np.concatenate([tau, seen, own])
+            more = self._control.observe(time, at.q[self._active], at.v_a, at.own)
+        return rate, np.concatenate([tau, seen, more])
 
     def advance(self, time: float, state: Array, first: Array, step: float) -> Array:
         """The state one step later, its rate at the start given.
@@ -42,7 +51,7 @@ class PythonStepper:
         """
         total = rate = first
         for share, weight in ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
-            if not np.abs(rate[: self._nq]).max() * step < 1:  # also NaN
+            if not np.abs(self.layout.view(rate).q).max() * step < 1:  # also NaN
                 raise SimulationError(
                     f"at t = {time:.6g} s the motion explodes (over 1 m or rad in a step of "
                     f"{step:g} s): shorten the step, or smooth the friction more"
@@ -50,20 +59,18 @@ class PythonStepper:
             rate, _ = self._rate(time + share * step, state + share * step * rate)
             total = total + weight * rate
         after = state + step / 6 * total
-        q = after[: self._nq]
+        q = self.layout.view(after).q
         try:
-            closed = self._dynamics.machine.closure.solve(q[self._active], guess=q)
+            q[:] = self._dynamics.machine.closure.solve(q[self._active], guess=q)
         except ClosureError as error:
             raise SimulationError(f"at t = {time + step:.6g} s: {error}{_OR}") from None
-        after[: self._nq] = closed
         return after
 
     def _rate(self, time: float, state: Array) -> tuple[Array, Array]:
-        q, v_a = state[: self._nq], state[self._speeds]
-        own = state[self._speeds.stop : -2]
-        tau, own_rate = self._control(time, q[self._active], v_a, own)
+        at = self.layout.view(state)
+        tau, own_rate = self._control(time, at.q[self._active], at.v_a, at.own)
         try:
-            rates = self._dynamics.at("rates", q, v_a, tau)
+            rates = self._dynamics.at("rates", at.q, at.v_a, tau)
         except ClosureError as error:
             raise SimulationError(f"at t = {time:.6g} s: {error}{_OR}") from None
-        return np.concatenate([rates[:-1], own_rate, [tau @ v_a, rates[-1]]]), tau
+        return np.concatenate([rates[:-1], own_rate, [tau @ at.v_a, rates[-1]]]), tau

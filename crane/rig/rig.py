@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from crane.codegen import Number, TooLongError
+from crane.codegen import Number
 from crane.control import PI, Traced
 from crane.dynamics import Dynamics
 from crane.errors import CraneError, CraneWarning, InputError, known
-from crane.integration import CompiledStepper, PythonStepper
+from crane.integration import Steps, row_layout
 from crane.kinematics import Kinematics
 from crane.machine import Machine, load
 from crane.paths import Path
@@ -168,7 +168,7 @@ class Rig:
                 channels[f"{name}_{joint}"], units[f"{name}_{joint}"] = values[:, i], of
         if machine.tip is not None:
             known_tip, tip = Kinematics(machine).position(measured), Kinematics(plant)
-            true_tip = np.array([tip.position_at(q) for q in postures])
+            true_tip = tip.positions(postures)
             for name, points in (("tip", known_tip), ("true_tip", true_tip)):
                 for axis, values in zip("xyz", points.T, strict=True):
                     channels[f"{name}_{axis}"], units[f"{name}_{axis}"] = values, "m"
@@ -195,36 +195,26 @@ class Rig:
         plant, dynamics = self.plant, Dynamics(self.plant)
         n, nq, active = len(plant.active), plant.model.nq, plant.closure.active
         held, substeps = _Held(n), _substeps(dynamics, reference, step)
-        h, slow = step / substeps, PythonStepper(dynamics, held)
-        try:
-            fast = CompiledStepper(dynamics, held, 0)
-        except TooLongError:
-            fast = None
+        h, steps = step / substeps, Steps(dynamics, held, 0)
         state = np.concatenate([plant.closure.solve(reference[0]), np.zeros(n + 2)])
-        rows = np.empty((substeps, len(state) + 2 * n + 2))
+        now = steps.slow.layout.view(state)
+        rows = np.empty((substeps, row_layout(plant, held, 0).size))
         integral = control.start(reference[0])
         measured, command, force = (np.empty_like(reference) for _ in range(3))
-        states = np.empty((len(reference), nq + n))
+        postures, v = np.empty((len(reference), nq)), np.empty_like(reference)
         for k in range(len(reference)):
-            q_a = state[:nq][active] + noise[k]
+            q_a = now.q[active] + noise[k]
             measured[k] = [s.position(x) for s, x in zip(sensors, q_a, strict=True)]
             error = reference[k] - measured[k]
             command[k] = kp * error + ki * integral
             integral = integral + step * error
             force[k] = np.minimum(np.maximum(command[k], -self.limits), self.limits)
-            states[k] = state[: nq + n]
+            postures[k], v[k] = now.q, now.v_a
             held.settings[:] = force[k]
-            times = k * step + h * np.arange(substeps, dtype=np.float64)
-            done = 0 if k < len(reference) - 1 else substeps
-            while done < substeps:
-                if fast is not None:
-                    done += fast.run(times[done:], state, h, rows)
-                if done < substeps:
-                    # machine code stops where a step needs a closer look
-                    rate, _ = slow.observe(times[done], state)
-                    state[:] = slow.advance(times[done], state, rate, h)
-                    done += 1
-        return measured, command, force, states[:, :nq], states[:, nq:]
+            if k < len(reference) - 1:
+                times = k * step + h * np.arange(substeps, dtype=np.float64)
+                steps.run(times, state, h, rows)
+        return measured, command, force, postures, v
 
     def _currents(self, force: Array, sign: Array, noise: Array) -> tuple[Array, Array]:
         """Measured currents (N, n) [A], and the forces that equation (8) makes of them."""

@@ -7,7 +7,7 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.codegen import TooLongError
+from crane.codegen import Parts, TooLongError
 from crane.control import (
     Command,
     Controller,
@@ -15,26 +15,25 @@ from crane.control import (
     Free,
     Signals,
     StiffController,
-    TracedController,
     ValveDrive,
 )
 from crane.dynamics import Dynamics
-from crane.errors import ClosureError, CraneWarning, InputError, SimulationError, known
+from crane.errors import CraneWarning, InputError, known
 from crane.integration import (
     ADAPTIVE,
-    CompiledStepper,
-    PythonStepper,
-    StiffStepper,
-    integrate_adaptively,
+    AdaptiveSteps,
+    Steps,
+    StiffSteps,
+    row_layout,
 )
 from crane.machine import Machine
 from crane.paths import Path
 from crane.recording import Recording
 from crane.samples import Array, as_number, as_sample
-from crane.simulation.recorded import ENERGIES, imbalance, recorded
+from crane.simulation.recorded import imbalance, recorded
 
 _MOST = 4_000_000  # steps of one recording
-_CHUNK = 1000  # steps between reports of progress
+_ENERGIES = 2  # of the state: work, lost
 
 Force = Callable[[float, Array, Array], Array]
 Progress = Callable[[float], None]
@@ -94,13 +93,12 @@ def simulate(
         raise InputError(f"task {task!r} is not one line of text")
     control = _as_controller(controller, machine)
     dynamics = Dynamics(machine, formulation, path)
-    _, states, seen = trajectory(dynamics, control, initial, duration, step, method, progress)
+    time, rows = trajectory(dynamics, control, initial, duration, step, method, progress)
     # the energies are integrated with the motion, so they tell when the step is too long
-    n = len(machine.active)
-    text = imbalance(states[:, -2], seen[:, 2 * n : 2 * n + 2], states[:, -1], step)
+    text = imbalance(rows, step)
     if text and formulation == "exact":
         warnings.warn(text, CraneWarning, stacklevel=2)
-    return recorded(machine, control, step, states, seen, task)
+    return recorded(machine, control, time, rows, task)
 
 
 def trajectory(
@@ -111,12 +109,11 @@ def trajectory(
     step: float,
     method: str | None = None,
     progress: Progress | None = None,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Parts]:
     """What `simulate` computes, without channels; see there for arguments and errors.
 
     Returns:
-        Times (N,); states (N, .) of q (nq), v_A (n), the controller's, work, dissipated;
-        observations (N, 2 n + 2) of tau, friction, kinetic, potential.
+        Times (N,), and what `crane.integration.row_layout` names, (N, .) each.
     """
     machine = dynamics.machine
     control = _as_controller(controller, machine)
@@ -126,133 +123,46 @@ def trajectory(
         duration = control.path.duration
     steps = _count(duration, step)
     q_a, v_a = _start(machine, initial, control.path)
-    state = np.concatenate(
-        [machine.closure.solve(q_a), v_a, control.start(q_a), np.zeros(ENERGIES)]
-    )
+    own = control.start(q_a)
+    state = np.concatenate([machine.closure.solve(q_a), v_a, own, np.zeros(_ENERGIES)])
+    integration = _integration(dynamics, control, len(own), method)
+    layout = row_layout(machine, control, len(own))
+    times, rows = step * np.arange(steps + 1, dtype=np.float64), np.empty((steps + 1, layout.size))
+
+    def report(done: int) -> None:
+        if progress is not None:
+            progress(done / (steps + 1))
+
+    integration.run(times[:-1], state, step, rows, report)
+    rows[-1] = [*state, *integration.slow.observe(times[-1], state)[1]]
+    if progress is not None:
+        progress(1.0)
+    return times, layout.view(rows)
+
+
+def _integration(
+    dynamics: Dynamics, control: Controller, own: int, method: str | None
+) -> Steps | StiffSteps | AdaptiveSteps:
+    """What integrates by a method, or by that which the controller asks for."""
+    stiff = isinstance(control, StiffController)
     if method is None:
-        method = "rosenbrock" if isinstance(control, StiffController) else "rk4"
-    if method != "rosenbrock" and isinstance(control, StiffController) and control.period:
+        method = "rosenbrock" if stiff else "rk4"
+    if method == "rosenbrock" and isinstance(control, StiffController):
+        if dynamics.path == "compiled":
+            with suppress(TooLongError):
+                return StiffSteps(dynamics, control)
+        if control.period:
+            raise InputError("a program with a period runs on the compiled path alone")
+        return AdaptiveSteps(dynamics, control, own, "BDF")
+    if isinstance(control, StiffController) and control.period:
         raise InputError(
             f"method '{method}' does not call the valves' program, leave the method out"
         )
-    if method == "rosenbrock" and isinstance(control, StiffController):
-        rows = _integrate_stiff(dynamics, control, state, steps, step, progress)
-    elif method == "rk4":
-        rows = _integrate(dynamics, control, state, steps, step, progress)
-    elif method in ADAPTIVE:
-        rows = integrate_adaptively(dynamics, control, state, steps, step, method, progress)
-    else:
-        raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")
-    times = step * np.arange(steps + 1, dtype=np.float64)
-    return times, rows[:, : len(state)], rows[:, len(state) :]
-
-
-def _integrate(
-    dynamics: Dynamics,
-    control: Controller,
-    state: Array,
-    steps: int,
-    step: float,
-    progress: Progress | None,
-) -> Array:
-    """States and observations [tau, friction, kinetic, potential] at all instants."""
-    n = len(dynamics.machine.active)
-    size, times = len(state), step * np.arange(steps + 1, dtype=np.float64)
-    width = 2 * n + ENERGIES + len(getattr(control, "channels", ()))
-    rows = np.empty((steps + 1, size + width))
-    slow = PythonStepper(dynamics, control)
-    fast = None
-    if (
-        dynamics.path == "compiled"
-        and isinstance(control, TracedController)
-        and not isinstance(control, StiffController)
-    ):
-        try:
-            own = size - dynamics.machine.model.nq - n - ENERGIES
-            fast = CompiledStepper(dynamics, control, own)
-        except TooLongError:
-            fast = None
-    done = 0
-    while done < steps:
-        stopped = True
-        if fast is not None:
-            chunk = times[done : min(done + _CHUNK, steps)]
-            count = fast.run(chunk, state, step, rows[done:])
-            done, stopped = done + count, count < len(chunk)
-        if stopped:
-            # machine code stops where a step needs a closer look: it succeeds here or says why
-            rate, seen = slow.observe(times[done], state)
-            rows[done] = [*state, *seen]
-            state = slow.advance(times[done], state, rate, step)
-            done += 1
-        if progress is not None:
-            progress(done / (steps + 1))
-    _, seen = slow.observe(times[steps], state)
-    rows[steps] = [*state, *seen]
-    if progress is not None:
-        progress(1.0)
-    return rows
-
-
-def _integrate_stiff(
-    dynamics: Dynamics,
-    control: StiffController,
-    state: Array,
-    steps: int,
-    step: float,
-    progress: Progress | None,
-) -> Array:
-    """As `_integrate`, for a controller whose own states are stiff."""
-    period = round(control.period / step) if control.period else 0
-    if control.period and abs(period * step - control.period) > 1e-9 * control.period:
-        raise InputError(
-            f"the period {control.period:g} s of the valves' program is no whole number of steps "
-            f"of {step:g} s, change one"
-        )
-    fast = None
-    if dynamics.path == "compiled":
-        with suppress(TooLongError):
-            fast = StiffStepper(dynamics, control)
-    if fast is None:
-        if period:
-            raise InputError("a program with a period runs on the compiled path alone")
-        return integrate_adaptively(dynamics, control, state, steps, step, "BDF", progress)
-    times = step * np.arange(steps + 1, dtype=np.float64)
-    rows = np.empty((steps + 1, fast.width))
-    nq, n = dynamics.machine.model.nq, len(dynamics.machine.active)
-    done = 0
-    while done < steps:
-        if period:
-            control.update(times[done], state[:nq], state[nq : nq + n], state[nq + n : -2])
-        chunk = times[done : min(done + (period or _CHUNK), steps)]
-        count = fast.run(chunk, state, step, rows[done:])
-        if count < len(chunk):
-            raise _stopped(dynamics, times[done + count], state)
-        done += count
-        if progress is not None:
-            progress(done / (steps + 1))
-    slow = PythonStepper(dynamics, control)
-    rows[steps] = [*state, *slow.observe(times[steps], state)[1]]
-    if progress is not None:
-        progress(1.0)
-    return rows
-
-
-def _stopped(dynamics: Dynamics, time: float, state: Array) -> SimulationError:
-    """Why the machine cannot go on from a state."""
-    machine = dynamics.machine
-    nq, n = machine.model.nq, len(machine.active)
-    speed = np.abs(state[nq : nq + n]).max()
-    # as far as it would have come
-    q = state[:nq][machine.closure.active] + 1e-3 * state[nq : nq + n]
-    try:
-        machine.closure.solve(q, guess=state[:nq])
-    except ClosureError as error:
-        return SimulationError(f"at t = {time:.6g} s: {error}")
-    return SimulationError(
-        f"at t = {time:.6g} s the motion cannot be followed, the fastest joint moves at "
-        f"{speed:.3g} m/s or rad/s: give its end stops damping, or smooth the friction more"
-    )
+    if method == "rk4":
+        return Steps(dynamics, control, own)
+    if method in ADAPTIVE:
+        return AdaptiveSteps(dynamics, control, own, method)
+    raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")
 
 
 def _as_controller(

@@ -119,7 +119,7 @@ class _Writer:
             self._line(f"store i64 0, ptr %{s.variable.operands[0]}")
         self._line(f"br label %{start}")
         self._begin(start)
-        if s.variable is not None:
+        if s.variable is not None and s.count is not None:
             inside = self._label()
             more = self._value(s.variable < s.count)
             self._line(f"br i1 {more}, label %{inside}, label %{end}")
