@@ -211,7 +211,7 @@ def test_chunks_are_seamless(forwarder, path, steps, monkeypatch):
     whole = crane.simulate(forwarder, control, duration=0.253)
     assert steps["python"] == 0
     for chunk in (1, 7, 11, 252, 253, 254):
-        monkeypatch.setattr(crane.simulation.run, "_CHUNK", chunk)
+        monkeypatch.setattr("crane.integration.steps._CHUNK", chunk)
         shares = []
         parts = crane.simulate(forwarder, control, duration=0.253, progress=shares.append)
         assert off(parts, whole) < 1e-12
@@ -308,7 +308,7 @@ def test_a_step_that_fails_after_a_whole_chunk_is_told(forwarder, steps, monkeyp
     wanted = failing(steps, free, Push(0.0, 200.0, 0.0), duration=1.0, path="pinocchio")
     before = steps["python"]
     for chunk in (1, 2, 3, before - 1, before):
-        monkeypatch.setattr(crane.simulation.run, "_CHUNK", chunk)
+        monkeypatch.setattr("crane.integration.steps._CHUNK", chunk)
         found = failing(steps, free, Push(0.0, 200.0, 0.0), duration=1.0)
         assert found[:50] == wanted[:50]
 
