@@ -16,6 +16,8 @@ from crane.paths import beyond_limits
 from crane.samples import Array, Brief
 from crane.simulation import Progress, imbalance, trajectory
 
+_Result = tuple[Array, Array, Array, Array, Array, str]
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Batch(Brief):
@@ -87,20 +89,19 @@ def simulate_batch(
 
     beyond: dict[int, str] = {}
 
-    def run(i: int) -> tuple[Array, ...]:
+    def run(i: int) -> _Result:
         machine = machines[i]
         control = None if controller is None else controller(machine)
         path = getattr(control, "path", None)
         if path is not None:
             text = beyond_limits(machine, path, np.inf if duration is None else duration)
             beyond.update({i: text} if text else {})
-        time, states, seen = trajectory(Dynamics(machine), control, starts[i], duration, step)
-        nq, n = machine.model.nq, len(active)
-        energy = np.column_stack([seen[:, 2 * n : 2 * n + 2], states[:, -2:]])
-        q_a = states[:, :nq][:, machine.closure.active]
-        return time, q_a, states[:, nq : nq + n], seen[:, :n], energy
+        time, rows = trajectory(Dynamics(machine), control, starts[i], duration, step)
+        energy = np.hstack([rows.kinetic, rows.potential, rows.work, rows.lost])
+        q_a = rows.q[:, machine.closure.active]
+        return time, q_a, rows.v_a, rows.tau, energy, imbalance(rows, step)
 
-    results: dict[int, tuple[Array, ...]] = {}
+    results: dict[int, _Result] = {}
     failures: dict[int, str] = {}
     # one first, so that the others find their machine code made
     waiting = list(range(len(machines)))
@@ -117,15 +118,14 @@ def simulate_batch(
                     progress((len(results) + len(failures)) / len(machines))
     if not results:
         raise InputError(f"all {len(machines)} simulations failed, the first: {failures[0]}")
-    return _stack(results, failures, beyond, len(machines), step)
+    return _stack(results, failures, beyond, len(machines))
 
 
 def _stack(
-    results: dict[int, tuple[Array, ...]],
+    results: dict[int, _Result],
     failures: dict[int, str],
     beyond: dict[int, str],
     count: int,
-    step: float,
 ) -> Batch:
     lengths = {len(result[0]) for result in results.values()}
     if len(lengths) > 1:
@@ -133,16 +133,13 @@ def _stack(
             f"the paths give recordings of {sorted(lengths)} samples, give one duration for all"
         )
     first = next(iter(results.values()))
-    stacks = []
-    for k in range(1, len(first)):
-        stack = np.full((count, *first[k].shape), np.nan)
-        for i, result in results.items():
-            stack[i] = result[k]
-        stacks.append(stack)
+    stacks = [np.full((count, *part.shape), np.nan) for part in first[1:5]]
+    for i, result in results.items():
+        for stack, part in zip(stacks, result[1:5], strict=True):
+            stack[i] = part
     q, v, tau, energy = stacks
     doubts = {}
     for i in sorted(results):
-        gap = imbalance(energy[i, :, 2], energy[i, :, :2], energy[i, :, 3], step)
-        if text := "; ".join(filter(None, (beyond.get(i, ""), gap))):
+        if text := "; ".join(filter(None, (beyond.get(i, ""), results[i][5]))):
             doubts[i] = text
     return Batch(first[0], q, v, tau, energy, dict(sorted(failures.items())), doubts)

@@ -1,7 +1,6 @@
 """The tip (or any other frame) as a function of the active coordinates, and back."""
 
 import itertools
-from ctypes import c_int64, c_void_p
 from functools import cached_property
 
 import numpy as np
@@ -10,38 +9,15 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 
 from crane.closure.traced import Constants, Motion, folded
+from crane.codegen import Number, Program, Tape, TooLongError
+from crane.codegen.scalar import add, cross, dot, scale, subtract, times
 from crane.errors import ClosureError, InputError, UnreachableTipError
 from crane.machine import Machine
 from crane.samples import Array, as_sample, as_samples, per_sample
-from crane.straight import Number, Program, Tape, TooLongError
-from crane.straight.scalar import add, cross, dot, scale, subtract, times
 
 _ACCURACY = 1e-11  # [m] per metre of machine
 _STRIDE = 16  # samples of a path between those that are searched for one by one
 _BESIDE = 0.02  # share of the strokes by which a sample may miss the curve through those
-
-_ROWS = """
-define void @rows(i64 %count, ptr %geometry, ptr %place, ptr %q, ptr %v, ptr %out) {{
-entry:
-  br label %sample
-sample:
-  %i = phi i64 [0, %entry], [%i1, %evaluate]
-  %more = icmp slt i64 %i, %count
-  br i1 %more, label %evaluate, label %done
-evaluate:
-  %q0 = mul i64 %i, {nq}
-  %q_at = getelementptr double, ptr %q, i64 %q0
-  %v0 = mul i64 %i, {n}
-  %v_at = getelementptr double, ptr %v, i64 %v0
-  %o0 = mul i64 %i, {size}
-  %o_at = getelementptr double, ptr %out, i64 %o0
-  call void @formula(ptr %geometry, ptr %place, ptr %q_at, ptr %v_at, ptr %o_at)
-  %i1 = add i64 %i, 1
-  br label %sample
-done:
-  ret void
-}}
-"""
 
 
 class Kinematics:
@@ -81,7 +57,18 @@ class Kinematics:
         Returns:
             (3,) or (N, 3) [m].
         """
-        q = self.machine.closure.solve(q_a)
+        return self.positions(self.machine.closure.solve(q_a))
+
+    def positions(self, q: ArrayLike) -> Array:
+        """Position in the world at postures that are closed already.
+
+        Args:
+            q: (nq,) or (N, nq) [m], [rad].
+
+        Returns:
+            (3,) or (N, 3) [m].
+        """
+        q = as_samples(q, self._model.nq, "q", self.machine.joints)
         if q.ndim == 2 and self._fast is not None:
             return self._fast.rows(q)[:, :3]
         return per_sample(self.position_at, q)
@@ -338,14 +325,13 @@ class _FastFrame:
         if key not in fast.programs:
             fast.programs[key] = self._compile(machine.model.nq)
         self._program = fast.programs[key]
-        self._rows = self._program.function("rows", c_int64, *[c_void_p] * 5)
 
     def rows(self, q: Array, v_a: Array | None = None) -> Array:
         """Rows [x (3), J gamma (3 n), bias (3)] at postures (N, nq) and velocities (N, n)."""
         v_a = np.zeros((len(q), self._n)) if v_a is None else np.ascontiguousarray(v_a)
-        out = np.empty((len(q), self._program.sizes["formula"]))
+        out = np.empty((len(q), self._program.outputs("formula").size))
         arrays = (self._closure.geometry.numbers, self._place, np.ascontiguousarray(q), v_a, out)
-        self._rows(len(q), *(array.ctypes.data for array in arrays))
+        self._program.call("rows", len(q), *arrays)
         return out
 
     def _compile(self, nq: int) -> Program:
@@ -376,7 +362,12 @@ class _FastFrame:
         outputs = times(world, subtract(point, posture.origin[0]))
         outputs += [column[row] for row in range(3) for column in jacobian]
         program = Program()
-        program.add("formula", 4, [*outputs, *times(world, bend)])
-        program.add_text(_ROWS.format(nq=nq, n=n, size=6 + 3 * n))
+        size = program.add("formula", 4, [*outputs, *times(world, bend)]).size
+        arrays = ("geometry", "place", "q", "v", "out")
+        with program.routine("rows", counts=("count",), arrays=arrays) as r:
+            with r.loop(r.count) as i:
+                rows = r.q.row(i, nq), r.v.row(i, n), r.out.row(i, size)
+                r.call("formula", r.geometry, r.place, *rows)
+            r.give(r.count)
         program.compile()
         return program

@@ -118,7 +118,9 @@ class Recording:
     def _check_values(self) -> None:
         if not len(self.time):
             raise RecordingError("no samples, give at least one")
-        check_finite(self.columns())
+        arrays = (self.time, self.q, self.v, self.tau, *self.channels.values())
+        if not all(np.isfinite(values).all() for values in arrays):
+            check_finite(self.columns())
         if (back := np.diff(self.time) <= 0).any():
             sample = int(np.argmax(back)) + 1
             before, now = self.time[sample - 1 : sample + 1]

@@ -24,7 +24,7 @@ def engines_of(machine: crane.Machine) -> dict[str, Engine]:
     v, nq = machine.closure.gamma(q) @ v_a, machine.model.nq
     kinematics, free, peer = Kinematics(machine), Free(machine), ConstraintDynamics(machine)
     fast = Runner(machine, free, q_a, v_a)
-    slow = PythonStepper(crane.Dynamics(machine, path="pinocchio"), free)
+    slow = PythonStepper(crane.Dynamics(machine, path="pinocchio"), free, 0)
     mujocos = {(name, h): MuJoCo(machine, h, name) for name in INTEGRATORS for h in STEPS}
 
     def ours(step: float) -> Tip:

@@ -1,43 +1,18 @@
 """What the benchmark simulates: the mini forwarder in springs and dampers, and its own motions."""
 
 import dataclasses
-from ctypes import c_int64, c_void_p
 
 import numpy as np
 import pinocchio as pin
 
 import crane
+from crane.codegen import Program
 from crane.control import TracedController
 from crane.integration import CompiledStepper
-from crane.straight import Program
 
 Array = np.ndarray
 
 START = np.array([0.3, 0.020, 0.010]), np.array([2.0, 0.02, 0.02])
-
-_LOOP = """
-define void @loop(i64 %count, ptr %formula, ptr %geometry, ptr %numbers, ptr %q, ptr %x,
-                  ptr %out) {{
-entry:
-  br label %sample
-sample:
-  %i = phi i64 [0, %entry], [%i1, %evaluate]
-  %more = icmp slt i64 %i, %count
-  br i1 %more, label %evaluate, label %done
-evaluate:
-  %q0 = mul i64 %i, {nq}
-  %qi = getelementptr double, ptr %q, i64 %q0
-  %x0 = mul i64 %i, {inputs}
-  %xi = getelementptr double, ptr %x, i64 %x0
-  %o0 = mul i64 %i, {outputs}
-  %oi = getelementptr double, ptr %out, i64 %o0
-  call void %formula(ptr %geometry, ptr %numbers, ptr %qi, ptr %xi, ptr %oi)
-  %i1 = add i64 %i, 1
-  br label %sample
-done:
-  ret void
-}}
-"""
 
 
 def swinging(machine: crane.Machine) -> crane.Machine:
@@ -112,30 +87,31 @@ class FormulaLoop:
     """
 
     def __init__(self, dynamics: crane.Dynamics, q: Array, v_a: Array, tau: Array):
-        self._formula = formula = dynamics._formula("forward")
+        formula = dynamics._formula("forward")
         self.out = np.empty((len(q), formula.size))
         self._q, self._x = q, np.hstack([v_a, tau])
-        program = self._program = Program()
-        program.add_text(
-            _LOOP.format(nq=q.shape[1], inputs=self._x.shape[1], outputs=formula.size)
-        )
+        program = Program()
+        names = ("geometry", "numbers", "q", "x", "out")
+        arguments = {"counts": ("count",), "functions": ("formula",), "arrays": names}
+        with program.routine("loop", **arguments) as r:
+            with r.loop(r.count) as i:
+                rows = r.q.row(i, q.shape[1]), r.x.row(i, self._x.shape[1])
+                r.call("formula", r.geometry, r.numbers, *rows, r.out.row(i, formula.size))
+            r.give(r.count)
         program.compile()
-        self._loop = program.function("loop", c_int64, *[c_void_p] * 6)
-        constants = [a.ctypes.data for a in (formula._fast.geometry.numbers, formula._numbers)]
-        self._arguments = (
-            len(q), formula._program.address("formula"), *constants,
-            q.ctypes.data, self._x.ctypes.data, self.out.ctypes.data,
-        )  # fmt: skip
+        constants = formula._fast.geometry.numbers, formula._numbers
+        address = formula._program.address("formula")
+        self._loop = program.bound("loop", len(q), address, *constants, q, self._x, self.out)
         self._each = [
-            (*constants, *(row.ctypes.data for row in rows))
+            formula._program.bound("formula", *constants, *rows)
             for rows in zip(q, self._x, self.out, strict=True)
         ]
 
     def run(self) -> None:
         """Once over all postures."""
-        self._loop(*self._arguments)
+        self._loop()
 
     def call_each(self) -> None:
-        """The same by one call of ctypes per posture."""
-        for addresses in self._each:
-            self._formula._formula(*addresses)
+        """The same by one call from Python per posture."""
+        for call in self._each:
+            call()

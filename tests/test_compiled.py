@@ -10,8 +10,8 @@ import oracles
 import pytest
 
 import crane
+import crane.codegen.program
 import crane.dynamics.tree
-import crane.straight.machine_code
 from crane.errors import CraneError, CraneWarning, InputError, OutOfReachError, WrongBranchError
 
 DATA = Path(__file__).parent / "data"
@@ -514,7 +514,7 @@ def test_long_formulas_are_left_to_pinocchio(mini, monkeypatch):
         again = crane.load("mini_forwarder")  # with nothing compiled yet
     quick = crane.Dynamics(mini)
     wanted = {quantity: ask(quick, quantity, samples) for quantity in QUANTITIES}
-    monkeypatch.setattr(crane.straight.machine_code, "MOST", 10)
+    monkeypatch.setattr(crane.codegen.program, "MOST", 10)
     monkeypatch.setattr(crane.closure.compiled, "_SHARED", {})
     asked = []
     at = crane.dynamics.tree.TreeDynamics.at

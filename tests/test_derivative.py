@@ -1,29 +1,25 @@
 """Derivatives and sparse elimination of traced formulas."""
 
-import ctypes
-
 import numpy as np
 import pytest
 
-from crane.straight import Program, Tape
-from crane.straight.derivative import derivatives
-from crane.straight.factors import eliminated, loaded, stored, substituted
-from crane.straight.scalar import apply, maximum, minimum, where_positive, with_sign_of
+from crane.codegen import Program, Tape
+from crane.codegen.derivative import derivatives
+from crane.codegen.factors import eliminated, loaded, stored, substituted
+from crane.codegen.scalar import apply, maximum, minimum, where_positive, with_sign_of
 
 
 def compiled(arrays, outputs):
     program = Program()
     program.add("f", arrays, outputs)
     program.compile()
-    function = program.function("f", *[ctypes.c_void_p] * (arrays + 1))
 
     def call(*inputs):
         out = np.zeros(len(outputs))
         inputs = [np.ascontiguousarray(x, dtype=np.float64) for x in inputs]
-        function(*(x.ctypes.data for x in inputs), out.ctypes.data)
+        program.call("f", *inputs, out)
         return out
 
-    call.program = program  # whose code it is
     return call
 
 

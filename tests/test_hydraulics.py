@@ -327,7 +327,7 @@ def test_a_machine_too_large_to_compile_is_integrated_by_scipy(tmp_path, monkeyp
     machine = rig(tmp_path, COMPENSATED)
     signals = Signals(machine, [0.0, 0.01, 0.02], {"x": [5.8, 5.8, 5.0]})
     with monkeypatch.context() as patch:
-        patch.setattr("crane.straight.machine_code.MOST", 300)
+        patch.setattr("crane.codegen.program.MOST", 300)
         large = crane.simulate(rig(tmp_path, COMPENSATED), signals, duration=0.1)
     whole = crane.simulate(machine, signals, duration=0.1)
     assert np.abs(large.q - whole.q).max() < 1e-7

@@ -7,9 +7,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import crane
+import crane.codegen.program
 import crane.integration
-import crane.simulation.steps
-import crane.straight.machine_code
 from crane.errors import CraneWarning, SimulationError
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
@@ -211,7 +210,7 @@ def test_chunks_are_seamless(forwarder, path, steps, monkeypatch):
     whole = crane.simulate(forwarder, control, duration=0.253)
     assert steps["python"] == 0
     for chunk in (1, 7, 11, 252, 253, 254):
-        monkeypatch.setattr(crane.simulation.steps, "_CHUNK", chunk)
+        monkeypatch.setattr("crane.integration.steps._CHUNK", chunk)
         shares = []
         parts = crane.simulate(forwarder, control, duration=0.253, progress=shares.append)
         assert off(parts, whole) < 1e-12
@@ -308,7 +307,7 @@ def test_a_step_that_fails_after_a_whole_chunk_is_told(forwarder, steps, monkeyp
     wanted = failing(steps, free, Push(0.0, 200.0, 0.0), duration=1.0, path="pinocchio")
     before = round(float(wanted.split()[3]) / 1e-3)  # "at t = 0.088 s: .."
     for chunk in (1, 2, 3, before - 1, before):
-        monkeypatch.setattr(crane.simulation.steps, "_CHUNK", chunk)
+        monkeypatch.setattr("crane.integration.steps._CHUNK", chunk)
         found = failing(steps, free, Push(0.0, 200.0, 0.0), duration=1.0)
         assert found[:50] == wanted[:50]
 
@@ -316,7 +315,7 @@ def test_a_step_that_fails_after_a_whole_chunk_is_told(forwarder, steps, monkeyp
 def test_long_formulas_step_in_python(steps, monkeypatch):
     machine = crane.load("mini_forwarder")  # with nothing compiled yet
     start = np.array([0.1, 0.012, 0.016])
-    monkeypatch.setattr(crane.straight.machine_code, "MOST", 10)
+    monkeypatch.setattr(crane.codegen.program, "MOST", 10)
     monkeypatch.setattr(crane.closure.compiled, "_SHARED", {})
     slow = crane.simulate(machine, None, start, duration=0.02)
     assert steps == {"compiled": 0, "python": 20}

@@ -7,7 +7,7 @@ PACKAGE = Path(__file__).parents[1] / "crane"
 
 # A module may import those before it. Within a room, modules may not form a circle either.
 ORDER = [
-    "errors", "samples", "units", "output", "npz", "timeseries", "straight", "description",
+    "errors", "samples", "units", "output", "npz", "timeseries", "codegen", "description",
     "closure", "machine", "check", "formats", "dynamics", "kinematics", "workspaces", "hydraulics",
     "paths", "control", "integration", "recording", "logs", "measured", "summary", "simulation",
     "replays", "batch", "studies", "rig", "identification", "view", "live", "runs", "demo", "cli",

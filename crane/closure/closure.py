@@ -13,10 +13,10 @@ from crane.closure.choice import Choice, condition, proposals, scales
 from crane.closure.compiled import Cursor, FastClosure
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import Structure, analyse
+from crane.codegen import TooLongError, carefully
 from crane.description import Coupling, LoopSpec
 from crane.errors import BranchEdgeError, InputError
 from crane.samples import Array, as_samples, per_sample, solve
-from crane.straight import TooLongError
 
 _FEW, _FAR = 100, 0.1  # samples worth sorting: how many, how far apart as a share of the range
 _STEPS = 8  # from home to a target that is far from the one before it
@@ -172,14 +172,17 @@ class Closure:
         """Close the loops at targets (N, n) into out (N, nq)."""
         order = self._order(targets) if len(targets) > _FEW else None
         sorted_targets = np.ascontiguousarray(targets if order is None else targets[order])
-        done, closed = 0, out if order is None else np.empty_like(out)
-        while done < len(targets):
-            done += self.fast.follow(self._cursor, sorted_targets[done:], closed[done:])
-            if done < len(targets):
-                index = done if order is None else order[done]
-                sample = f" (sample {index})" if stacked else ""
-                closed[done] = self.reach(self._cursor, sorted_targets[done], sample)
-                done += 1
+        closed = out if order is None else np.empty_like(out)
+
+        def reach(i: int) -> None:
+            sample = f" (sample {i if order is None else order[i]})" if stacked else ""
+            closed[i] = self.reach(self._cursor, sorted_targets[i], sample)
+
+        carefully(
+            len(targets),
+            lambda i, _: self.fast.follow(self._cursor, sorted_targets[i:], closed[i:]),
+            reach,
+        )
         if order is not None:
             out[order] = closed
 
@@ -240,18 +243,17 @@ class Closure:
             return per_sample(self._gamma, q)
         if q.size == 0:
             raise InputError("q is an empty stack, give at least one sample")
-        rows, done = np.atleast_2d(np.ascontiguousarray(q)), 0
+        rows = np.atleast_2d(np.ascontiguousarray(q))
         out = np.empty((len(rows), self.model.nv, len(self.active)))
-        while done < len(rows):
-            done += self.fast.gamma(rows[done:], out[done:])
-            if done < len(rows):
-                # what looks singular is computed with pivoting, or refused
-                try:
-                    out[done] = self._gamma(rows[done])
-                except BranchEdgeError as error:
-                    sample = f" (sample {done})" if q.ndim == 2 else ""
-                    raise BranchEdgeError(f"{error}{sample}") from None
-                done += 1
+
+        def pivoted(i: int) -> None:  # what looks singular
+            try:
+                out[i] = self._gamma(rows[i])
+            except BranchEdgeError as error:
+                sample = f" (sample {i})" if q.ndim == 2 else ""
+                raise BranchEdgeError(f"{error}{sample}") from None
+
+        carefully(len(rows), lambda i, _: self.fast.gamma(rows[i:], out[i:]), pivoted)
         return out if q.ndim == 2 else out[0]
 
     def drift(self, q: ArrayLike, v: ArrayLike) -> Array:

@@ -1,6 +1,5 @@
 """Closing loops in machine code made for one machine."""
 
-from ctypes import c_int64, c_void_p
 from dataclasses import dataclass
 from weakref import WeakValueDictionary
 
@@ -10,142 +9,14 @@ from crane.closure.branch import Posture as ClosedPosture
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import Indices, Structure
 from crane.closure.traced import Constants, Loops, Posture, folded, geometry_of
+from crane.codegen import Layout, Number, Program, Tape, largest, maximum
+from crane.codegen.scalar import dot
 from crane.samples import Array
-from crane.straight import Number, Program, Tape, largest, maximum
-from crane.straight.scalar import dot
 
 _STEEP = 1e3  # an entry of gamma above this is looked at closely by `Branch`
 _NEAR = 1e-6  # residual of a guess that is as good as closed
 _SURPLUS = 1e-9  # residual of redundant equations, likewise
-
-# Newton's method in place: 1 where it closes the loops on the home branch, else 0. newton gives
-# [residual, change, regular, corrected q, gamma]. A change so small that its square is rounding is
-# the last one.
-_CLOSE = """
-define i64 @close(ptr %numbers, ptr %q, ptr %result, ptr %bounds) {{
-entry:
-  %closed_at = getelementptr double, ptr %bounds, i64 1
-  %small_at = getelementptr double, ptr %bounds, i64 2
-  %rounded = load double, ptr %bounds
-  %closed = load double, ptr %closed_at
-  %small = load double, ptr %small_at
-  %change_at = getelementptr double, ptr %result, i64 1
-  %good_at = getelementptr double, ptr %result, i64 2
-  %next_at = getelementptr double, ptr %result, i64 3
-  br label %newton
-newton:
-  %k = phi i64 [0, %entry], [%k1, %again]
-  %before = phi double [0x7FF0000000000000, %entry], [%residual, %again]
-  call void @newton(ptr %numbers, ptr %q, ptr %result)
-  %residual = load double, ptr %result
-  %tight = fcmp ole double %residual, %rounded
-  br i1 %tight, label %judge, label %maybe
-maybe:
-  %near = fcmp ole double %residual, %closed
-  %quarter = fmul double %before, 0.25
-  %slow = fcmp ogt double %residual, %quarter
-  %stalled = and i1 %near, %slow
-  br i1 %stalled, label %judge, label %step
-step:
-  %change = load double, ptr %change_at
-  %fine = fcmp olt double %change, 1.0
-  %k1 = add i64 %k, 1
-  %time = icmp slt i64 %k1, 8
-  %on = and i1 %fine, %time
-  br i1 %on, label %again, label %fail
-again:
-  call void @llvm.memcpy.p0.p0.i64(ptr %q, ptr %next_at, i64 {bytes}, i1 false)
-  %last = fcmp ole double %change, %small
-  br i1 %last, label %judge, label %newton
-judge:
-  %good = load double, ptr %good_at
-  %regular = fcmp ogt double %good, 0.0
-  br i1 %regular, label %pass, label %fail
-pass:
-  ret i64 1
-fail:
-  ret i64 0
-}}
-"""
-
-# Follows a stack of targets as `Branch` does while a single step leads from one to the next, and
-# stops where it does not: `Branch` takes that sample. `at` holds [q, gamma] of the last sample.
-_FOLLOW = """
-define i64 @follow(i64 %count, ptr %numbers, ptr %targets, ptr %at, ptr %work, ptr %out,
-                   ptr %bounds) {{
-entry:
-  %guess = getelementptr double, ptr %work, i64 0
-  %first = getelementptr double, ptr %work, i64 {nq}
-  %move_at = getelementptr double, ptr %first, i64 {nq}
-  %verdict = getelementptr double, ptr %move_at, i64 1
-  %result = getelementptr double, ptr %verdict, i64 1
-  %next_at = getelementptr double, ptr %result, i64 3
-  %gamma_new = getelementptr double, ptr %next_at, i64 {nq}
-  %gamma_at = getelementptr double, ptr %at, i64 {nq}
-  br label %sample
-sample:
-  %i = phi i64 [0, %entry], [%i1, %accept]
-  %more = icmp slt i64 %i, %count
-  br i1 %more, label %begin, label %done
-begin:
-  %t0 = mul i64 %i, {n}
-  %target = getelementptr double, ptr %targets, i64 %t0
-  call void @predict(ptr %at, ptr %target, ptr %first)
-  %move = load double, ptr %move_at
-  %small = fcmp olt double %move, 1.0
-  br i1 %small, label %start, label %done
-start:
-  call void @llvm.memcpy.p0.p0.i64(ptr %guess, ptr %first, i64 {bytes}, i1 false)
-  %got = call i64 @close(ptr %numbers, ptr %guess, ptr %result, ptr %bounds)
-  %ok = icmp eq i64 %got, 1
-  br i1 %ok, label %compare, label %done
-compare:
-  call void @distance(ptr %first, ptr %guess, ptr %verdict)
-  %off = load double, ptr %verdict
-  %half = fmul double %move, 0.5
-  %bound = fadd double %half, 0.02
-  %follows = fcmp ole double %off, %bound
-  br i1 %follows, label %accept, label %done
-accept:
-  call void @llvm.memcpy.p0.p0.i64(ptr %at, ptr %guess, i64 {bytes}, i1 false)
-  call void @llvm.memcpy.p0.p0.i64(ptr %gamma_at, ptr %gamma_new, i64 {gamma_bytes}, i1 false)
-  %o0 = mul i64 %i, {nq}
-  %o = getelementptr double, ptr %out, i64 %o0
-  call void @llvm.memcpy.p0.p0.i64(ptr %o, ptr %guess, i64 {bytes}, i1 false)
-  %i1 = add i64 %i, 1
-  br label %sample
-done:
-  ret i64 %i
-}}
-"""
-
-
-_GAMMAS = """
-define i64 @gammas(i64 %count, ptr %numbers, ptr %q, ptr %out, ptr %work) {{
-entry:
-  %good_at = getelementptr double, ptr %work, i64 2
-  br label %sample
-sample:
-  %i = phi i64 [0, %entry], [%i1, %accept]
-  %more = icmp slt i64 %i, %count
-  br i1 %more, label %look, label %done
-look:
-  %q0 = mul i64 %i, {nq}
-  %here = getelementptr double, ptr %q, i64 %q0
-  call void @newton(ptr %numbers, ptr %here, ptr %work)
-  %good = load double, ptr %good_at
-  %regular = fcmp ogt double %good, 0.0
-  br i1 %regular, label %accept, label %done
-accept:
-  %o0 = mul i64 %i, {size}
-  %o = getelementptr double, ptr %out, i64 %o0
-  call void @whole(ptr %work, ptr %o)
-  %i1 = add i64 %i, 1
-  br label %sample
-done:
-  ret i64 %i
-}}
-"""
+_EVALUATIONS = 8  # of Newton's method, which doubles its digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,11 +25,9 @@ class Cursor:
 
     Attributes:
         at: (nq + m n,) posture and passive rows of gamma that the next sample starts from.
-        work: Memory to work in.
     """
 
     at: Array
-    work: Array
 
     def start(self, posture: ClosedPosture) -> None:
         """Let the next sample start from a posture."""
@@ -226,10 +95,7 @@ class FastClosure:
             shared = _SHARED[key] = _Shared(self._compile(signs))
         self._shared = shared  # the functions live as long as it
         program, self.programs = shared.loops, shared.programs
-        kinds = [c_int64, *[c_void_p] * 6]
-        self._follow = program.function("follow", *kinds, result=c_int64)
-        self._gamma = program.function("gammas", c_int64, *[c_void_p] * 4, result=c_int64)
-        self._newton = program.function("newton", *[c_void_p] * 3)
+        self._loops = program
         self.address = program.address("follow")
         self.close_address = program.address("close")
         self._rows = rows
@@ -256,23 +122,22 @@ class FastClosure:
         )
 
     def _compile(self, signs: Array) -> Program:
-        nq, n = self._nq, self._n
         program = Program()
         self.add_newton(program, signs)
         self._add_moves(program)
-        program.add_text(_CLOSE.format(bytes=8 * nq))
-        gamma_bytes = 8 * len(self._passive) * n
-        program.add_text(_FOLLOW.format(n=n, nq=nq, bytes=8 * nq, gamma_bytes=gamma_bytes))
+        self._add_close(program)
+        self._add_follow(program)
         self._add_gamma(program)
         program.compile()
         return program
 
+    def outputs(self, formula: str) -> Layout:
+        """Parts of what a formula of the loops' own program writes."""
+        return self._loops.outputs(formula)
+
     def cursor(self) -> "Cursor":
         """A place to follow stacks from, at home."""
-        cursor = Cursor(
-            np.empty(self._nq + self._rows * self._n),
-            np.empty(3 * self._nq + 5 + self._rows * self._n),
-        )
+        cursor = Cursor(np.empty(self._nq + self._rows * self._n))
         cursor.start(self._home)
         return cursor
 
@@ -282,14 +147,15 @@ class FastClosure:
         Returns:
             Whether it is, and on the home branch.
         """
-        result = np.empty(3 + len(cursor.at))
         q = np.ascontiguousarray(q)
-        self._newton(self.geometry.numbers.ctypes.data, q.ctypes.data, result.ctypes.data)
-        residual, _, regular = result[:3]
-        if not (residual <= _NEAR and regular > 0):
+        layout = self.outputs("newton")
+        result = np.empty(layout.size)
+        self._loops.call("newton", self.geometry.numbers, q, result)
+        found = layout.view(result)
+        if not (found.residual[0] <= _NEAR and found.regular[0] > 0):
             return False
         cursor.at[: self._nq] = q
-        cursor.at[self._nq :] = result[3 + self._nq :]
+        cursor.at[self._nq :] = found.gamma
         return True
 
     def follow(self, cursor: "Cursor", targets: Array, out: Array) -> int:
@@ -298,13 +164,9 @@ class FastClosure:
         Returns:
             How many were closed.
         """
-        numbers, targets = self.geometry.numbers, np.ascontiguousarray(targets)
-        return int(
-            self._follow(
-                len(targets), numbers.ctypes.data, targets.ctypes.data, cursor.at.ctypes.data,
-                cursor.work.ctypes.data, out.ctypes.data, self.bounds.ctypes.data,
-            )
-        )  # fmt: skip
+        targets = np.ascontiguousarray(targets)
+        arrays = (self.geometry.numbers, targets, cursor.at, out, self.bounds)
+        return self._loops.call("follow", len(targets), *arrays)
 
     def gamma(self, q: Array, out: Array) -> int:
         """Evaluate gamma at closed postures (N, nq) into out (N, nv, n), while they are regular.
@@ -312,10 +174,8 @@ class FastClosure:
         Returns:
             How many were done.
         """
-        work = self.cursor().work  # held until the call is over
-        numbers, q = self.geometry.numbers, np.ascontiguousarray(q)
-        arrays = (numbers, q, out, work)
-        return int(self._gamma(len(q), *(array.ctypes.data for array in arrays)))
+        q = np.ascontiguousarray(q)
+        return self._loops.call("gammas", len(q), self.geometry.numbers, q, out)
 
     def trace(self, tape: Tape, geometry: int, q: int) -> tuple[list[Number], Posture, Loops]:
         """Coordinates, bodies and loops, read from two arguments of a function to be."""
@@ -339,19 +199,94 @@ class FastClosure:
             worst = maximum(worst, -(float(sign) * determinant))
         for alignment in loops.alignments:
             worst = maximum(worst, -1.0 * alignment)
-        outputs = [loops.residual, largest(steps.values()), -1.0 * worst, *corrected, *rows]
-        program.add("newton", 2, outputs)
+        program.add(
+            "newton",
+            2,
+            {
+                "residual": [loops.residual],
+                "change": [largest(steps.values())],
+                "regular": [-1.0 * worst],
+                "q": corrected,
+                "gamma": rows,
+            },
+        )
+
+    def _add_close(self, program: Program) -> None:
+        """Newton's method in place: 1 where it closes the loops on the home branch, else 0.
+
+        A change so small that its square is rounding is the last one.
+        """
+        arrays = {"numbers": None, "q": None, "result": program.outputs("newton"), "bounds": None}
+        with program.routine("close", arrays=arrays) as r:
+            q, result = r.q, r.result
+            rounded, closed, small = (r.let(r.bounds[i]) for i in range(3))
+            before = r.let(np.inf)
+            evaluations = r.let(0)
+            with r.forever():
+                r.call("newton", r.numbers, q, result)
+                residual, change = r.let(result["residual"]), r.let(result["change"])
+                stalled = (residual <= closed) & (residual > before * 0.25)
+                with r.when((residual <= rounded) | stalled):
+                    r.leave()
+                r.set(evaluations, evaluations + 1)
+                with r.when(~((change < 1.0) & (evaluations < _EVALUATIONS))):
+                    r.give(0)
+                r.copy(q, result.at("q"), self._nq)
+                with r.when(change <= small):
+                    r.leave()
+                r.set(before, residual)
+            with r.when(result["regular"] > 0.0):
+                r.give(1)
+            r.give(0)
+
+    def _add_follow(self, program: Program) -> None:
+        """Follow a stack of targets as `Branch` does while one step leads from each to the next.
+
+        Stops where it does not: `Branch` takes that sample. `at` holds [q, gamma] of the last
+        sample.
+        """
+        nq, n = self._nq, self._n
+        at = Layout(q=nq, gamma=len(self._passive) * n)
+        arrays = {"numbers": None, "targets": None, "at": at, "out": None, "bounds": None}
+        with program.routine("follow", counts=("count",), arrays=arrays) as r:
+            guess, verdict = r.array("guess", nq), r.array("verdict", program.outputs("distance"))
+            first = r.array("first", program.outputs("predict"))
+            result = r.array("result", program.outputs("newton"))
+            with r.loop(r.count) as i:
+                r.call("predict", r.at, r.targets.row(i, n), first)
+                move = r.let(first["move"])
+                with r.when(~(move < 1.0)):
+                    r.give(i)
+                r.copy(guess, first.at("q"), nq)
+                closed = r.call("close", r.numbers, guess, result, r.bounds)
+                with r.when(closed < 1):
+                    r.give(i)
+                r.call("distance", first, guess, verdict)
+                with r.when(~(verdict["all"] <= move * 0.5 + 0.02)):
+                    r.give(i)
+                r.copy(r.at, guess, nq)
+                r.copy(r.at.at("gamma"), result.at("gamma"), at.parts["gamma"])
+                r.copy(r.out.row(i, nq), guess, nq)
+            r.give(r.count)
 
     def _add_gamma(self, program: Program) -> None:
-        """whole(result of newton) -> gamma of all joints, and the loop `gammas` over postures."""
-        tape, n = Tape(), self._n
+        """whole(result of newton) -> gamma of all joints, and `gammas` over postures."""
+        tape, n, result = Tape(), self._n, program.outputs("newton")
         rows: list[list[Number]] = [[0.0] * n for _ in range(self._nq)]
         for k, column in enumerate(self._active):
             rows[column][k] = 1.0
-        for i, column in enumerate(self._passive):
-            rows[column] = tape.loads(0, 3 + self._nq + i * n, n)
+        for row, column in enumerate(self._passive):
+            rows[column] = tape.loads(0, result.start("gamma") + row * n, n)
         program.add("whole", 1, [entry for row in rows for entry in row])
-        program.add_text(_GAMMAS.format(nq=self._nq, size=self._nq * n))
+        arrays = ("numbers", "q", "out")
+        with program.routine("gammas", counts=("count",), arrays=arrays) as r:
+            work = r.array("work", result)
+            with r.loop(r.count) as sample:
+                r.call("newton", r.numbers, r.q.row(sample, self._nq), work)
+                with r.when(~(work["regular"] > 0.0)):
+                    r.give(sample)
+                r.call("whole", work, r.out.row(sample, self._nq * n))
+            r.give(r.count)
 
     def _signs(self, home: ClosedPosture) -> Array:
         """Of the blocks' determinants on the home branch."""
@@ -374,7 +309,7 @@ class FastClosure:
             q[column] = q[column] + move
         for column, value in zip(self._active, target, strict=True):
             q[column] = value
-        program.add("predict", 2, [*q, largest(moves)])
+        program.add("predict", 2, {"q": q, "move": [largest(moves)]})
         tape = Tape()
         one, two = tape.loads(0, 0, self._nq), tape.loads(1, 0, self._nq)
         program.add("distance", 2, [largest(one[i] - two[i] for i in self._passive)])

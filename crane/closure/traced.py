@@ -9,8 +9,7 @@ import pinocchio as pin
 
 from crane.closure.equations import LoopEquations, aligned_axes, turned
 from crane.closure.structure import Indices, Structure
-from crane.samples import Array
-from crane.straight.scalar import (
+from crane.codegen.scalar import (
     Number,
     Tape,
     add,
@@ -24,6 +23,7 @@ from crane.straight.scalar import (
     subtract,
     times,
 )  # fmt: skip
+from crane.samples import Array
 
 Vector = list[Number]
 _ROUNDING = 1e-15  # of a rotation by a right angle

@@ -5,11 +5,11 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from crane.codegen import Number
 from crane.dynamics.traced import Sweep
 from crane.machine import Machine
 from crane.paths import Path
 from crane.samples import Array, as_sample
-from crane.straight import Number
 
 
 class Controller(Protocol):

@@ -4,6 +4,7 @@ from collections.abc import Hashable, Mapping, Sequence
 
 import numpy as np
 
+from crane.codegen import Number
 from crane.control.base import Traced
 from crane.control.valves import Command, circuit_of
 from crane.dynamics import Dynamics
@@ -13,7 +14,6 @@ from crane.hydraulics.circuit import Instant
 from crane.machine import Machine
 from crane.paths import Path
 from crane.samples import Array, as_sample
-from crane.straight import Number
 
 
 class ValveDrive:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.codegen import Number
 from crane.control.base import Traced
 from crane.description import PIGains
 from crane.dynamics import Dynamics
@@ -13,7 +14,6 @@ from crane.errors import ClosureError, CraneWarning, InputError
 from crane.machine import Machine
 from crane.paths import Path
 from crane.samples import Array, as_number, as_sample
-from crane.straight import Number
 
 
 class PI:

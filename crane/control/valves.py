@@ -6,14 +6,14 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.codegen import Number
+from crane.codegen.scalar import apply
 from crane.description import Hydraulics, PDGains
 from crane.description.magnitudes import meant
 from crane.errors import InputError, known
 from crane.machine import Machine
 from crane.paths import Path
 from crane.samples import Array, as_number, as_sample
-from crane.straight import Number
-from crane.straight.scalar import apply
 
 _LONGEST = 4000.0  # of levers [s], what a simulation can have of milliseconds
 _JUMP = 0.01  # of the spool's stroke, over which the feedforward jumps the dead band

@@ -1,17 +1,16 @@
 """Equations of motion in machine code made for one machine."""
 
 from collections.abc import Callable
-from ctypes import c_int64, c_void_p
 from typing import Any
 
 import numpy as np
 
 from crane.closure.compiled import FastClosure
 from crane.closure.traced import Constants, folded
+from crane.codegen import Number, Program, Tape, largest
 from crane.dynamics.traced import Sweep
 from crane.machine import Machine
 from crane.samples import Array
-from crane.straight import Number, Program, Tape, largest
 
 # What can be asked of a sweep, given a second argument x (n,): a_A for inverse and regressor,
 # tau_A for forward.
@@ -35,54 +34,6 @@ QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
     "regressor": lambda sweep, x: [entry for row in sweep.regressor(x) for entry in row],
 }
 _FLOAT = np.dtype(np.float64)
-
-# Closes the loops sample by sample and evaluates there; like `follow`, stops at the first sample
-# that is too far from the one before it.
-_EACH = """
-define i64 @each(i64 %count, ptr %follow, ptr %geometry, ptr %numbers, ptr %targets, ptr %inputs,
-                 ptr %at, ptr %work, ptr %q, ptr %out, ptr %bounds) {{
-entry:
-  br label %sample
-sample:
-  %i = phi i64 [0, %entry], [%i1, %evaluate]
-  %more = icmp slt i64 %i, %count
-  br i1 %more, label %close, label %done
-close:
-  %t0 = mul i64 %i, {n}
-  %target = getelementptr double, ptr %targets, i64 %t0
-  %got = call i64 %follow(i64 1, ptr %geometry, ptr %target, ptr %at, ptr %work, ptr %q,
-                          ptr %bounds)
-  %ok = icmp eq i64 %got, 1
-  br i1 %ok, label %evaluate, label %done
-evaluate:
-  %x0 = mul i64 %i, {inputs}
-  %x = getelementptr double, ptr %inputs, i64 %x0
-  %o0 = mul i64 %i, {outputs}
-  %o = getelementptr double, ptr %out, i64 %o0
-  call void @formula(ptr %geometry, ptr %numbers, ptr %q, ptr %x, ptr %o)
-  %i1 = add i64 %i, 1
-  br label %sample
-done:
-  ret i64 %i
-}}
-define i64 @once(ptr %a) {{
-  {loads}
-  call void @scan(ptr %v4, ptr %v5, ptr %v9)
-  %most = load double, ptr %v9
-  %finite = fcmp olt double %most, 0x7FF0000000000000
-  br i1 %finite, label %go, label %stop
-stop:
-  ret i64 0
-go:
-  %done = call i64 @each(i64 1, {passed})
-  ret i64 %done
-}}
-"""
-_LOADS = "\n  ".join(
-    f"%p{i} = getelementptr i64, ptr %a, i64 {i}\n  %v{i} = load ptr, ptr %p{i}"
-    for i in range(1, 11)
-)
-_PASSED = ", ".join(f"ptr %v{i}" for i in range(1, 11))
 
 
 class Formula:
@@ -110,20 +61,13 @@ class Formula:
         if key not in fast.programs:
             fast.programs[key] = _compile(quantity, fast, numbers, n, carriers)
         self._program = program = fast.programs[key]
-        self.size = program.sizes["formula"]
-        kinds = [c_int64, *[c_void_p] * 10]
-        self._each = program.function("each", *kinds, result=c_int64)
-        self._formula = program.function("formula", *[c_void_p] * 5)
+        self.size = program.outputs("formula").size
         self.cursor = fast.cursor()
         self._q, self._out = np.zeros(nq), np.zeros(self.size)
         self._target, self._input = np.zeros(n), np.zeros(2 * n)
         self._first, self._second = self._input[:n], self._input[n:]
         self._shape = (n,)
-        # a single pointer costs a call from Python far less than twelve arguments
-        self._once = program.function("once", c_void_p, result=c_int64)
-        arguments = self._arguments(self._target[None], self._input[None], self._out[None])
-        self._packed = np.array(arguments)
-        self._packed_at = self._packed.ctypes.data
+        self._once = program.bound("once", *self._arguments(self._target, self._input, self._out))
 
     def one(self, q_a: Any, v_a: Any, x: Any) -> Array | None:
         """The quantity of one sample without delay, or None where arguments need a closer look.
@@ -143,15 +87,13 @@ class Formula:
                 ):
                     return None
                 buffer[:] = array
-        return self._out.copy() if self._once(self._packed_at) == 1 else None
+        return self._out.copy() if self._once() == 1 else None
 
     def at(self, q: Array, inputs: Array) -> Array:
         """The quantity at one closed posture (nq,), inputs [v_A, x] (2 n,)."""
         out = np.empty(self.size)
-        self._formula(
-            self._fast.geometry.numbers.ctypes.data, self._numbers.ctypes.data,
-            q.ctypes.data, inputs.ctypes.data, out.ctypes.data,
-        )  # fmt: skip
+        geometry = self._fast.geometry.numbers
+        self._program.call("formula", geometry, self._numbers, q, inputs, out)
         return out
 
     def each(self, targets: Array, inputs: Array, out: Array) -> int:
@@ -160,14 +102,13 @@ class Formula:
         Returns:
             How many were done.
         """
-        return int(self._each(*self._arguments(targets, inputs, out)))
+        arguments = self._arguments(targets, inputs, out)
+        return self._program.call("each", len(targets), *arguments)
 
-    def _arguments(self, targets: Array, inputs: Array, out: Array) -> tuple[int, ...]:
+    def _arguments(self, targets: Array, inputs: Array, out: Array) -> tuple[int | Array, ...]:
         fast = self._fast
         arrays = (fast.geometry.numbers, self._numbers, targets, inputs)
-        memory = (self.cursor.at, self.cursor.work, self._q, out, fast.bounds)
-        addresses = [array.ctypes.data for array in (*arrays, *memory)]
-        return (len(targets), fast.address, *addresses)
+        return (fast.address, *arrays, self.cursor.at, self._q, out, fast.bounds)
 
 
 def _compile(
@@ -182,8 +123,36 @@ def _compile(
     program.add("formula", 4, outputs)
     tape = Tape()  # what is not finite is left to the checks that name it
     program.add("scan", 2, [largest([*tape.loads(0, 0, n), *tape.loads(1, 0, 2 * n)])])
-    program.add_text(
-        _EACH.format(n=n, inputs=2 * n, outputs=len(outputs), loads=_LOADS, passed=_PASSED)
-    )
+    _add_loop(program, n)
     program.compile()
     return program
+
+
+def _add_loop(program: Program, n: int) -> None:
+    """each: close the loops sample by sample and evaluate there; once: the same of one sample.
+
+    Like `follow` of `FastClosure`, it stops at the first sample that is too far from the one
+    before it.
+    """
+    arrays = ("geometry", "numbers", "targets", "inputs", "at", "q", "out", "bounds")
+    outputs = program.outputs("formula").size
+    with program.routine("each", counts=("count",), functions=("follow",), arrays=arrays) as r:
+        with r.loop(r.count) as i:
+            target = r.targets.row(i, n)
+            got = r.call("follow", 1, r.geometry, target, r.at, r.q, r.bounds)
+            with r.when(got < 1):
+                r.give(i)
+            out = r.out.row(i, outputs)
+            r.call("formula", r.geometry, r.numbers, r.q, r.inputs.row(i, 2 * n), out)
+        r.give(r.count)
+    with program.routine("once", functions=("follow",), arrays=arrays) as r:
+        scanned = r.array("scanned", program.outputs("scan"))
+        r.call("scan", r.targets, r.inputs, scanned)
+        with r.when(~(scanned["all"] < np.inf)):
+            r.give(0)
+        r.give(
+            r.call(
+                "each", 1, r.follow, r.geometry, r.numbers, r.targets, r.inputs, r.at, r.q, r.out,
+                r.bounds,
+            )
+        )  # fmt: skip

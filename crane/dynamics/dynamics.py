@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.codegen import TooLongError, carefully
 from crane.dynamics.compiled import Formula
 from crane.dynamics.elements import JointForces
 from crane.dynamics.formulation import carriers
@@ -11,7 +12,6 @@ from crane.dynamics.tree import TreeDynamics
 from crane.errors import InputError, known
 from crane.machine import Machine
 from crane.samples import Array, as_samples
-from crane.straight import TooLongError
 
 PATHS = ("compiled", "pinocchio")
 
@@ -284,12 +284,10 @@ class Dynamics:
                 ]
             )
         out = np.empty((len(targets), formula.size))
-        done = 0
-        while done < len(targets):
-            done += formula.each(targets[done:], rows[done:], out[done:])
-            if done < len(targets):
-                sample = f" (sample {done})" if stacked else ""
-                q = closure.reach(formula.cursor, targets[done], sample)
-                out[done] = formula.at(q, rows[done])
-                done += 1
+
+        def reach(i: int) -> None:
+            sample = f" (sample {i})" if stacked else ""
+            out[i] = formula.at(closure.reach(formula.cursor, targets[i], sample), rows[i])
+
+        carefully(len(targets), lambda i, _: formula.each(targets[i:], rows[i:], out[i:]), reach)
         return out

@@ -6,10 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from crane.closure.traced import Constants, Geometry, Loops, Motion, Posture, Vector
-from crane.dynamics.elements import JointForces
-from crane.machine import Machine
-from crane.samples import Array
-from crane.straight.scalar import (
+from crane.codegen.scalar import (
     Number,
     add,
     apply,
@@ -22,6 +19,9 @@ from crane.straight.scalar import (
     subtract,
     times,
 )  # fmt: skip
+from crane.dynamics.elements import JointForces
+from crane.machine import Machine
+from crane.samples import Array
 
 BODY, JOINT = 10, 19  # numbers per body and per joint
 

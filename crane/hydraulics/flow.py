@@ -1,6 +1,6 @@
 """Flow through orifices, from floats or traced numbers."""
 
-from crane.straight.scalar import Number, apply, maximum, minimum, where_positive, with_sign_of
+from crane.codegen.scalar import Number, apply, maximum, minimum, where_positive, with_sign_of
 
 LAMINAR = 1.0e4  # pressure drop below which an orifice's flow is smooth [Pa]
 

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from crane.codegen import Number, maximum
+from crane.codegen.scalar import apply, where_positive
 from crane.description import Counterbalance, Cylinder, Valve
 from crane.hydraulics.flow import clipped, in_series, root, through
-from crane.straight import Number, maximum
-from crane.straight.scalar import apply, where_positive
 
 GAS_PRESSURE = 1.0e5  # at which volumes of entrapped gas are given [Pa]
 _SLIGHT = 0.1  # of the hose's volume, the least that a chamber holds

@@ -173,7 +173,7 @@ class Session:
         """(N, 3) positions of the tip [m] at closed postures (N, nq); (0, 3) without one."""
         if self._kinematics is None:
             return np.empty((0, 3))
-        return np.array([self._kinematics.position_at(row) for row in q])
+        return self._kinematics.positions(q)
 
     def _way(self, target: Array) -> list[Array] | None:
         """Postures on the straight way to a target (n,), up to where it leaves the branch.

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from crane.codegen import Number
 from crane.control import PI, Traced
 from crane.dynamics import Dynamics
 from crane.errors import (
@@ -16,7 +17,7 @@ from crane.errors import (
     SimulationError,
     known,
 )
-from crane.integration import CompiledStepper, HaltedError, PythonStepper, explained
+from crane.integration import HaltedError, Steps, explained, row_layout
 from crane.kinematics import Kinematics
 from crane.machine import Machine, load
 from crane.paths import Path, beyond_limits
@@ -24,7 +25,6 @@ from crane.recording import FORCE_UNITS, VELOCITY_UNITS, Recording
 from crane.rig.plant import Tolerances, drawn
 from crane.rig.sensors import Sensors, default_sensors
 from crane.samples import Array, as_number, as_seed
-from crane.straight import Number, TooLongError
 
 _STABLE = 2.0  # fastest rate times substep; Runge-Kutta of fourth order bears 2.785
 _CUTOFF = 5.0  # [Hz] of the measured velocity
@@ -176,7 +176,7 @@ class Rig:
                 channels[f"{name}_{joint}"], units[f"{name}_{joint}"] = values[:, i], of
         if machine.tip is not None:
             known_tip, tip = Kinematics(machine).position(measured), Kinematics(plant)
-            true_tip = np.array([tip.position_at(q) for q in postures])
+            true_tip = tip.positions(postures)
             for name, points in (("tip", known_tip), ("true_tip", true_tip)):
                 for axis, values in zip("xyz", points.T, strict=True):
                     channels[f"{name}_{axis}"], units[f"{name}_{axis}"] = values, "m"
@@ -203,40 +203,30 @@ class Rig:
         plant, dynamics = self.plant, Dynamics(self.plant)
         n, nq, active = len(plant.active), plant.model.nq, plant.closure.active
         held, substeps = _Held(n), _substeps(dynamics, reference, step)
-        h, slow = step / substeps, PythonStepper(dynamics, held)
-        try:
-            fast = CompiledStepper(dynamics, held, 0)
-        except TooLongError:
-            fast = None
+        h, steps = step / substeps, Steps(dynamics, held, 0)
         state = np.concatenate([plant.closure.solve(reference[0]), np.zeros(n + 2)])
-        rows = np.empty((substeps, len(state) + 2 * n + 2))
+        now = steps.slow.layout.view(state)
+        rows = np.empty((substeps, row_layout(plant, held, 0).size))
         integral = control.start(reference[0])
         measured, command, force = (np.empty_like(reference) for _ in range(3))
-        states = np.empty((len(reference), nq + n))
+        postures, v = np.empty((len(reference), nq)), np.empty_like(reference)
         for k in range(len(reference)):
-            q_a = state[:nq][active] + noise[k]
+            q_a = now.q[active] + noise[k]
             measured[k] = [s.position(x) for s, x in zip(sensors, q_a, strict=True)]
             error = reference[k] - measured[k]
             command[k] = kp * error + ki * integral
             integral = integral + step * error
             force[k] = np.minimum(np.maximum(command[k], -self.limits), self.limits)
-            states[k] = state[: nq + n]
+            postures[k], v[k] = now.q, now.v_a
             held.settings[:] = force[k]
-            times = k * step + h * np.arange(substeps, dtype=np.float64)
-            done = 0 if k < len(reference) - 1 else substeps
-            while done < substeps:
-                if fast is not None:
-                    done += fast.run(times[done:], state, h, rows)
-                if done < substeps:
-                    # machine code stops where a step needs a closer look
-                    try:
-                        rate, _ = slow.observe(times[done], state)
-                        state[:] = slow.advance(times[done], state, rate, h)
-                    except HaltedError as halt:
-                        before = step * np.arange(k + 1.0), states[: k + 1, :nq][:, active]
-                        raise explained(plant, halt, *before, path) from None
-                    done += 1
-        return measured, command, force, states[:, :nq], states[:, nq:]
+            if k < len(reference) - 1:
+                times = k * step + h * np.arange(substeps, dtype=np.float64)
+                try:
+                    steps.run(times, state, h, rows)
+                except HaltedError as halt:
+                    before = step * np.arange(k + 1.0), postures[: k + 1, active]
+                    raise explained(plant, halt, *before, path) from None
+        return measured, command, force, postures, v
 
     def _currents(self, force: Array, sign: Array, noise: Array) -> tuple[Array, Array]:
         """Measured currents (N, n) [A], and the forces that equation (8) makes of them."""

@@ -1,7 +1,6 @@
 """Machines in time."""
 
 from crane.simulation.recorded import imbalance
-from crane.simulation.run import Force, simulate, trajectory
-from crane.simulation.steps import Progress
+from crane.simulation.run import Force, Progress, simulate, trajectory
 
 __all__ = ["Force", "Progress", "imbalance", "simulate", "trajectory"]

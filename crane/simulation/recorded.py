@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 
+from crane.codegen import Parts
 from crane.control import Controller, Free, Signals, StiffController, ValveDrive
 from crane.errors import CraneWarning
 from crane.hydraulics.circuit import BALANCES
@@ -12,35 +13,23 @@ from crane.machine import Machine
 from crane.recording import Recording
 from crane.samples import Array
 
-ENERGIES = 2  # of the state: work, dissipated; of the observations: kinetic, potential
 _IMBALANCE = 5e-3  # share of the energy that went through
 
 
 def recorded(
-    machine: Machine,
-    control: Controller,
-    step: float,
-    states: Array,
-    seen: Array,
-    task: str,
+    machine: Machine, control: Controller, time: Array, rows: Parts, task: str
 ) -> Recording:
     """What the integration left as a recording.
 
     Args:
         machine: The machine.
         control: What drove it.
-        step: [s].
-        states: (N, .) see `trajectory`.
-        seen: (N, .) observations, see there.
+        time: (N,) [s].
+        rows: See `trajectory`.
         task: Name to put into it.
     """
-    n, path = len(machine.active), control.path
-    forces, friction = seen[:, :n], seen[:, n : 2 * n]
-    energies, more = seen[:, 2 * n : 2 * n + ENERGIES], seen[:, 2 * n + ENERGIES :]
-    time = step * np.arange(len(states), dtype=np.float64)
-    nq = machine.model.nq
-    postures, v_a = states[:, :nq], states[:, nq : nq + len(machine.active)]
-    q_a = postures[:, machine.closure.active]
+    path = control.path
+    q_a = rows.q[:, machine.closure.active]
     _warn_of_limits(machine, time, q_a)
     channels: dict[str, Array] = {}
     units: dict[str, str] = {}
@@ -50,11 +39,9 @@ def recorded(
 
     for column in machine.closure.passive:
         joint = machine.joints[column]
-        add(joint, postures[:, column], machine.unit(joint))
+        add(joint, rows.q[:, column], machine.unit(joint))
     if machine.tip is not None:
-        kinematics = Kinematics(machine)
-        tip = np.array([kinematics.position_at(q) for q in postures])
-        for axis, values in zip("xyz", tip.T, strict=True):
+        for axis, values in zip("xyz", Kinematics(machine).positions(rows.q).T, strict=True):
             add(f"tip_{axis}", values, "m")
     if path is not None:
         reference, reference_rate, _ = path(time)
@@ -66,23 +53,22 @@ def recorded(
             for axis, values in zip("xyz", path.tip(time)[0].T, strict=True):
                 add(f"reference_tip_{axis}", values, "m")
     for i, joint in enumerate(machine.active):
-        add(f"friction_{joint}", friction[:, i], "N" if machine.unit(joint) == "m" else "N m")
-    add("kinetic", energies[:, 0], "J")
-    add("potential", energies[:, 1], "J")
-    add("work", states[:, -2], "J")
-    add("dissipated", states[:, -1], "J")
+        add(f"friction_{joint}", rows.friction[:, i], "N" if machine.unit(joint) == "m" else "N m")
+    names = {"kinetic": "kinetic", "potential": "potential", "work": "work", "dissipated": "lost"}
+    for name, part in names.items():
+        add(name, getattr(rows, part)[:, 0], "J")
     if isinstance(control, StiffController):
-        for (name, unit), values in zip(control.channels, more.T, strict=True):
+        for (name, unit), values in zip(control.channels, rows.channels.T, strict=True):
             add(name, values, unit)
-        integrals = states[:, -ENERGIES - len(BALANCES) : -ENERGIES]
+        integrals = rows.own[:, -len(BALANCES) :]
         for (name, unit), values in zip(BALANCES.items(), integrals.T, strict=True):
             add(name, values, unit)
     return Recording(
         time=time,
         joints=machine.active,
         q=q_a,
-        v=v_a,
-        tau=forces,
+        v=rows.v_a,
+        tau=rows.tau,
         units={joint: machine.unit(joint) for joint in machine.active},
         channels=channels,
         channel_units=units,
@@ -113,19 +99,18 @@ def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
             )
 
 
-def imbalance(work: Array, energies: Array, dissipated: Array, step: float) -> str:
+def imbalance(rows: Parts, step: float) -> str:
     """What to say if a simulation does not keep its energy, else nothing.
 
     Args:
-        work: (N,) of the active forces [J].
-        energies: (N, 2) kinetic, potential [J].
-        dissipated: (N,) [J].
+        rows: See `trajectory`; work, lost, kinetic, potential [J] of it.
         step: [s].
     """
-    change = (energies - energies[0]).sum(axis=1)
-    gap = float(np.abs(work - change - dissipated).max())
-    throughput = float(max(np.ptp(part) for part in (work, dissipated, *energies.T)))
-    rounding = 1e-12 * float(np.abs(energies).max())
+    change = rows.kinetic + rows.potential - rows.kinetic[0] - rows.potential[0]
+    gap = float(np.abs(rows.work - change - rows.lost).max())
+    parts = rows.work, rows.lost, rows.kinetic, rows.potential
+    throughput = float(max(np.ptp(part) for part in parts))
+    rounding = 1e-12 * float(max(np.abs(rows.kinetic).max(), np.abs(rows.potential).max()))
     if gap <= _IMBALANCE * throughput + rounding:
         return ""
     return (

@@ -2,10 +2,12 @@
 
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.codegen import Parts, TooLongError
 from crane.control import (
     Command,
     Controller,
@@ -17,17 +19,26 @@ from crane.control import (
 )
 from crane.dynamics import Dynamics
 from crane.errors import ClosureError, CraneWarning, InputError, SimulationError, known
-from crane.integration import ADAPTIVE, integrate_adaptively
+from crane.integration import (
+    ADAPTIVE,
+    AdaptiveSteps,
+    HaltedError,
+    Steps,
+    StiffSteps,
+    explained,
+    row_layout,
+)
 from crane.machine import Machine
 from crane.paths import Path, beyond_limits
 from crane.recording import Recording
 from crane.samples import Array, as_number, as_sample
-from crane.simulation.recorded import ENERGIES, imbalance, recorded
-from crane.simulation.steps import Progress, integrate, integrate_stiff
+from crane.simulation.recorded import imbalance, recorded
 
 _MOST = 4_000_000  # steps of one recording
+_ENERGIES = 2  # of the state: work, lost
 
 Force = Callable[[float, Array, Array], Array]
+Progress = Callable[[float], None]
 
 
 def simulate(
@@ -93,13 +104,12 @@ def simulate(
         if text := beyond_limits(machine, control.path, until):
             warnings.warn(text, CraneWarning, stacklevel=2)
     dynamics = Dynamics(machine, formulation, path)
-    _, states, seen = trajectory(dynamics, control, initial, duration, step, method, progress)
+    time, rows = trajectory(dynamics, control, initial, duration, step, method, progress)
     # the energies are integrated with the motion, so they tell when the step is too long
-    n = len(machine.active)
-    text = imbalance(states[:, -2], seen[:, 2 * n : 2 * n + 2], states[:, -1], step)
+    text = imbalance(rows, step)
     if text and formulation == "exact":
         warnings.warn(text, CraneWarning, stacklevel=2)
-    return recorded(machine, control, step, states, seen, task)
+    return recorded(machine, control, time, rows, task)
 
 
 def trajectory(
@@ -110,12 +120,11 @@ def trajectory(
     step: float,
     method: str | None = None,
     progress: Progress | None = None,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Parts]:
     """What `simulate` computes, without channels; see there for arguments and errors.
 
     Returns:
-        Times (N,); states (N, .) of q (nq), v_A (n), the controller's, work, dissipated;
-        observations (N, 2 n + 2) of tau, friction, kinetic, potential.
+        Times (N,), and what `crane.integration.row_layout` names, (N, .) each.
     """
     machine = dynamics.machine
     control = _as_controller(controller, machine)
@@ -129,23 +138,50 @@ def trajectory(
         posture, own = machine.closure.solve(q_a), control.start(q_a)
     except ClosureError as error:
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
-    state = np.concatenate([posture, v_a, own, np.zeros(ENERGIES)])
+    state = np.concatenate([posture, v_a, own, np.zeros(_ENERGIES)])
+    integration = _integration(dynamics, control, len(own), method)
+    layout = row_layout(machine, control, len(own))
+    times, rows = step * np.arange(steps + 1, dtype=np.float64), np.empty((steps + 1, layout.size))
+
+    def report(done: int) -> None:
+        if progress is not None:
+            progress(done / (steps + 1))
+
+    try:
+        integration.run(times[:-1], state, step, rows, report)
+        rows[-1] = [*state, *integration.slow.observe(times[-1], state)[1]]
+    except HaltedError as halt:
+        finer, done = integration.finer(times[:-1], rows, step), integration.done
+        q_a = layout.view(rows[:done]).q[:, machine.closure.active]
+        raise explained(machine, halt, times[:done], q_a, control.path, finer) from None
+    if progress is not None:
+        progress(1.0)
+    return times, layout.view(rows)
+
+
+def _integration(
+    dynamics: Dynamics, control: Controller, own: int, method: str | None
+) -> Steps | StiffSteps | AdaptiveSteps:
+    """What integrates by a method, or by that which the controller asks for."""
+    stiff = isinstance(control, StiffController)
     if method is None:
-        method = "rosenbrock" if isinstance(control, StiffController) else "rk4"
-    if method != "rosenbrock" and isinstance(control, StiffController) and control.period:
+        method = "rosenbrock" if stiff else "rk4"
+    if method == "rosenbrock" and isinstance(control, StiffController):
+        if dynamics.path == "compiled":
+            with suppress(TooLongError):
+                return StiffSteps(dynamics, control)
+        if control.period:
+            raise InputError("a program with a period runs on the compiled path alone")
+        return AdaptiveSteps(dynamics, control, own, "BDF")
+    if isinstance(control, StiffController) and control.period:
         raise InputError(
             f"method '{method}' does not call the valves' program, leave the method out"
         )
-    if method == "rosenbrock" and isinstance(control, StiffController):
-        rows = integrate_stiff(dynamics, control, state, steps, step, progress)
-    elif method == "rk4":
-        rows = integrate(dynamics, control, state, steps, step, progress)
-    elif method in ADAPTIVE:
-        rows = integrate_adaptively(dynamics, control, state, steps, step, method, progress)
-    else:
-        raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")
-    times = step * np.arange(steps + 1, dtype=np.float64)
-    return times, rows[:, : len(state)], rows[:, len(state) :]
+    if method == "rk4":
+        return Steps(dynamics, control, own)
+    if method in ADAPTIVE:
+        return AdaptiveSteps(dynamics, control, own, method)
+    raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")
 
 
 def _as_controller(

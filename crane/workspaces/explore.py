@@ -59,7 +59,7 @@ def workspace(
         raise InputError(f"no active joint moves '{kinematics.frame}', name another frame")
     patches, counted = _patches(machine, strokes, low, high, samples, random)
     q = np.concatenate([patch.q[patch.closed] for patch in patches])
-    tips = np.array([kinematics.position_at(posture) for posture in q])
+    tips = kinematics.positions(q)
     home = kinematics.position_at(machine.home)
     section = section_of(machine, kinematics.frame, tips, home)
     places = section.coordinates(tips)

@@ -39,7 +39,7 @@ class Probe:
 
     def tips(self, q: Array) -> Array:
         """Positions (N, 3) [m] at postures (N, nq)."""
-        return np.array([self.kinematics.position_at(posture) for posture in q])
+        return self.kinematics.positions(q)
 
     def on_axis(self, q: Array) -> bool:
         """Whether the first coordinate is a distance from an axis that the tip is on."""

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 import crane
+from crane.codegen.scalar import apply
 from crane.control import PI, Traced
 from crane.errors import ClosureError
 from crane.samples import Array
-from crane.straight.scalar import apply
 from forwarder.paper import (
     CRUISE,
     DURATION,

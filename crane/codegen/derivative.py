@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from crane.straight.scalar import Expression, Number, Tape, apply, where_positive, with_sign_of
+from crane.codegen.scalar import Expression, Number, Tape, apply, where_positive, with_sign_of
 
 # Of functions of one number: f'(x) by x and y = f(x).
 _ONE: dict[str, Callable[[Expression, Expression], Number]] = {
@@ -54,19 +54,19 @@ def _change(tape: Tape, index: int, kind: str, operands: list, slope: dict[int, 
     value: list[Number] = [Expression(tape, x) if type(x) is int else x for x in operands]
     moved: list[Number] = [slope.get(x, 0.0) if type(x) is int else 0.0 for x in operands]
     a, da = value[0], moved[0]
-    if kind == "fneg":
+    if kind == "negate":
         return -da
     if kind in _ONE:
         assert isinstance(a, Expression)
         return da * _ONE[kind](a, Expression(tape, index))
     b, db = value[1], moved[1]
-    if kind == "fadd":
+    if kind == "add":
         return da + db
-    if kind == "fsub":
+    if kind == "subtract":
         return da - db
-    if kind == "fmul":
+    if kind == "multiply":
         return da * b + a * db
-    if kind == "fdiv":
+    if kind == "divide":
         return (da - Expression(tape, index) * db) / b
     if kind == "maximum":
         return where_positive(a - b, da, db)

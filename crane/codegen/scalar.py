@@ -54,7 +54,7 @@ class Expression:
     def __add__(self, other: Number) -> Number:
         if not isinstance(other, Expression) and other == 0:
             return self
-        return self._symmetric("fadd", other)
+        return self._symmetric("add", other)
 
     __radd__ = __add__
 
@@ -63,10 +63,10 @@ class Expression:
             return self + (-other)
         if other.index == self.index:
             return 0.0
-        return self.tape.add("fsub", self.index, other.index)
+        return self.tape.add("subtract", self.index, other.index)
 
     def __rsub__(self, other: float) -> Number:
-        return -self if other == 0 else self.tape.add("fsub", float(other), self.index)
+        return -self if other == 0 else self.tape.add("subtract", float(other), self.index)
 
     def __mul__(self, other: Number) -> Number:
         if not isinstance(other, Expression):
@@ -74,28 +74,44 @@ class Expression:
                 return 0.0
             if abs(other) == 1:
                 return self if other == 1 else -self
-        return self._symmetric("fmul", other)
+        return self._symmetric("multiply", other)
 
     __rmul__ = __mul__
 
     def __truediv__(self, other: Number) -> Number:
         if not isinstance(other, Expression):
             return self * (1.0 / other)
-        return self.tape.add("fdiv", self.index, other.index)
+        return self.tape.add("divide", self.index, other.index)
 
     def __rtruediv__(self, other: float) -> Number:
-        return 0.0 if other == 0 else self.tape.add("fdiv", float(other), self.index)
+        return 0.0 if other == 0 else self.tape.add("divide", float(other), self.index)
 
     def __neg__(self) -> "Expression":
         operation = self.tape.operations[self.index]
-        if operation[0] == "fneg":
+        if operation[0] == "negate":
             return Expression(self.tape, operation[1])
-        return self.tape.add("fneg", self.index)
+        return self.tape.add("negate", self.index)
 
     def _symmetric(self, name: str, other: Number) -> "Expression":
         if not isinstance(other, Expression):
             return self.tape.add(name, self.index, float(other))
         return self.tape.add(name, *sorted((self.index, other.index)))
+
+
+def needed(outputs: Sequence[Number]) -> list[int]:
+    """Indices of the operations that the outputs depend on, in order."""
+    found: set[int] = set()
+    waiting = [value for value in outputs if isinstance(value, Expression)]
+    operations = waiting[0].tape.operations if waiting else []
+    indices = [value.index for value in waiting]
+    while indices:
+        index = indices.pop()
+        if index not in found:
+            found.add(index)
+            kind, *operands = operations[index]
+            if kind != "load":
+                indices += [operand for operand in operands if type(operand) is int]
+    return sorted(found)
 
 
 def apply(function: str, x: Number) -> Number:

@@ -6,14 +6,13 @@ import math
 import subprocess
 import sys
 import threading
-from ctypes import c_void_p
 from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
 
-from crane.straight import Expression, Program, Tape, largest, maximum
-from crane.straight.scalar import (
+from crane.codegen import Expression, Program, Tape, largest, maximum
+from crane.codegen.scalar import (
     add,
     apply,
     cross,
@@ -41,13 +40,10 @@ class Function:
             self.program.add(f"f{i}", 1, outputs)
             self.sizes.append(len(outputs))
         self.program.compile()
-        self.calls = [
-            self.program.function(f"f{i}", c_void_p, c_void_p) for i in range(len(functions))
-        ]
 
     def __call__(self, x, which=0):
         x, out = np.array(x, dtype=np.float64), np.empty(self.sizes[which])
-        self.calls[which](x.ctypes.data, out.ctypes.data)
+        self.program.call(f"f{which}", x, out)
         return out
 
 
@@ -586,8 +582,7 @@ def test_arguments_are_told_apart():
     program.compile()
     arrays = [np.arange(3) + 10.0 * i for i in range(3)]
     out = np.empty(1)
-    call = program.function("f", *[c_void_p] * 4)
-    call(*(array.ctypes.data for array in arrays), out.ctypes.data)
+    assert program.call("f", *arrays, out) == 0
     assert out[0] == 20.0 - 1.0 * 12.0
 
 

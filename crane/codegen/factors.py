@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from crane.straight.scalar import Expression, Number, Tape
+from crane.codegen.scalar import Expression, Number, Tape
 
 Matrix = list[list[Number]]
 

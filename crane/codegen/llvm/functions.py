@@ -47,6 +47,11 @@ def _bits(value: float) -> int:
     return int(bits)
 
 
+def real(value: float) -> str:
+    """A number in LLVM's language."""
+    return f"0x{_bits(value):016X}"
+
+
 class _Text:
     """Lines of one function of a vector.
 
@@ -69,7 +74,7 @@ class _Text:
 
     def number(self, value: float) -> str:
         """The same number everywhere."""
-        return "<" + ", ".join([f"double 0x{_bits(value):016X}"] * self._width) + ">"
+        return "<" + ", ".join([f"double {real(value)}"] * self._width) + ">"
 
     def integer(self, value: int) -> str:
         """The same integer everywhere."""

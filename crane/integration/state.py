@@ -1,0 +1,22 @@
+"""What a simulation integrates and what it observes, part by part."""
+
+from crane.codegen import Layout
+from crane.control import Controller, StiffController
+from crane.machine import Machine
+
+
+def state_layout(machine: Machine, own: int) -> Layout:
+    """What is integrated: q (nq), v_a (n), the controller's own, work, lost [J]."""
+    return Layout(q=machine.model.nq, v_a=len(machine.active), own=own, work=1, lost=1)
+
+
+def seen_layout(machine: Machine, control: Controller) -> Layout:
+    """What is observed: tau (n), friction (n), kinetic, potential [J], channels of circuits."""
+    n = len(machine.active)
+    channels = len(control.channels) if isinstance(control, StiffController) else 0
+    return Layout(tau=n, friction=n, kinetic=1, potential=1, channels=channels)
+
+
+def row_layout(machine: Machine, control: Controller, own: int) -> Layout:
+    """Both, as they are recorded at an instant."""
+    return Layout(**state_layout(machine, own).parts, **seen_layout(machine, control).parts)
