@@ -404,6 +404,14 @@ def test_forces_of_friction_and_rotors_tell_no_unit():
             assert line.startswith("'q1_force' is ") and line.endswith("recording cannot say")
 
 
+def test_a_force_of_another_shape_is_a_doubt():
+    """A hundred times the model, and more that the model lacks: what it has is no measure."""
+    motion, modelled = moved()
+    motion = dataclasses.replace(motion, tau=100 * modelled + 2e3 * np.sin(11 * motion.q))
+    with pytest.warns(CraneWarning, match="'q1_force' is .* this recording cannot say"):
+        check_forces(first(motion), modelled[:, :1], JOINTS[:1])
+
+
 def test_forces_come_late():
     motion, modelled = moved()
     late = Motion(
