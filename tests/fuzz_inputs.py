@@ -367,9 +367,9 @@ def judge_npz(seed, folder):
         elif how in (3, 4):
             entries[name] = damaged(rng, entries[name])
         elif how == 5:
-            entries[rng.choice(["", "a", "../x.npy", "a b", "time.npy", "$\\bad$ [m].npy"])] = (
-                entries[name]
-            )
+            entries[
+                rng.choice([".npy", "a", "../x.npy", "a b", "time.npy", "$\\bad$ [m].npy"])
+            ] = entries[name]
         elif how == 6:
             del entries[name]
         elif how == 7:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-SOME = {"visuals": 15, "meshes": 1, "npz": 15, "csv": 25}
+SOME = {"visuals": 8, "meshes": 1, "npz": 10, "csv": 12}
 MANY = {"visuals": 2000, "meshes": 150, "npz": 1000, "csv": 1500}  # meshes: 20 files each
 
 
