@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 SOME = {"visuals": 8, "meshes": 1, "npz": 10, "csv": 12}
-MANY = {"visuals": 2000, "meshes": 150, "npz": 1000, "csv": 1500}  # meshes: 20 files each
+MANY = {"visuals": 1500, "meshes": 100, "npz": 600, "csv": 900}  # meshes: 20 files each
 
 
 def run(kind, first, count):
