@@ -53,7 +53,9 @@ def recorded(
         add(joint, postures[:, column], machine.unit(joint))
     if machine.tip is not None:
         kinematics = Kinematics(machine)
-        tip = np.array([kinematics.position_at(q) for q in postures])
+        tip = np.empty((len(postures), 3))  # a list of an hour's would take half a gigabyte
+        for i, q in enumerate(postures):
+            tip[i] = kinematics.position_at(q)
         for axis, values in zip("xyz", tip.T, strict=True):
             add(f"tip_{axis}", values, "m")
     if path is not None:
