@@ -31,6 +31,7 @@ _WORD = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
 _ROWS_AT_ONCE = 4096
 _BLOCK = 1 << 20  # bytes, and so many at most in a line
 _LONG_HEADING, _LONG_NAME = 1 << 16, 200  # characters
+_LARGEST = 1e30  # in SI units; what is computed from larger ones overflows
 
 # unit: (SI unit, a, b) with x a / b in SI units; two factors, so that 12.3 mm is 0.0123 m exactly
 _TO_SI = {
@@ -223,10 +224,9 @@ def _table(path: Path, names: Sequence[str], values: Array, notes: dict[str, str
     heading = io.StringIO()
     csv.writer(heading).writerow(names)
     try:
-        units = _units(heading.getvalue().rstrip())
+        return _in_si(Table(_units(heading.getvalue().rstrip()), values, notes))
     except RecordingError as error:
         raise RecordingError(at(str(path), error)) from None
-    return _in_si(Table(units, values, notes))
 
 
 def check_plain(path: Path) -> None:
@@ -268,6 +268,15 @@ def _in_si(table: Table) -> Table:
             units[name], a, b = _TO_SI[unit]
             with np.errstate(over="ignore"):  # infinite values are refused with their name
                 values[:, i] = values[:, i] * a / b
+    for i, name in enumerate(table.units):
+        column = values[:, i]
+        beyond = np.isfinite(column) & (np.abs(column) > _LARGEST)
+        if beyond.any():
+            sample = int(np.argmax(beyond))
+            raise RecordingError(
+                f"'{name}' is {column[sample]:.3g} at sample {sample}, beyond all that is "
+                "measured, correct it"
+            )
     return Table(units, values, table.notes)
 
 

@@ -12,6 +12,7 @@ from crane.identification.determined import weak_directions
 from crane.identification.feasible import body_parameters, curvature, pseudo_inertia
 from crane.identification.identify import identify
 from crane.identification.model import Model
+from crane.identification.possible import thick
 from crane.identification.signals import Motion
 
 NOISE = np.array([5e-3, 0.5, 0.3])  # [N m], [N], [N]
@@ -175,8 +176,7 @@ def test_feasible_intervals_cover_machines_that_are_not_as_described(mini, prior
         rng = np.random.default_rng(seed)
         truth = model.nominal.copy()
         for i in range(0, 10 * len(model.bodies), 10):
-            P = pseudo_inertia(truth[i : i + 10])
-            L = np.linalg.cholesky(P + 1e-9 * np.trace(P) * np.eye(4))
+            L = np.linalg.cholesky(pseudo_inertia(thick(truth[i : i + 10])))
             E = rng.normal(size=(4, 4))
             values, vectors = np.linalg.eigh(0.15 * (E + E.T))
             X = vectors @ np.diag(np.exp(values)) @ vectors.T

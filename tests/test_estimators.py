@@ -84,6 +84,7 @@ def test_prior(estimator):
     # Huber's clips the noise and weighs its rows less, together by a few percent.
     close = 0.1 if estimator is huber else 2e-3
     np.testing.assert_allclose(found.values[0], exact[0], rtol=close)
+    information = W.T @ W / 0.5**2 + np.diag(1 / std**2)
     np.testing.assert_allclose(found.std[0], np.linalg.inv(information)[0, 0] ** 0.5, rtol=0.1)
 
 

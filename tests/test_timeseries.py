@@ -113,7 +113,7 @@ def test_binary_file(tmp_path, rows):
 @settings(deadline=None)
 @given(
     st.lists(
-        st.floats(allow_nan=False, allow_infinity=False),
+        st.floats(-1e30, 1e30),
         min_size=1,
         max_size=30,
     )
@@ -210,6 +210,15 @@ def test_more_numbers_than_memory(tmp_path, monkeypatch):
     with pytest.raises(RecordingError, match="holds 3 lines of 3 columns, give at most 8 numbers"):
         read_text(tmp_path, GOOD + "1,2,3\n")
     assert len(read_text(tmp_path, GOOD).values) == 2
+
+
+def test_numbers_beyond_all_that_is_measured(tmp_path):
+    """Pages keep float32, and what is computed squares them."""
+    with pytest.raises(RecordingError, match="table.csv: 'b' is 1e\\+308 at sample 2, beyond all"):
+        read_text(tmp_path, GOOD + "1,2,1e308\n")
+    np.savez(tmp_path / "table.npz", **{"time [s]": [0.0, 1.0], "a [bar]": [1e30, 1e20]})
+    with pytest.raises(RecordingError, match="table.npz: 'a' is 1e\\+35 at sample 0, beyond all"):
+        read(tmp_path / "table.npz")
 
 
 def test_a_pipe_is_no_file(tmp_path):

@@ -58,7 +58,7 @@ def import_log(
     ],
     columns: Annotated[
         Path,
-        typer.Argument(metavar="COLUMNS", help="Lines such as 'q1 [deg] = angle[0] - 90'."),
+        typer.Argument(metavar="COLUMNS", help="A text file, a line per column of the recording."),
     ],
     out: Annotated[
         Path,

@@ -119,7 +119,8 @@ def huber(
 
     Beyond k = 1.345 robust standard deviations sigma (1.4826 median |e|, of each joint) a row
     counts by its sign alone: weight min(1, k sigma / |e|) / sigma^2. The covariance is that of
-    sum_i w_i psi(e_i), psi clipping at k sigma, divided by the share of unclipped rows.
+    sum_i w_i psi(e_i), psi clipping at k sigma, over the information sum_i w_i psi'(e_i) w_i^T of
+    the unclipped rows: where noise depends on the motion, their share does so too.
 
     Arguments and errors as for `least_squares`.
     """
@@ -376,25 +377,26 @@ class _Rows:
         Where parameters take many of the degrees of freedom at low frequencies, where motions
         are, the residuals there are smaller than the noise, and noise may be more than a steady
         spectrum. So the standard deviations are those of the `Jackknife` where these are larger;
-        the correlations between parameters stay.
+        the correlations between parameters stay. R and A are of the rows that are not clipped,
+        with which alone the estimate moves, Q of all.
         """
         every = s[self.groups]
         clipped = np.clip(e, -turn * every, turn * every)
-        unclipped = float(np.mean(np.abs(e) <= turn * every))
+        counted = np.abs(e) <= turn * every
         count, inflated = len(e), math.sqrt(len(e) / max(len(e) - len(theta), 1))
         noise = inflated * np.array([_rms(clipped[rows]) for rows in self.members])
         clipped /= every
         del every
         noises = [Noise.of(clipped[rows], self.samples[rows]) for rows in self.members]
-        weights = s / math.sqrt(unclipped)
-        _, R, A = self._solve(self.plain, weights)
+        rows = self.plain if counted.all() else factors(self.W, self.y, self.groups, counted)
+        _, R, A = self._solve(rows, s)
         left_out = Jackknife(self.samples, noises, len(theta))
-        middle = self._coloured(R, weights, noises, left_out, clipped)
-        del clipped
+        middle = self._coloured(R, s, noises, left_out, clipped, counted)
+        del clipped, counted
         prior = np.linalg.solve(R.T, self.pull.T)
         inverse = np.linalg.inv(A)
         covariance, moved = (
-            inverse @ (x / unclipped + prior @ prior.T) @ inverse.T
+            inverse @ (x + prior @ prior.T) @ inverse.T
             for x in (0.5 * (middle + middle.T), left_out.covariance())
         )
         larger = np.sqrt(np.maximum(np.diag(moved) / np.diag(covariance), 1.0))
@@ -414,11 +416,18 @@ class _Rows:
         )
 
     def _coloured(
-        self, R: Array, s: Array, noises: list[Noise], left_out: Jackknife, e: Array
+        self,
+        R: Array,
+        s: Array,
+        noises: list[Noise],
+        left_out: Jackknife,
+        e: Array,
+        counted: np.ndarray,
     ) -> Array:
         """Q^T (covariance of the noise) Q (p, p), Q = Z / s R^-1, from the last row on.
 
-        The rows are handed to a jackknife on the way, with their weighted residuals e (m,).
+        The rows are handed to a jackknife on the way, with their weighted residuals e (m,) and
+        whether the estimate moves with them.
         """
         from scipy.linalg import solve_triangular
 
@@ -446,7 +455,7 @@ class _Rows:
         for rows, block in self.Z.blocks(backwards=True):
             at, groups = self.samples[rows], self.groups[rows]
             Q = solve_triangular(R, (block / s[groups, None]).T, trans="T")
-            left_out.add(self.samples[rows], Q, e[rows])
+            left_out.add(self.samples[rows], Q, e[rows], counted[rows])
             wait(last - 1 - int(at[-1]))
             pass_on(int(at[-1] - at[0]) + 1, at[-1] - at, groups, Q)
             last = int(at[0])

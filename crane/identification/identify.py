@@ -40,7 +40,8 @@ _SLOW = 0.02  # of a joint's largest velocity, below which its rows are left out
 _SETTLED = 4.0  # of the velocity over which friction's sign changes, tanh 4 = 0.9993
 _MOVING = 0.5  # of a joint's largest velocity, above which rows count always
 _MOVES = 3.0  # standard deviations of a joint's velocity, above which it moves
-_TIMES = 5.0  # times the frequency below which 99 % of the velocities are, the filter's least
+_KNOWN = 0.75  # of the frequency where a smoother passes half: there it passes 91 %
+_TIMES = 3.0  # times the frequency below which 99 % of the velocities are, the filter's least
 _FAST = 40.0  # times the frequency below which 99 % of the accelerations are
 _HUM = 10.0  # times the frequency of the motion, above which a line in a spectrum is hum
 _PART = 0.3  # of what is left to do that one pass over a recording is taken for
@@ -310,7 +311,7 @@ def _bandwidth(motion: Motion) -> float:
     hardly above the motion.
     """
     step = float(motion.time[1] - motion.time[0])
-    highest = max(motion.passed, _TIMES * _fastest(motion.v, step))
+    highest = max(_KNOWN * motion.passed, _TIMES * _fastest(motion.v, step))
     return min(_FAST * _fastest(motion.a, step), highest, 0.24 / step)
 
 
@@ -326,4 +327,4 @@ def _fastest(x: Array, step: float) -> float:
         for column, moved in zip(share.T, np.ptp(x, axis=0), strict=True)
         if moved > 0
     ]
-    return max(*last, float(frequency[1]))
+    return max([*last, float(frequency[1])])

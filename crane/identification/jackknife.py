@@ -6,7 +6,7 @@ from crane.identification.noise import Noise
 from crane.samples import Array
 
 _CORRELATED = 4.0  # correlation times of the noise in a stretch, at least
-_FEWEST, _MOST = 10, 200  # stretches
+_FEWEST, _MOST = 20, 200  # stretches
 _ALONE = 1e-8  # of a direction's information, what others than one stretch have at least
 
 
@@ -41,11 +41,19 @@ class Jackknife:
         self._H = np.zeros((len(self._starts), size, size))
         self._c = np.zeros((len(self._starts), size))
 
-    def add(self, samples: np.ndarray, Q: Array, e: Array) -> None:
-        """Rows of whole instants (N,): Q (p, N) and weighted residuals (N,)."""
+    def add(self, samples: np.ndarray, Q: Array, e: Array, counted: np.ndarray) -> None:
+        """Rows of whole instants (N,).
+
+        Args:
+            samples: Number of their instants.
+            Q: (p, N).
+            e: Weighted residuals.
+            counted: Whose small changes change the estimate: not those that are clipped.
+        """
         cuts = [0, *np.searchsorted(samples, self._starts[1:]).tolist(), len(samples)]
         for k, rows in enumerate(map(slice, cuts[:-1], cuts[1:])):
-            self._H[k] += Q[:, rows] @ Q[:, rows].T
+            here = Q[:, rows][:, counted[rows]]
+            self._H[k] += here @ here.T
             self._c[k] += Q[:, rows] @ e[rows]
 
     @property
