@@ -1,7 +1,6 @@
 """Machines that several modules test with, and how property tests run."""
 
 import os
-import warnings
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: two processes, two cores
@@ -10,7 +9,6 @@ import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 import crane  # noqa: E402
-from crane.errors import CraneWarning  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 
@@ -21,9 +19,7 @@ settings.load_profile("crane")
 
 @pytest.fixture(scope="session")
 def mini():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CraneWarning)  # an offset larger than its mean
-        return crane.load("mini_forwarder")
+    return crane.load("mini_forwarder")
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from broken import (
     whole,
     with_line,
 )
+from work import TooMuchWorkError, at_most
 
 import crane
 from crane.check import Report, check
@@ -161,7 +161,7 @@ GRAPH = [
         "two links without a parent and a ring",
         [
             "ground.urdf:45: error: 2 links have no parent (ground, lost): join all but one",
-            "ground.urdf:47: error: link 'a' is its own ancestor: cut the ring of joints at"
+            "ground.urdf:47: error: link 'a' is its own ancestor: cut the ring of joints ab, ba at"
             " 'ba' and close it as a loop",
         ],
         swap(
@@ -702,7 +702,7 @@ LOOPS = [
 def test_says_all_at_once(case, tmp_path):
     report = checked(case.machine, case.edits, tmp_path)
     lines = [str(finding) for finding in report.findings]
-    if case.machine == MINI:  # whose friction is told every time
+    if case.machine == MINI:  # of whose friction copies tell
         lines = [line for line in lines if "a constant force may hide" not in line]
     assert lines == [with_line(line, tmp_path) for line in case.lines]
     assert all(line.isprintable() for line in lines)
@@ -753,9 +753,7 @@ def test_says_no_more_than_load_of_single_slips(tmp_path):
 @pytest.mark.parametrize("name", bundled())
 def test_bundled_machines_are_clean(name):
     report = check(name)
-    assert report.errors == 0
-    told = [finding.what for finding in report.findings]
-    assert [what for what in told if "a constant force may hide" not in what] == []
+    assert report.findings == ()
     assert f"{report.summary}".endswith("m at home")
 
 
@@ -797,7 +795,7 @@ def run(*arguments, cwd=None):
         capture_output=True,
         text=True,
         cwd=cwd,
-        timeout=120,
+        timeout=300,
     )
 
 
@@ -871,11 +869,11 @@ ODD = {
     "kinds.yaml": (
         b"name: 1\nchains: 5\nloops: 3\nactive: {a: 1}\ntip: [1]\ntasks: 4\nhome: 1e999\n"
     ),
-    "nested.yaml": b"[" * 100_000,
+    "nested.yaml": b"[" * 1_200,
     "nested.urdf": b'<robot name="r">' + b"<a>" * 100_000 + b"</a>" * 100_000 + b"</robot>",
-    "deep.urdf": tree(10_000, lambda i: i - 1).encode(),
-    "wide.urdf": tree(10_000, lambda i: 0, "1,5").encode(),
-    "strangers.urdf": tree(10_000, lambda i: f"x{i}").encode(),
+    "deep.urdf": tree(3_000, lambda i: i - 1).encode(),
+    "wide.urdf": tree(3_000, lambda i: 0, "1,5").encode(),
+    "strangers.urdf": tree(3_000, lambda i: f"x{i}").encode(),
     "large.yaml": b"name: x\n" + b"# comment\n" * 1_000_000,
 }
 
@@ -884,12 +882,22 @@ ODD = {
 def test_odd_files_are_findings_soon(name, tmp_path):
     path = tmp_path / name
     path.write_bytes(ODD[name])
-    begin = time.perf_counter()
-    report = check(path)
-    assert time.perf_counter() - begin < 20
+    with at_most(5000 + 5 * len(ODD[name])):  # work that grows as the file does
+        report = check(path)
     assert report.status == 2
     assert all(finding.file in (name, "") for finding in report.findings)
     assert all(str(finding).isprintable() for finding in report.findings)
+
+
+def test_a_bound_on_work_ends_what_exceeds_it(tmp_path):
+    path = tmp_path / "wide.urdf"
+    path.write_bytes(ODD["wide.urdf"])
+    with at_most(10**9) as work:
+        check(path)
+    with pytest.raises(TooMuchWorkError, match="more than"), at_most(work.lines - 1):
+        check(path)
+    with at_most(work.lines):  # the same each time
+        check(path)
 
 
 def test_many_findings_end_somewhere(tmp_path):
@@ -902,7 +910,7 @@ def test_many_findings_end_somewhere(tmp_path):
 
 def test_a_tree_deeper_than_the_stack_is_refused(tmp_path):
     path = tmp_path / "deep.urdf"
-    path.write_text(tree(10_000, lambda i: i - 1).replace("continuous", "fixed", 9_500))
+    path.write_text(tree(3_000, lambda i: i - 1).replace("continuous", "fixed", 2_900))
     with pytest.raises(crane.CraneError, match="th in a row, join links to have at most 2000"):
         crane.load(path)
 

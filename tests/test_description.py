@@ -228,9 +228,15 @@ class TestWarnings:
             four_bar()
             four_bar(machine=LOOPED)
 
-    def test_mini_forwarder_warns_of_the_published_offset(self):
+    @pytest.mark.parametrize("name", bundled())
+    def test_bundled_machines_warn_of_nothing(self, name):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            crane.load(name)
+
+    def test_a_copy_of_a_bundled_machine_warns_of_what_is_odd(self, tmp_path):
         with pytest.warns(CraneWarning, match="friction of 'X2' drives the joint") as caught:
-            crane.load("mini_forwarder")
+            crane.load(copy_machine(MINI, tmp_path))
         assert len(caught) == 1
 
 

@@ -48,8 +48,7 @@ class Lone:
 
 @pytest.fixture(scope="module")
 def mini():
-    with pytest.warns(crane.CraneWarning):
-        return crane.load("mini_forwarder")
+    return crane.load("mini_forwarder")
 
 
 @pytest.fixture(scope="module")

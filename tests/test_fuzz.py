@@ -1,7 +1,8 @@
-"""Valid files with bytes changed, by the thousand: read, or refused in one line.
+"""Valid files with bytes changed, and odd graphs, by the thousand: read, or refused in one line.
 
-What counts as well is in fuzz.py: an error of the package or a closed machine, within 5 s, that is
-the same as before exactly if another parser finds the same words and numbers in the file.
+What counts as well is in fuzz.py: an error of the package or a closed machine, within a bound on
+the work, that is the same as before exactly if another parser finds the same words and numbers in
+the file. In graphs.py it is that whatever is no tree is told, ring by ring, within such a bound.
 """
 
 import json
@@ -15,11 +16,11 @@ import pytest
 FORMATS = ("machine", "urdf", "urdf+", "parallel", "mjcf")
 
 
-def run(kind, first, count):
-    """Judge changed files in a process of its own, which some of them may end."""
+def run(kind, first, count, program="fuzz.py"):
+    """Judge drawn files in a process of its own, which some of them may end."""
     if kind == "mjcf":
         pytest.importorskip("mujoco")
-    program = Path(__file__).with_name("fuzz.py")
+    program = Path(__file__).with_name(program)
     done = subprocess.run(
         [sys.executable, str(program), kind, str(first), str(count)],
         capture_output=True, text=True, timeout=1800,
@@ -35,6 +36,17 @@ def run(kind, first, count):
 @pytest.mark.parametrize("kind", FORMATS)
 def test_some_changed_files(kind):
     run(kind, 0, 150)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_some_odd_graphs(kind):
+    run(kind, 0, 100, "graphs.py")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", FORMATS)
+def test_two_thousand_odd_graphs(kind):
+    run(kind, 0, 2000, "graphs.py")
 
 
 @pytest.mark.slow

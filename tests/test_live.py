@@ -5,7 +5,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 import warnings
 
 import numpy as np
@@ -14,6 +13,7 @@ import pytest
 from conftest import DATA
 from hypothesis import given
 from hypothesis import strategies as st
+from work import at_most
 
 import crane
 from crane.errors import CraneWarning, InputError, RecordingError
@@ -223,14 +223,14 @@ def test_both_signals_end_it_and_leave_nothing(number, connected):
     if not connected:
         client.close()
     process.send_signal(number)
-    out, err = process.communicate(timeout=20)
+    out, err = process.communicate(timeout=300)
     assert (process.returncode, out, err) == (0, "", "")
     assert group_is_empty(process.pid)
 
 
 @pytest.mark.slow
-def test_a_slider_moves_the_picture_in_time(patu):
-    """From the note of a slider to everything sent: 50 ms, measured in the process's own time."""
+def test_a_slider_moves_the_picture_with_little_work(patu):
+    """From the note of a slider to everything sent: 1900 lines, 50 ms on a slow computer."""
     pytest.importorskip("viser")
     from queue import SimpleQueue
 
@@ -240,18 +240,16 @@ def test_a_slider_moves_the_picture_in_time(patu):
     session = Session(patu)
     server = start("127.0.0.1", 0)
     try:
-        page, rng, spent = Page(server, session, None, SimpleQueue()), np.random.default_rng(0), []
+        page, rng = Page(server, session, None, SimpleQueue()), np.random.default_rng(0)
         for i in range(300):
             joint = patu.active[i % len(patu.active)]
             unit = 180 / np.pi if patu.unit(joint) == "rad" else 1000.0
             low, high = unit * patu.lower[i % 4], unit * patu.upper[i % 4]
-            begun = time.thread_time()
-            page.work([(f"joint {joint}", rng.uniform(low, high))])
-            spent.append(time.thread_time() - begun)
+            with at_most(4_000):
+                page.work([(f"joint {joint}", rng.uniform(low, high))])
             assert session.posture.residual < 1e-9
     finally:
         stop(server)
-    assert np.quantile(spent, 0.99) < 0.05
 
 
 def protocol():
@@ -273,7 +271,7 @@ def protocol():
 def test_errors_are_one_line(arguments, text, tmp_path):
     pytest.importorskip("viser")
     process, line = begin(*arguments)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=300)
     assert (process.returncode, line) == (2, "")
     assert err.startswith("error: ") and err.count("\n") == 1 and text in err
 
@@ -287,14 +285,14 @@ def test_a_port_that_is_taken_is_told():
         other.listen()
         port = other.getsockname()[1]
         process, line = begin("tx40", "--port", port)
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=300)
     assert (process.returncode, line) == (2, "")
     assert f"127.0.0.1: port {port} can" in err and err.endswith("choose another --port\n")
 
 
 def test_without_viser_it_says_how_to_get_it():
     process, line = begin("tx40", code=f"import sys; sys.modules['viser'] = None; {MAIN}")
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=300)
     assert (process.returncode, line) == (2, "")
     assert err == (
         "error: a live view needs viser, install it: pip install 'crane-dynamics[live]'\n"

@@ -4,12 +4,12 @@ import base64
 import dataclasses
 import itertools
 import shutil
-import time as clock
 import warnings
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from work import at_most
 
 import crane
 from crane.errors import CraneWarning, RecordingError
@@ -147,13 +147,13 @@ def test_a_second_recording_has_to_be_of_the_machine(machine, recording, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_minute_at_a_thousand_hertz_is_small_and_quick(machine, recording, tmp_path):
+def test_a_minute_at_a_thousand_hertz_is_small_and_no_work_of_its_rows(
+    machine, recording, tmp_path
+):
     rows = np.arange(60_001) % 401
     long = part(recording, rows, np.arange(60_001) * 1e-3)
-    crane.report(machine, recording, tmp_path / "first.html")  # imports
-    start = clock.perf_counter()
-    page = crane.report(machine, long, tmp_path / "page.html")
-    assert clock.perf_counter() - start < 3
+    with at_most(40_000):  # lines; 12,000 for the 401 rows
+        page = crane.report(machine, long, tmp_path / "page.html")
     assert page.stat().st_size < 5e6
 
 
@@ -345,7 +345,7 @@ def test_it_plays_pauses_and_listens_to_keys(machine, recording, opened):
     page.keyboard.press("Escape")
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("Space")
-    page.wait_for_function("crane.time === 5 && !crane.timeline.playing", timeout=10_000)
+    page.wait_for_function("crane.time === 5 && !crane.timeline.playing", timeout=120_000)
 
 
 @pytest.mark.slow

@@ -39,8 +39,7 @@ def test_the_published_page_is_of_this_code():
     import crane
 
     text = (ROOT / "docs" / "validation" / "mini_forwarder.md").read_text()
-    with pytest.warns(crane.CraneWarning):
-        machine = crane.load("mini_forwarder")
+    machine = crane.load("mini_forwarder")
     gap = crane.Dynamics(machine).gravity([0, 0.03, 0.0175])
     gap -= crane.Dynamics(machine, formulation="decoupled").gravity([0, 0.03, 0.0175])
     (shown,) = re.findall(r"^\| static: F_A1 \[N\] \| ([\d.]+) ", text, re.M)

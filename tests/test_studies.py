@@ -217,13 +217,13 @@ def workers(nanny):
         started = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for _ in range(2)]
         try:
             with Client(address) as client:
-                client.wait_for_workers(2, timeout=60)
+                client.wait_for_workers(2, timeout=300)
                 pids = list(client.run(os.getpid).values())
             yield address, pids
         finally:
             for process in started:
                 process.terminate()
-                process.wait(20)
+                process.wait(300)
 
 
 @pytest.mark.slow

@@ -504,7 +504,7 @@ TREE = [
     case(
         "ring",
         "ground.urdf:40: link 'coupler_pin' is its own ancestor: cut the ring of "
-        "joints at 'coupler_pin_fixed' and close it as a loop",
+        "joints crank, coupler, coupler_pin_fixed at 'coupler_pin_fixed' and close it as a loop",
         swap('<link name="ground"/>', "", GROUND),
         swap(
             '<parent link="ground"/>\n    <child link="pin_B"/>',
@@ -519,8 +519,8 @@ TREE = [
     ),
     case(
         "ring beside the tree",
-        "ground.urdf:47: link 'a' is its own ancestor: cut the ring of joints at "
-        "'ba' and close it as a loop",
+        "ground.urdf:47: link 'a' is its own ancestor: cut the ring of joints "
+        "ab, ba at 'ba' and close it as a loop",
         swap(
             "</robot>",
             '  <link name="a"/><link name="b"/>\n'

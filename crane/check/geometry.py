@@ -1,6 +1,5 @@
 """How large links are drawn, and mesh files that are missing."""
 
-import logging
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from lxml import etree
 
+from crane.description.mesh_file import mesh_file
 from crane.description.xml import XmlFile
 from crane.samples import Array
 
@@ -22,21 +22,6 @@ def numbers(element: etree._Element | None, key: str, count: int) -> Array | Non
     except ValueError:
         return None
     return found if found.shape == (count,) and np.isfinite(found).all() else None
-
-
-def mesh_file(name: str, folder: Path) -> Path | None:
-    """The file that a mesh's name stands for, as drawings look for it; None if there is none."""
-    from yourdfpy.urdf import filename_handler_magic
-
-    log = logging.getLogger("yourdfpy.urdf")
-    before, log.disabled = log.disabled, True  # what is missing becomes a finding
-    try:
-        path = Path(filename_handler_magic(name, dir=str(folder)))
-        return path if path.is_file() else None
-    except (OSError, ValueError):  # a name that cannot be a file's
-        return None
-    finally:
-        log.disabled = before
 
 
 @lru_cache(maxsize=1024)

@@ -13,6 +13,7 @@ from crane.closure.structure import least_squares_step
 from crane.description import MachineSpec
 from crane.description.findings import Findings, note
 from crane.errors import CraneWarning, DescriptionError, MechanismError
+from crane.machine.ambiguity import warn_of_assemblies
 from crane.machine.assemble import assemble, closed, home_guess
 from crane.samples import Array
 
@@ -48,6 +49,7 @@ def check_mechanism(spec: MachineSpec, found: Findings) -> Closure | None:
             _note_with_gaps(spec, model, guess, error)
             return None
         _warn_of_limits(spec, closure)
+        warn_of_assemblies(spec, closure, guess, thorough=True)
         return closure
 
 
@@ -118,6 +120,7 @@ def massless(spec: MachineSpec) -> Iterator[DescriptionError]:
             joint.find("parent").get("link"), joint.find("child").get("link"), joint.get("type"),
         )
         for joint in spec.tree.iter("joint")
+        if joint.get("cut") is None
     }  # fmt: skip
     if not all(parent and child for parent, child, _ in ends.values()):
         return  # what has no place may be the mass that seems to be missing

@@ -11,8 +11,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from lxml import etree
 
-from crane.check.geometry import Bounds, extent, mesh_bounds, mesh_file, meshes, numbers
+from crane.check.geometry import Bounds, extent, mesh_bounds, meshes, numbers
 from crane.description import MachineSpec, inertia_problem
+from crane.description.mesh_file import mesh_file
 from crane.description.xml import XmlFile
 from crane.errors import CraneWarning
 from crane.samples import Array

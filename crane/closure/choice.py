@@ -50,15 +50,21 @@ def slides(model: pin.Model) -> NDArray[np.bool_]:
     return np.array([kind.startswith("JointModelP") for kind in kinds], dtype=bool)
 
 
+def units(model: pin.Model) -> Array:
+    """(nv,) units of coordinates that compare: 1 rad, and the size of the machine.
+
+    The size is the largest distance between neighbouring joints.
+    """
+    places = [np.abs(place.translation).max() for place in list(model.jointPlacements)[1:]]
+    return np.where(slides(model), max(places, default=0.0) or 1.0, 1.0)
+
+
 def scales(model: pin.Model) -> Array:
     """(nv,) ways of the joints that compare: their ranges, of at most 1 rad or the machine's size.
 
-    The size is the largest distance between neighbouring joints; it also stands for the range of
-    slides without limits, as 1 rad does for that of turns.
+    Those also stand for the ranges of joints without limits.
     """
-    places = [np.abs(place.translation).max() for place in list(model.jointPlacements)[1:]]
-    size = max(places, default=0.0) or 1.0
-    most = np.where(slides(model), size, 1.0)
+    most = units(model)
     span = model.upperPositionLimit - model.lowerPositionLimit
     return np.where(span > 0, np.minimum(span, most), most)
 

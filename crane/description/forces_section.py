@@ -35,7 +35,7 @@ def read_friction(top: Section, tree: Tree) -> dict[str, Friction]:
             )
             for kind in ("coulomb", "viscous"):
                 mean, offset = getattr(friction, kind), getattr(friction, f"{kind}_offset")
-                if abs(offset) > mean:
+                if abs(offset) > mean and not item.is_bundled:
                     warnings.warn(
                         f"{item.where()}: friction of '{joint}' drives the joint in one "
                         f"direction (|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), "

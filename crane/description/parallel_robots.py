@@ -8,7 +8,8 @@ from lxml import etree
 from crane.description.section import Section
 from crane.description.spec import Chain, LoopSpec, MachineSpec
 from crane.description.tree import Tree
-from crane.description.urdf import MOVING, Urdf, read_urdf
+from crane.description.urdf import Urdf, read_urdf
+from crane.description.urdf_graph import MOVING
 from crane.description.xml import XmlFile
 from crane.errors import DescriptionError, known
 

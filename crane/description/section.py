@@ -9,6 +9,7 @@ from typing import Any, overload
 import yaml
 
 from crane.description.findings import kept, note
+from crane.description.sources import bundled
 from crane.errors import DescriptionError, known
 
 
@@ -130,6 +131,11 @@ class Section:
         section = cls(data, "the machine file", file)
         section.only(*keys)
         return section
+
+    @property
+    def is_bundled(self) -> bool:
+        """Whether it is of a machine that comes with the package, whose file says what is odd."""
+        return self._file in bundled().values()
 
     def only(self, *keys: str) -> None:
         """Raise for any other key.

@@ -7,7 +7,8 @@ from lxml import etree
 from crane.description.findings import FollowUpError, kept, note
 from crane.description.section import Section
 from crane.description.spec import Chain, LoopSpec
-from crane.description.urdf import MOVING, Urdf
+from crane.description.urdf import Urdf
+from crane.description.urdf_graph import MOVING
 from crane.errors import CraneError, DescriptionError, known
 
 
@@ -93,7 +94,8 @@ class Tree:
         below: dict[str, list[tuple[str, bool]]] = {}
         for joint in urdf.robot.iter("joint"):
             parent, child = (joint.find(end).get("link") for end in ("parent", "child"))
-            below.setdefault(parent, []).append((child, joint.get("type") == "fixed"))
+            if parent and child:  # which is a forest, see `crane.description.urdf_graph`
+                below.setdefault(parent, []).append((child, joint.get("type") == "fixed"))
         waiting = [urdf.root]
         while waiting:
             link = waiting.pop()

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from pathlib import Path
 
 from lxml import etree
@@ -18,12 +17,12 @@ from crane.description.urdf_elements import (
     write_link,
     write_several,
 )
+from crane.description.urdf_graph import MOVING, read_graph
 from crane.description.urdf_home import read_home, read_tip
-from crane.description.urdf_loops import independent, read_loops, unknown_link
+from crane.description.urdf_loops import independent, read_loops
+from crane.description.urdf_strangers import warn_of_strangers
 from crane.description.xml import XmlFile
 from crane.errors import DescriptionError, known
-
-MOVING = ("revolute", "continuous", "prismatic")
 
 _CHILDREN = {
     "robot": {
@@ -130,11 +129,11 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         for element in xml.root.iterfind(tag):
             note(xml.fail(element, f"<{tag}> is not read, URDF+ has <{now}> for it: write one"))
     links, joints = _named(xml, "link"), _named(xml, "joint")
+    warn_of_strangers(xml, _CHILDREN, _ATTRIBUTES, joints)
     if not links:
         raise xml.fail(xml.root, "no <link> in this file, add one")
     robot = etree.Element("robot", name=xml.root.get("name") or file.stem)
-    ends = {name: _ends(xml, name, joint, links) for name, joint in joints.items()}
-    root = _root(xml, links, joints, ends)
+    ends, root = read_graph(xml, links, joints)
     moved = {ends[name][1] for name, joint in joints.items() if joint.get("type") != "fixed"}
     for name, link in links.items():
         with kept():
@@ -254,86 +253,3 @@ def _named(xml: XmlFile, kind: str) -> dict[str, etree._Element]:
         else:
             found[name] = element
     return found
-
-
-def _ends(
-    xml: XmlFile, name: str, joint: etree._Element, links: Mapping[str, etree._Element]
-) -> tuple[str, str]:
-    """Parent and child link of a joint of a known type; "" for one that was noted as wrong."""
-    what, kinds = f"joint '{name}'", (*MOVING, *SEVERAL, "fixed")
-    kind = joint.get("type")
-    if kind not in kinds:
-        note(
-            xml.fail(
-                joint,
-                f"{what} has no type, {known(kinds)}"
-                if not kind
-                else f"{what} has the type '{kind}', which is not supported, {known(kinds, kind)}",
-            )
-        )
-        near = get_close_matches(kind or "", kinds, 1, 0.75)
-        joint.set("type", near[0] if near else "continuous")
-        if joint.find("limit") is None:  # whatever it is, nobody has to miss limits
-            etree.SubElement(joint, "limit", lower="-1", upper="1")
-    ends = []
-    for end in ("parent", "child"):
-        tag = xml.only(joint, end, what)
-        link = "" if tag is None else tag.get("link", "").strip()
-        if not link:
-            note(xml.fail(joint, f'{what} has no {end} link, add <{end} link="..."/>'))
-        elif link not in links:
-            with kept():
-                raise unknown_link(xml, tag, f"{what} has the unknown {end}", link, links)
-            link = ""
-        ends.append(link)
-    if ends[0] and ends[0] == ends[1]:
-        note(xml.fail(joint, f"{what} joins link '{ends[0]}' to itself, change one end"))
-        return "", ""
-    return ends[0], ends[1]
-
-
-def _root(
-    xml: XmlFile,
-    links: Mapping[str, etree._Element],
-    joints: Mapping[str, etree._Element],
-    ends: Mapping[str, tuple[str, str]],
-) -> str:
-    """The one link without a parent of joints that form a tree."""
-    above: dict[str, tuple[str, str]] = {}  # link -> parent, joint
-    for name, (parent, child) in ends.items():
-        if child in above:
-            note(
-                xml.fail(
-                    joints[name],
-                    f"link '{child}' has two parents, joints '{above[child][1]}' and '{name}': "
-                    "keep one and close the other as a loop",
-                )
-            )
-        elif child:
-            above[child] = (parent, name)
-    roots = [name for name in links if name not in above]
-    passed = {""}  # links whose ancestors have been looked at
-    for name in links:
-        seen, at = {name}, name
-        while at in above and at not in passed:
-            at = above[at][0]
-            if at in seen:
-                note(
-                    xml.fail(
-                        joints[above[at][1]],
-                        f"link '{at}' is its own ancestor: cut the ring of joints at "
-                        f"'{above[at][1]}' and close it as a loop",
-                    )
-                )
-                break
-            seen.add(at)
-        passed |= seen
-    lost = len(xml.root.findall("joint")) - len(above)  # joints that may have had a root as child
-    if len(roots) - lost > 1:
-        listed = ", ".join(roots[:4]) + (", ..." if len(roots) > 4 else "")
-        note(
-            xml.fail(
-                links[roots[1]], f"{len(roots)} links have no parent ({listed}): join all but one"
-            )
-        )
-    return roots[0] if roots else next(iter(links))

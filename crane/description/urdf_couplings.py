@@ -44,7 +44,7 @@ def read_coupling(
     kind = element.get("type", _TYPES[0])
     if kind not in _TYPES:
         raise xml.fail(element, f"{what} has the unknown type '{kind}', {known(_TYPES, kind)}")
-    above = {child: (parent, joint) for joint, (parent, child) in ends.items()}
+    above = {child: (parent, joint) for joint, (parent, child) in ends.items() if parent and child}
     ways = []
     for end in ("predecessor", "successor"):
         tag = xml.only(element, end, what)

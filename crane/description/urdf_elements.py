@@ -100,6 +100,8 @@ def write_joint(
     what, kind = f"joint '{name}'", joint.get("type")
     xml.only(joint, "mimic", what)
     clean = add_joint(robot, name, kind, xml.placement(joint, what), ends)
+    if joint.get("cut"):
+        clean.set("cut", "true")
     if kind != "fixed":
         axis = xml.direction(joint, what, (1.0, 0.0, 0.0))
         etree.SubElement(clean, "axis", xyz=_text(*axis))

@@ -13,11 +13,12 @@ from lxml import etree
 
 from crane.description import Coupling
 from crane.description.clean import add_joint, add_link, text
+from crane.description.mesh_file import mesh_file
 from crane.errors import CraneWarning
 from crane.machine import Machine
 from crane.samples import Array
 
-ENDLESS = 1e9  # limit that a slide without one is written with, and that is read as none
+ENDLESS = 1e9  # limit that is read as none, written where one has to stand
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,8 @@ class Parts:
             if math.isfinite(values[column]):
                 given[key] = text([values[column]])
         if given:
-            etree.SubElement(element, "limit", given)
+            endless = {"effort": text([ENDLESS]), "velocity": text([ENDLESS])}
+            etree.SubElement(element, "limit", endless | given)
         return element
 
     def draw(self, robot: etree._Element, chains: Iterable[str] | None = None) -> None:
@@ -158,8 +160,7 @@ def _located(drawn: etree._Element, folder: Path) -> etree._Element:
     """A copy of what is drawn, its mesh named by its whole path where it is there."""
     drawn = copy.deepcopy(drawn)
     for mesh in drawn.iter("mesh"):
-        name = mesh.get("filename", "").removeprefix("file://")
-        if "://" not in name and (file := folder / name).is_file():
+        if (file := mesh_file(mesh.get("filename", ""), folder)) is not None:
             mesh.set("filename", str(file.resolve()))
     return drawn
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import pinocchio as pin
 from lxml import etree
 
+from crane.description.mesh_file import mesh_file
 from crane.samples import Array
 
 _TENSOR = {
@@ -79,10 +80,8 @@ def _remove(element: etree._Element) -> None:
 
 def _locate(mesh: etree._Element, folder: Path) -> None:
     """Name a mesh by its whole path, where it is there."""
-    from yourdfpy.urdf import filename_handler_magic
-
-    file = Path(filename_handler_magic(mesh.get("filename", ""), dir=str(folder)))
-    if file.is_file():
+    file = mesh_file(mesh.get("filename", ""), folder)
+    if file is not None:
         mesh.set("filename", str(file.resolve()))
 
 

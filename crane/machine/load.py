@@ -8,6 +8,7 @@ from types import MappingProxyType
 from crane.description import changed, locked, read
 from crane.description.sources import find
 from crane.errors import DescriptionError, InputError
+from crane.machine.ambiguity import warn_of_assemblies
 from crane.machine.assemble import assemble, closed, home_guess
 from crane.machine.machine import Machine, fixed
 
@@ -40,7 +41,9 @@ def load(
     if lock:
         spec = locked(spec, lock)
     model = assemble(spec)
-    closure = closed(spec, model, home_guess(spec, model))
+    guess = home_guess(spec, model)
+    closure = closed(spec, model, guess)
+    warn_of_assemblies(spec, closure, guess)
     lower, upper = model.lowerPositionLimit, model.upperPositionLimit
     return Machine(
         name=spec.name,

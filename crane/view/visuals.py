@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from crane.description.mesh_file import mesh_file
 from crane.description.xml import XmlFile
 from crane.errors import CraneWarning
 from crane.machine import Machine
@@ -180,10 +181,9 @@ def _meshes(
     mesh: Any, urdf: Path, missing: list[str], box: Box
 ) -> list[tuple[Shape, Colour | None]]:
     import trimesh
-    from yourdfpy.urdf import filename_handler_magic
 
-    file = Path(filename_handler_magic(mesh.filename, dir=str(urdf.parent)))
-    if not file.is_file():
+    file = mesh_file(mesh.filename, urdf.parent)
+    if file is None:
         missing.append(mesh.filename)
         return [(box, None)]
     # unmerged vertices keep the edges of the drawing sharp

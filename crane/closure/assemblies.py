@@ -1,0 +1,258 @@
+"""Other assemblies: postures that close the loops at the same active coordinates.
+
+Equations that solve one after the other (see `crane.closure.blocks`) have their alternatives one
+after the other, too: a triangle or a four-bar linkage has two, mirror images of each other. So
+each block is solved anew from starts all over its unknowns, with what was solved before it as at
+home; what comes after it follows, from where the guess has it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from crane.closure.choice import slides, units
+from crane.closure.closure import Closure
+from crane.closure.structure import Indices
+from crane.samples import Array, solve
+
+_CLOSED = 1e-9
+_SAME = 1e-3  # [rad], or share of the machine's size: postures that are not different
+_STEP = 1.0  # the same, of an iteration at most
+_ITERATIONS = 15
+_CERTAIN = 0.05  # the same, off the guess: other assemblies are farther
+_FAR = 0.5  # the same: a guess that is farther says little
+_RATIO, _LOOSE = 2.0, 5.0  # of distances from the guess, up to which it does not decide
+_STARTS = 8  # for each unknown of a block
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """Another way to assemble a machine, which the guess does not rule out.
+
+    Attributes:
+        q: (nq,) the posture.
+        loops: Names of the loops that are assembled the other way.
+        columns: Joints that are elsewhere than at home.
+        off: The joint that is farthest from the guess, and by how much [m], [rad].
+        home_off: The same of the home posture.
+        outside: Whether the home posture is outside of limits that this one keeps.
+    """
+
+    q: Array
+    loops: tuple[str, ...]
+    columns: Indices
+    off: tuple[int, float]
+    home_off: tuple[int, float]
+    outside: bool
+
+
+def ambiguities(closure: Closure, guess: Array, named: Indices, most: int) -> list[Assembly]:
+    """Assemblies that a guess leaves open, at most one for each block of equations.
+
+    Distances from the guess are compared at the joints that differ from home, at those that the
+    file names if it names one of them. An assembly is told where it is less than twice as far as
+    home; five times where none is named, or home is 0.5 rad off; or where it keeps limits that
+    home does not.
+
+    Args:
+        closure: The loops, closed at home.
+        guess: (nq,) what they were closed from.
+        named: Columns for which it is the file that says so.
+        most: Starts in one block, which bounds the work; an assembly that is not found from there
+            is not told.
+    """
+    search = _Search(closure, guess, named)
+    found = []
+    for index, (_, columns) in enumerate(closure.structure.blocks):
+        block = closure.passive[columns]
+        kept = search.within_limits(closure.home, block)
+        if kept and search.away(closure.home, search.said(block)) < _CERTAIN:
+            continue
+        near = [(search.away(q, block), q) for q in search.others(index, most)]
+        for _, q in sorted(near, key=lambda item: item[0]):
+            if (one := search.judged(q, index)) is not None:
+                found.append(one)
+                break
+    return found
+
+
+class _Search:
+    """Solutions of the blocks of one machine."""
+
+    def __init__(self, closure: Closure, guess: Array, named: Indices):
+        self.closure, self.guess, self.named = closure, guess, named
+        self.model, self.equations = closure.model, closure.equations
+        self.home, self.blocks = closure.home, closure.structure.blocks
+        self._unit = units(self.model)
+        self._turns = ~slides(self.model)
+
+    def difference(self, one: Array, two: Array) -> Array:
+        """(nq,) how far apart two postures are, in units of 1 rad or the machine's size."""
+        apart = one - two
+        turns = np.remainder(apart + np.pi, 2 * np.pi) - np.pi
+        return np.asarray(np.where(self._turns, np.abs(turns), np.abs(apart) / self._unit))
+
+    def away(self, q: Array, columns: Indices) -> float:
+        """How far some joints are from the guess."""
+        return float(self.difference(q, self.guess)[columns].max(initial=0.0))
+
+    def said(self, columns: Indices) -> Indices:
+        """Those of some joints that the file names; all where it names none."""
+        among = columns[np.isin(columns, self.named)]
+        return among if len(among) else columns
+
+    def within_limits(self, q: Array, columns: Indices) -> bool:
+        """Whether some joints are."""
+        lower, upper = self.model.lowerPositionLimit, self.model.upperPositionLimit
+        return bool(((q >= lower - 1e-9) & (q <= upper + 1e-9))[columns].all())
+
+    def others(self, index: int, most: int) -> list[Array]:
+        """Solutions of a block with what is before it as at home, without that of home."""
+        rows, columns = self._block(index)
+        found = [self.home]
+        sign = self._sign(self.home, rows, columns)
+        pair = len(columns) <= 2 and self._is_dyad(index)
+        starts = [*self._across(rows, columns), *self._starts(columns, _STARTS * len(columns))]
+        for start in starts[:most]:
+            q = self._solved(start, rows, columns, found)
+            if q is None or any(self.difference(q, x)[columns].max() < _SAME for x in found):
+                continue
+            found.append(q)
+            if pair and self._sign(q, rows, columns) != sign:
+                break  # mirror images, of which there are two
+        return found[1:]
+
+    def _block(self, index: int) -> tuple[Indices, Indices]:
+        rows, columns = self.blocks[index]
+        return self.closure.structure.rows[rows], self.closure.passive[columns]
+
+    def _is_dyad(self, index: int) -> bool:
+        """Whether a block is about translations of one loop: two circles or lines that cross."""
+        rows, _ = self._block(index)
+        loops = set(self.equations.loop_of_row[rows].tolist())
+        return len(loops) == 1 and bool(self.equations.is_translation[rows].all())
+
+    def _across(self, rows: Indices, columns: Indices) -> Array:
+        """(4, nq) postures on both sides of home, where its equations determine least."""
+        jacobian = self.equations.evaluate(self.home)[1][np.ix_(rows, columns)]
+        weakest = np.linalg.svd(jacobian * self._unit[columns])[2][-1]
+        out = np.tile(self.home, (4, 1))
+        out[:, columns] += np.outer([0.5, -0.5, 1.5, -1.5], weakest * self._unit[columns])
+        return out
+
+    def _starts(self, columns: Indices, count: int) -> Array:
+        """(count, nq) postures all over the unknowns: a low-discrepancy sequence about the guess.
+
+        Multiples of the powers of 1 / phi, phi^(k + 1) = phi + 1 for k unknowns (Roberts 2018),
+        over a turn, the limits of a slide, or the machine's size.
+        """
+        size = len(columns)
+        phi = 2.0
+        for _ in range(40):
+            phi = (1 + phi) ** (1 / (size + 1))
+        share = np.outer(np.arange(count), phi ** -np.arange(1.0, size + 1)) + 0.5
+        share = np.remainder(share, 1.0) - 0.5
+        lower, upper = self.model.lowerPositionLimit, self.model.upperPositionLimit
+        span = np.where(self._turns, 2 * np.pi, 2 * self._unit)
+        middle = self.guess.copy()
+        limited = ~self._turns & np.isfinite(lower) & np.isfinite(upper)
+        middle[limited] = (lower[limited] + upper[limited]) / 2
+        span[limited] = upper[limited] - lower[limited]
+        out = np.tile(self.home, (count, 1))
+        out[:, columns] = middle[columns] + share * span[columns]
+        return out
+
+    def _solved(
+        self, q: Array, rows: Indices, columns: Indices, known: Sequence[Array] = ()
+    ) -> Array | None:
+        """Newton's method on some rows for some columns, None where it does not converge.
+
+        Solutions that are known are deflated (Farrell, Birkisson, Funke 2015): for m phi instead
+        of phi, m = prod 1 / r^2 + 1 with r the distance from one of them, it is the Newton step d
+        divided by 1 - (grad m . d) / m, which turns round near them.
+        """
+        q = q.copy()
+        for _ in range(_ITERATIONS):
+            phi, jacobian = self.equations.evaluate(q)
+            residual = np.abs(phi[rows]).max(initial=0.0)
+            if residual < 1e-13:
+                break
+            try:
+                step = solve(jacobian[np.ix_(rows, columns)], -phi[rows])
+            except np.linalg.LinAlgError:
+                return None
+            pushed = 0.0
+            for other in known:
+                apart = (q - other)[columns] / self._unit[columns]
+                turning = self._turns[columns]
+                square = np.where(turning, 2 - 2 * np.cos(apart), apart**2).sum()
+                slope = np.where(turning, 2 * np.sin(apart), 2 * apart) / self._unit[columns]
+                pushed -= float(slope @ step) / max(square * (1 + square), 1e-12)
+            step = step / (1 - pushed if abs(1 - pushed) > 1e-6 else 1e-6)
+            largest = float((np.abs(step) / self._unit[columns]).max())
+            if not largest < np.inf:
+                return None
+            q[columns] += step * min(1.0, _STEP / max(largest, 1e-300))
+        if not np.abs(self.equations.evaluate(q)[0][rows]).max(initial=0.0) < _CLOSED:
+            return None
+        angles = columns[self._turns[columns]]
+        q[angles] = np.remainder(q[angles] + np.pi, 2 * np.pi) - np.pi
+        return q
+
+    def _sign(self, q: Array, rows: Indices, columns: Indices) -> float:
+        jacobian = self.equations.evaluate(q)[1][np.ix_(rows, columns)]
+        return float(np.linalg.slogdet(jacobian)[0])
+
+    def judged(self, q: Array, index: int) -> Assembly | None:
+        """An assembly with a block elsewhere, None where it is none or the guess rules it out."""
+        for later in range(index + 1, len(self.blocks)):
+            rows, columns = self._block(later)
+            ways = []
+            for start in (self.guess, self.home):
+                begun = q.copy()
+                begun[columns] = start[columns]
+                if (way := self._solved(begun, rows, columns)) is not None:
+                    ways.append(way)
+            if not ways:
+                return None
+            q = min(ways, key=lambda way: self.away(way, columns))
+        passive = self.closure.passive
+        if np.abs(self.equations.evaluate(q)[0]).max() > _CLOSED:
+            return None
+        if self.equations.turned_over(q) is not None or not self.within_limits(q, passive):
+            return None
+        columns = np.flatnonzero(self.difference(q, self.home) > _SAME)
+        if not len(columns) or self._looks_the_same(q):
+            return None
+        said = self.said(columns)
+        away, home_away = self.away(q, said), self.away(self.home, said)
+        outside = not self.within_limits(self.home, passive)
+        told = home_away < _FAR and np.isin(said, self.named).all()
+        ratio = _RATIO if told else _LOOSE
+        if away > ratio * home_away and not outside:
+            return None
+        rows, _ = self._block(index)
+        loops = sorted(set(self.equations.loop_of_row[rows].tolist()))
+        names = tuple(self.equations.names[i] for i in loops)
+        off, home_off = self._farthest(q, said), self._farthest(self.home, said)
+        return Assembly(q, names, columns, off, home_off, outside)
+
+    def _farthest(self, q: Array, columns: Indices) -> tuple[int, float]:
+        apart = self.difference(q, self.guess)[columns]
+        column = int(columns[apart.argmax()])
+        return column, float(apart.max() * self._unit[column])
+
+    def _looks_the_same(self, q: Array) -> bool:
+        """Whether all that has a mass is where it is at home: other angles of a ball, say."""
+        data, places = self.equations.data, []
+        for posture in (q, self.home):
+            pin.forwardKinematics(self.model, data, posture)
+            places.append([
+                place.homogeneous
+                for place, inertia in zip(data.oMi, self.model.inertias, strict=True)
+                if inertia.mass > 0
+            ])  # fmt: skip
+        one, two = (np.array(place) for place in places)
+        return bool(np.abs(one - two).max(initial=0.0) < _SAME)

@@ -1,0 +1,84 @@
+"""Warnings about machines whose files do not tell how to assemble them."""
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from crane.closure import Closure
+from crane.closure.assemblies import Assembly, ambiguities
+from crane.closure.choice import slides
+from crane.description import MachineSpec
+from crane.description.urdf import is_urdf
+from crane.errors import CraneWarning
+from crane.samples import Array
+
+_QUICK, _THOROUGH = 6, 100  # starts of the search in one block: milliseconds, up to a second
+
+
+def warn_of_assemblies(
+    spec: MachineSpec, closure: Closure, guess: Array, thorough: bool = False
+) -> None:
+    """Warn of loops that are assembled one way though the file may mean another.
+
+    Args:
+        spec: The machine as read.
+        closure: Its loops, closed at home.
+        guess: (nq,) what they were closed from, see `home_guess`.
+        thorough: Whether to search long, and to tell all; else the first and how many there are.
+    """
+    if not len(closure.passive):
+        return
+    xml = spec.path.suffix.lower() in (".xml", ".mjcf")
+    drawn = xml and not is_urdf(spec.path)  # MJCF has a value of every joint
+    names = list(closure.model.names)[1:]
+    named = [i for i, name in enumerate(names) if drawn or name in spec.home]
+    most = _THOROUGH if thorough else _QUICK
+    found = ambiguities(closure, guess, np.array(named, dtype=np.intp), most)
+    more = ""
+    if len(found) > 1 and not thorough:
+        more = f"; {len(found) - 1} more such: crane check tells them"
+        found = found[:1]
+    for other in found:
+        warnings.warn(_told(spec, closure, other) + more, CraneWarning, stacklevel=3)
+
+
+def _told(spec: MachineSpec, closure: Closure, other: Assembly) -> str:
+    loops = " and ".join(f"'{name}'" for name in other.loops)
+    place = spec.where.get("home") or spec.where.get(f"loop {other.loops[0]}", spec.path.name)
+    names = list(closure.model.names)[1:]
+    sliding = slides(closure.model)
+
+    def off(at: tuple[int, float]) -> str:
+        return f"{names[at[0]]} {at[1]:.3g} {'m' if sliding[at[0]] else 'rad'} off"
+
+    kept = "outside of limits" if other.outside else off(other.home_off)
+    columns = [int(i) for i in other.columns]
+    now, then = (
+        _values(spec, [names[i] for i in columns], q[columns]) for q in (closure.home, other.q)
+    )
+    return (
+        f"{place}: loop{'s' * (len(other.loops) > 1)} {loops} can be assembled another way at "
+        f"home, and the file does not say which is meant; {_where(spec)} write {then} for the "
+        f"other ({off(other.off)}) or {now} to keep this one ({kept} what it says)"
+    ).replace("limits what it says", "limits")
+
+
+def _where(spec: MachineSpec) -> str:
+    """Where a file says how its machine is at home."""
+    suffix = spec.path.suffix.lower()
+    if suffix == ".urdf":
+        return 'in <group_state name="home">'
+    if suffix in (".xml", ".mjcf"):
+        return "in the key 'home'"
+    if "chains" not in spec.where:  # robot.yaml, which has no place for it
+        return "in a machine file (crane convert) under 'home:'"
+    return "under 'home:'"
+
+
+def _values(spec: MachineSpec, names: Sequence[str], values: Array) -> str:
+    """Coordinates as a file has them."""
+    pattern = '<joint name="{}" value="{:.4g}"/>' if spec.path.suffix == ".urdf" else "{}: {:.4g}"
+    return ", ".join(
+        pattern.format(name, value) for name, value in zip(names, values, strict=True)
+    )
