@@ -15,7 +15,7 @@ from crane.description.hydraulics import (
     Valve,
 )
 from crane.description.section import Section
-from crane.description.tree import Tree
+from crane.description.tree_builder import TreeBuilder
 from crane.errors import InputError, known
 
 Part = TypeVar("Part", Oil, Supply, Counterbalance, Cylinder, Valve, PDGains)
@@ -29,7 +29,7 @@ def numbers_of(kind: type) -> list[str]:
     return [entry.name for entry in fields(kind) if entry.name not in _NOT_NUMBERS]
 
 
-def read_hydraulics(top: Section, tree: Tree, active: tuple[str, ...]) -> Hydraulics | None:
+def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) -> Hydraulics | None:
     """The circuit of a machine file, None where it has none.
 
     Raises:
@@ -60,10 +60,8 @@ def read_hydraulics(top: Section, tree: Tree, active: tuple[str, ...]) -> Hydrau
         named["cylinder"].append(joint)
         with kept():
             _check_joint(joint, item, active)
-            if not tree.has_limits(joint):
-                problem = (
-                    f"joint '{joint}' is continuous, a cylinder needs the limits of its stroke"
-                )
+            if lack := tree.unlimited(joint):
+                problem = f"joint '{joint}' {lack}, a cylinder needs the limits of its stroke"
                 note(item.fail(None, problem))
             cylinders[joint] = _part(item, Cylinder, joint=joint, **_holding(item, holding))
     valves: dict[str, Valve] = {}

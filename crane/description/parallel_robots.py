@@ -7,7 +7,7 @@ from lxml import etree
 
 from crane.description.section import Section
 from crane.description.spec import Chain, LoopSpec, MachineSpec
-from crane.description.tree import Tree
+from crane.description.tree_builder import TreeBuilder
 from crane.description.urdf import Urdf, read_urdf
 from crane.description.urdf_graph import MOVING
 from crane.description.xml import XmlFile
@@ -49,9 +49,9 @@ def read_parallel_robot(path: Path) -> MachineSpec:
         raise DescriptionError(
             f"{urdf.loops[0].where}: the loops stand in {path.name}, keep <loop> or closed_loop"
         )
-    name = urdf.robot.get("name")
+    name = urdf.name
     chain = Chain(name, file, None, path.name, urdf.moving)
-    tree = Tree()
+    tree = TreeBuilder()
     tree.add(chain, urdf)
     if not tree.joints:
         raise DescriptionError(f"{file.name}: no joint moves in this file, add one")
@@ -64,7 +64,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
                 f"the motor '{joint}' is {replaced[joint][0]}, drive a joint with one freedom",
             )
         tree.check_joint(joint, top.where("name_mot"))
-    where = {"active": top.where("name_mot")} | tree.where
+    where = {"active": top.where("name_mot")}
     where |= {f"loop {loop.name}": loop.where for loop in loops}
     where |= {f"loop {coupling.name}": coupling.where for coupling in urdf.couplings}
     return MachineSpec(
@@ -72,7 +72,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
         source=path.name,
         path=path,
         chains=(chain,),
-        tree=tree.robot,
+        tree=tree.tree,
         loops=loops,
         active=motors,
         friction=urdf.friction,
@@ -151,15 +151,13 @@ def _write_universal(
             element.sourceline = at
 
 
-def _loops(top: Section, urdf: Urdf, tree: Tree) -> tuple[LoopSpec, ...]:
+def _loops(top: Section, urdf: Urdf, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
     """Loops between the frames of `closed_loop`: points that coincide, or frames."""
     pairs = top.pairs("closed_loop") if "closed_loop" in top else []
     kinds = top.texts("type") if "type" in top else ("6d",) * len(pairs)
     if len(kinds) != len(pairs):
         raise top.fail("type", f"{len(kinds)} types for {len(pairs)} closed loops, give each one")
-    below = {
-        joint.get("name"): joint.find("child").get("link") for joint in urdf.robot.iter("joint")
-    }
+    below = {joint.name: joint.child for joint in urdf.tree.joints.values()}
     loops: dict[str, LoopSpec] = {}
     for pair, kind in zip(pairs, kinds, strict=True):
         if kind.lower() not in _LOOPS:

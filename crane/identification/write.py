@@ -74,11 +74,7 @@ def write_machine(result: Identification, folder: str | Path) -> Path:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)  # told when the machine was loaded
         spec = read(machine.path)
-    moved = {
-        joint.get("name"): joint.find("child").get("link")
-        for joint in spec.tree.iterfind("joint")
-        if joint.get("type") != "fixed"
-    }
+    moved = {joint.name: joint.child for joint in spec.tree.moving}
     if machine.changes or moved.keys() != set(machine.joints):
         raise InputError(
             f"'{machine.name}' was loaded with changed numbers or locked joints, identify it as "
@@ -132,15 +128,12 @@ def _files(spec: MachineSpec) -> tuple[Chain, ...]:
 
 def _carried(spec: MachineSpec) -> set[str]:
     """Links that are fixed to one that a joint moves."""
-    above = {
-        joint.find("child").get("link"): (joint.find("parent").get("link"), joint.get("type"))
-        for joint in spec.tree.iterfind("joint")
-    }
+    above = {joint.child: joint for joint in spec.tree.joints.values()}
     found = set()
     for link in above:
         at = link
-        while at in above and above[at][1] == "fixed":
-            at = above[at][0]
+        while at in above and not above[at].moves:
+            at = above[at].parent
         if at != link and at in above:
             found.add(link)
     return found
