@@ -116,10 +116,37 @@ def test_limits_are_checked_where_asked(mini):
     with pytest.raises(LimitError) as error:
         mini.check_limits([0.0, 0.031, 0.01], "the start")
     assert str(error.value) == (
-        "the start: X1 = 0.031 is outside of its limits 0 to 0.03 m, choose one within them"
+        "the start: X1 = 0.031 is outside of its limits 0 to 0.03 m (chain_b1.urdf:57), choose "
+        "one within them"
     )
     with pytest.raises(LimitError, match=r"q_a: q1 = 3\.2 in sample 1 is outside .* rad"):
         mini.check_limits([[0.0, 0.01, 0.01], [3.2, 0.01, 0.01]])
+
+
+def test_errors_of_limits_tell_where_they_stand(tmp_path):
+    """Of a start, a path, a task and a posture; of a changed limit its parameter."""
+    path = copy_machine(MINI, tmp_path)
+    (file,) = tmp_path.rglob("chain_b1.urdf")
+    (line,) = (i for i, text in enumerate(file.read_text().splitlines(), 1) if "<limit" in text)
+    place = rf"0 to 0\.03 m \(chain_b1\.urdf:{line}\), choose one within them"
+    machine = crane.load(path)
+    far = machine.home[machine.closure.active] + [0, 0.02, 0]
+    task = "  far: {duration: 1, active: {q1: [0], X1: [0.04], X2: [0.01]}}\n"
+    text = path.read_text().replace("tasks:\n", f"tasks:\n{task}")
+    (tmp_path / "task.yaml").write_text(text)
+    for call in (
+        lambda: crane.simulate(machine, initial=far, duration=0.1),
+        lambda: crane.simulate(machine, crane.PI(machine, crane.point_to_point(far, far, 1.0))),
+        lambda: crane.task_path(crane.load(tmp_path / "task.yaml"), "far"),
+        lambda: crane.sketch(machine, tmp_path / "a.svg", far),
+    ):
+        with pytest.raises(LimitError, match=place):
+            call()
+    shorter = crane.load(path, {"X1.upper": 0.025})
+    with pytest.raises(LimitError, match=r"limits 0 to 0\.025 m \(changed by X1\.upper\), choose"):
+        shorter.check_limits([0.0, 0.029, 0.01])
+    with pytest.raises(crane.CraneError, match=r"0 to 0\.01 \(changed by X1\.upper\), choose"):
+        crane.load(path, {"X1.upper": 0.01})
 
 
 def test_unknown_names(mini):

@@ -59,9 +59,12 @@ def _ends(
             )
         )
         near = get_close_matches(kind or "", kinds, 1, 0.75)
-        joint.set("type", near[0] if near else "continuous")
-        if joint.find("limit") is None:  # whatever it is, nobody has to miss limits
-            etree.SubElement(joint, "limit", lower="-1", upper="1")
+        joint.set("type", near[0] if near else "revolute")
+        limit = joint.find("limit")
+        if limit is None:
+            limit = etree.SubElement(joint, "limit")
+        if limit.get("lower") is None and limit.get("upper") is None:
+            limit.attrib.update({"lower": "-1", "upper": "1"})  # nobody has to miss them
     ends = []
     for end in ("parent", "child"):
         tag = xml.only(joint, end, what)
