@@ -1,6 +1,6 @@
 """MJCF files of MuJoCo: bodies, joints, equality constraints and actuators."""
 
-from dataclasses import dataclass
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +9,7 @@ import pinocchio as pin
 from crane.description.mjcf_equality import Frames, read_equality
 from crane.description.mujoco_file import MujocoFile
 from crane.description.rigid import inertial, placement, vector
-from crane.description.series import names_of, parts_of
+from crane.description.series import parts_of, series
 from crane.description.spec import Chain, ForceElement, Friction, MachineSpec
 from crane.description.tree import Inertial, Joint, Limits, Link, Tree, limit
 from crane.description.tree_builder import TreeBuilder
@@ -17,18 +17,6 @@ from crane.description.urdf import Urdf
 from crane.errors import DescriptionError
 
 _GRAVITY = (0.0, 0.0, -9.81)
-
-
-@dataclass(frozen=True)
-class _Part:
-    """One freedom of a body: a joint on the frame before it."""
-
-    name: str
-    kind: str
-    axis: np.ndarray
-    place: pin.SE3  # on the frame after the part before, or on the parent body
-    limits: Limits
-    where: str
 
 
 def read_mjcf(path: Path) -> MachineSpec:
@@ -159,7 +147,7 @@ class _Reader:
         parent = self.bodies[model.body_parentid[body]]
         place = pin.SE3(_rotation(model.body_quat[body]), model.body_pos[body].copy())
         first = model.body_jntadr[body]
-        parts: list[_Part] = []
+        parts: list[Joint] = []
         at = np.zeros(3)  # anchor of the part before, in the body's frame
         for joint in range(first, first + model.body_jntnum[body]):
             if model.jnt_type[joint] == 0:
@@ -178,23 +166,19 @@ class _Reader:
                 self._add_link(child, where, between=None if last else name)
             if part.name in self.joints:
                 raise DescriptionError(f"{part.where}: two joints '{part.name}', rename one")
-            self.joints[part.name] = Joint(
-                part.name, part.kind, parent, child, part.where, *placement(part.place),
-                vector(part.axis), part.limits,
-            )  # fmt: skip
+            self.joints[part.name] = dataclasses.replace(part, parent=parent, child=child)
             parent = child
         if parent != name:
             self._fix(name, parent, place if not parts else pin.SE3(np.eye(3), -at))
 
-    def _joint(self, joint: int, place: pin.SE3) -> list[_Part]:
-        """The freedoms of a joint, and what acts on them."""
+    def _joint(self, joint: int, place: pin.SE3) -> list[Joint]:
+        """The freedoms of a joint, without their links, and what acts on them."""
         model, name = self.model, self.names[joint]
         where = self.mjcf.where(name, "joint", "freejoint")
         kind = self.mjcf.kind("Joint", model.jnt_type[joint])
         dof = model.jnt_dofadr[joint]
         if kind in ("BALL", "FREE"):
             parts = parts_of("spherical" if kind == "BALL" else "floating", (0.0, 0.0, 1.0))
-            names = names_of(name, parts)
             own = range(dof, dof + len(parts))
             if model.dof_damping[own].any() or model.dof_frictionloss[own].any() or (
                 model.jnt_stiffness[joint]
@@ -203,11 +187,8 @@ class _Reader:
                     f"damping, friction and stiffness of the {kind.lower()} joint '{name}' are "
                     "left out, a machine has them along single freedoms"
                 )
-            places = [place] + [pin.SE3.Identity()] * (len(parts) - 1)
-            return [
-                _Part(x, part[1], np.array(part[2]), step, Limits(), where)
-                for x, part, step in zip(names, parts, places, strict=True)
-            ]
+            made = series(name, parts, placement(place), ("", ""), where)
+            return [part for part in made if isinstance(part, Joint)]
         axis = model.jnt_axis[joint].copy()
         turns = kind == "HINGE"
         zero = float(model.qpos0[model.jnt_qposadr[joint]])
@@ -226,7 +207,7 @@ class _Reader:
             rest = float(model.qpos_spring[model.jnt_qposadr[joint]])
             self.forces.append(ForceElement(name, stiffness=stiffness, rest=rest))
         style = "revolute" if turns else "prismatic"
-        return [_Part(name, style, axis, place, limits, where)]
+        return [Joint(name, style, "", "", where, *placement(place), vector(axis), limits)]
 
     def _frames(self) -> Frames:
         """Links of the named sites."""

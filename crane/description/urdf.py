@@ -24,7 +24,7 @@ from crane.description.urdf_home import read_home, read_tip
 from crane.description.urdf_loops import independent, read_loops
 from crane.description.urdf_strangers import warn_of_strangers
 from crane.description.xml import XmlFile
-from crane.errors import DescriptionError, known
+from crane.errors import known
 
 _CHILDREN = {
     "robot": {
@@ -135,43 +135,44 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         raise xml.fail(xml.root, "no <link> in this file, add one")
     ends, root, cut = read_graph(xml, links, joints)
     moved = {ends[name][1] for name, joint in joints.items() if joint.get("type") != "fixed"}
-    tree_links: dict[str, Link] = {}
+    parts: list[Link | Joint] = []
     for name, link in links.items():
         with kept():
-            tree_links[name] = read_link(xml, name, link, name in moved)
-    tree_joints: dict[str, Joint] = {}
+            parts.append(read_link(xml, name, link, name in moved))
     friction = {}
     for name, joint in joints.items():
         if joint.get("type") in SEVERAL:
             with kept():
-                _add_series(
-                    read_several(xml, name, joint, ends[name]),
-                    (links, tree_links),
-                    (joints, tree_joints),
-                )
+                for part in read_several(xml, name, joint, ends[name]):
+                    kind, taken = ("link", links) if isinstance(part, Link) else ("joint", joints)
+                    if part.name in taken:
+                        problem = f"its {kind} '{part.name}' is there already, rename one"
+                        note(xml.fail(joint, problem))
+                    else:
+                        parts.append(part)
             continue
         with kept():
             read = dataclasses.replace(read_joint(xml, name, joint, ends[name]), cut=name in cut)
-            tree_joints[name] = read
+            parts.append(read)
             if read.moves:
                 limits = read_limits(xml, name, joint)
-                tree_joints[name] = dataclasses.replace(read, limits=limits)
+                parts[-1] = dataclasses.replace(read, limits=limits)
         with kept(harmless=True):
             if (found := read_friction(xml, name, joint)) is not None:
                 friction[name] = found
     driven = independent(xml, joints)
     loops, frames = read_loops(xml, _named(xml, "loop"), links)
     for frame in frames:
-        tree_links[frame.child] = Link(frame.child, frame.where)
+        parts.append(Link(frame.child, frame.where))
         if (same := joints.get(frame.name)) is not None:
             note(xml.fail(same, f"joint '{frame.name}' has the name of a loop's, rename it"))
             continue
-        tree_joints[frame.name] = frame
+        parts.append(frame)
     couplings = _mimics(xml, joints, driven)
     for name, element in _named(xml, "coupling").items():
         with kept():
             couplings += (read_coupling(xml, name, element, joints, ends, links),)
-    tree = Tree(tree_links, tree_joints)
+    tree = Tree({}, {}).replacing(*parts)
     home, home_lines = read_home(xml, {joint.name for joint in tree.moving})
     return Urdf(
         file,
@@ -187,29 +188,6 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         read_tip(xml, links),
         complete=not xml.nameless,
     )
-
-
-def _add_series(
-    parts: Sequence[Link | Joint],
-    links: tuple[Mapping[str, etree._Element], dict[str, Link]],
-    joints: tuple[Mapping[str, etree._Element], dict[str, Joint]],
-) -> None:
-    """Add what a joint with several freedoms consists of to links and joints.
-
-    Args:
-        parts: The links and joints.
-        links: Those of the file, and those to add to.
-        joints: The same.
-    """
-    for part in parts:
-        kind, taken = ("link", links[0]) if isinstance(part, Link) else ("joint", joints[0])
-        if part.name in taken:
-            problem = f"its {kind} '{part.name}' is there already, rename one"
-            note(DescriptionError(f"{part.where}: {problem}"))
-        elif isinstance(part, Link):
-            links[1][part.name] = part
-        else:
-            joints[1][part.name] = part
 
 
 def _mimics(
