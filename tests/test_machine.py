@@ -18,6 +18,7 @@ from oracles import (
 )
 
 import crane
+from crane.description import examples
 from crane.errors import InputError, LimitError, MechanismError
 
 ELEVEN = {"q1", "q2", "q3", "q4", "X1", "q6", "q7", "q9", "q10", "X2", "q11"}
@@ -306,3 +307,27 @@ class TestDrivenBy:
     def test_joints_that_cannot_drive(self, mini, names, error, text):
         with pytest.raises(error, match=text):
             mini.driven_by(names)
+
+
+@pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+@pytest.mark.parametrize("name", ["talos_reduced", "ur5_robot", "hyq_no_sensors", "kinova"])
+def test_a_tree_is_what_pinocchio_makes_of_the_urdf(name):
+    """Joints, frames and their order, placements to the last digit, inertias to rounding."""
+    path = examples().get(name)
+    if path is None:
+        pytest.skip("example-robot-data is not installed")
+    ours, theirs = crane.load(name).model, pin.buildModelFromUrdf(str(path))
+    turning = [joint.shortname().replace("RUB", "R") for joint in theirs.joints]
+    assert [joint.shortname() for joint in ours.joints] == turning
+    assert list(ours.names) == list(theirs.names)
+    assert list(ours.parents) == list(theirs.parents)
+    described = ("name", "type", "parentJoint", "parentFrame", "placement")
+    for one, two in zip(ours.frames, theirs.frames, strict=True):
+        assert [getattr(one, x) for x in described] == [getattr(two, x) for x in described]
+    for joint in range(ours.njoints):
+        assert ours.jointPlacements[joint] == theirs.jointPlacements[joint]
+        np.testing.assert_allclose(
+            ours.inertias[joint].toDynamicParameters(),
+            theirs.inertias[joint].toDynamicParameters(),
+            rtol=1e-12, atol=1e-15,
+        )  # fmt: skip
