@@ -21,7 +21,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np  # noqa: E402
 import yaml  # noqa: E402
-from lxml import etree  # noqa: E402
 from work import TooMuchWorkError, at_most  # noqa: E402
 
 import crane  # noqa: E402
@@ -207,8 +206,6 @@ def got(spec):
             continue
         if name == "name" and not named:
             continue
-        if name == "tree":
-            value = etree.tostring(value).decode()
         if name == "chains":
             value = [(named and chain.name, chain.urdf.name, chain.parent) for chain in value]
         if name == "payload":

@@ -26,6 +26,7 @@ from work import TooMuchWorkError, at_most
 import crane
 from crane.check import Report, check
 from crane.description import bundled, examples
+from crane.formats import write_machine
 
 CHAIN_B1 = "urdf/mini_forwarder/chain_b1.urdf"
 CHAIN_B2 = "urdf/mini_forwarder/chain_b2.urdf"
@@ -303,7 +304,7 @@ SLIPS = [
             "four_bar.yaml:14: error: unknown key 'hoem' in the machine file, did you mean "
             "'home'?",
             "four_bar.yaml:15: error: home of 'crank' is 2.6, outside of its limits -1.5 to"
-            " 2.5, choose one within them",
+            " 2.5 (ground.urdf:14), choose one within them",
             "four_bar.yaml:21: error: 'viscous' of friction of 'coupler' is -0.01, give at "
             "least 0",
             "four_bar.yaml:21: error: unknown key 'visous' in friction of 'coupler', did "
@@ -588,7 +589,7 @@ MECHANISM = [
         "home outside of the limits",
         [
             "four_bar.yaml:15: error: home of 'crank' is 2.6, outside of its limits -1.5 to"
-            " 2.5, choose one within them",
+            " 2.5 (ground.urdf:14), choose one within them",
         ],
         swap("  crank: 1.2", "  crank: 2.6"),
     ),
@@ -917,11 +918,15 @@ def test_many_findings_end_somewhere(tmp_path):
     assert report.counts == "200 errors, no warnings; there is more, mend these first"
 
 
-def test_a_tree_deeper_than_the_stack_is_refused(tmp_path):
+def test_links_in_a_row_need_no_stack(tmp_path):
+    """A pendulum of 3000 links, all but the first joint fixed: m = 3000, I = 3000 * 1."""
     path = tmp_path / "deep.urdf"
-    path.write_text(tree(3_000, lambda i: i - 1).replace("continuous", "fixed", 2_900))
-    with pytest.raises(crane.CraneError, match="th in a row, join links to have at most 2000"):
-        crane.load(path)
+    text = tree(3_000, lambda i: i - 1).replace("continuous", "fixed")
+    path.write_text(text.replace("fixed", "continuous", 1))
+    machine = crane.load(path)
+    assert machine.model.inertias[1].mass == 3_000
+    assert crane.Dynamics(machine).mass_matrix([0.3])[0, 0] == pytest.approx(3_000, rel=1e-12)
+    assert len(crane.load(write_machine(machine, tmp_path / "again")).tree.links) == 3_001
 
 
 def test_collecting_leaves_nothing_behind(tmp_path):

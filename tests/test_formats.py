@@ -1,5 +1,7 @@
 """Machines in other formats: written, and read again; couplings of URDF+."""
 
+import dataclasses
+import itertools
 import re
 import subprocess
 import sys
@@ -11,6 +13,7 @@ from broken import DATA
 from linkages import MACHINES, WRITERS, assert_same, loaded, postures, rewritten
 
 import crane
+from crane.description import parameters, read
 from crane.errors import CraneError, CraneWarning
 from crane.formats import write_machine, write_mjcf, write_urdf_plus
 
@@ -78,6 +81,67 @@ def test_round_trip_of_machine_files(name, kind, tmp_path):
             [v.c1 for v in machine.hydraulics.valves.values()],
             rtol=1e-15,
         )
+
+
+def numbers(tree):
+    """Links and joints without their places in files."""
+    plain = {f"joint {name}": dataclasses.replace(x, where="", limits=None)
+             for name, x in tree.joints.items()}  # fmt: skip
+    limits = {f"limits {name}": dataclasses.replace(x.limits, where="")
+              for name, x in tree.joints.items()}  # fmt: skip
+    links = {name: dataclasses.replace(x, where="") for name, x in tree.links.items()}
+    return plain | limits | links
+
+
+@pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+@pytest.mark.parametrize("kind", ["urdf+", "machine"])
+@pytest.mark.parametrize("name", ["mini_forwarder", "patu655", "four_bar_loop.urdf"])
+def test_every_number_of_links_and_joints_is_kept(name, kind, tmp_path):
+    machine = crane.load(DATA / name if name.endswith("urdf") else name)
+    again = rewritten(machine, kind, tmp_path)
+    found = numbers(again.tree)  # with frames where URDF+ reads the ends of loops of chains
+    assert {name: found[name] for name in numbers(machine.tree)} == numbers(machine.tree)
+
+
+SLIDES = """<robot name="slides">
+  <link name="base"/>
+  {bodies}
+  <joint name="free" type="prismatic"><parent link="base"/><child link="a"/>
+    <limit lower="-1e9" upper="1e9" effort="1e9" velocity="2"/></joint>
+  <joint name="half" type="revolute"><parent link="a"/><child link="b"/>
+    <limit lower="-0.5" upper="1e12" effort="3" velocity="1e9"/></joint>
+  <joint name="round" type="continuous"><parent link="b"/><child link="c"/></joint>
+</robot>
+"""
+
+
+def test_limits_that_are_none_are_infinite_and_survive_every_format(tmp_path):
+    body = (
+        '<link name="{}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" '
+        'ixz="0" iyz="0"/></inertial></link>'
+    )
+    text = SLIDES.format(bodies="".join(map(body.format, "abc")))
+    (tmp_path / "slides.urdf").write_text(text)
+    machine = crane.load(tmp_path / "slides.urdf")
+    inf, none = np.inf, (-np.inf, np.inf, np.inf, np.inf)
+    wanted = {
+        "free": (-inf, inf, inf, 2.0), "half": (-0.5, inf, 3.0, inf), "round": none
+    }  # fmt: skip
+    again = [machine]
+    for kind in WRITERS:
+        (tmp_path / kind).mkdir()
+        again.append(rewritten(machine, kind, tmp_path / kind))
+    for (joint, expected), other in itertools.product(wanted.items(), again):
+        limits, column = other.tree.joints[joint].limits, other.column(joint)
+        ends = other.model.lowerPositionLimit[column], other.model.upperPositionLimit[column]
+        assert (limits.lower, limits.upper) == ends == expected[:2]
+        if other.path.suffix != ".xml":  # MJCF has no place for these
+            assert (limits.effort, limits.velocity) == expected[2:]
+    with pytest.raises(CraneError, match=r"limits -0\.5 to inf rad \(slides\.urdf:7\), choose"):
+        machine.check_limits([0.0, -1.0, 0.0])
+    assert "free.lower" not in parameters(read(machine.path))
+    narrow = crane.load(machine.path, {"half.lower": -1e9})
+    assert narrow.lower[1] == -inf
 
 
 def test_the_other_assembly_branch_is_kept(tmp_path):

@@ -18,6 +18,7 @@ from oracles import (
 )
 
 import crane
+from crane.description import examples
 from crane.errors import InputError, LimitError, MechanismError
 
 ELEVEN = {"q1", "q2", "q3", "q4", "X1", "q6", "q7", "q9", "q10", "X2", "q11"}
@@ -116,10 +117,37 @@ def test_limits_are_checked_where_asked(mini):
     with pytest.raises(LimitError) as error:
         mini.check_limits([0.0, 0.031, 0.01], "the start")
     assert str(error.value) == (
-        "the start: X1 = 0.031 is outside of its limits 0 to 0.03 m, choose one within them"
+        "the start: X1 = 0.031 is outside of its limits 0 to 0.03 m (chain_b1.urdf:57), choose "
+        "one within them"
     )
     with pytest.raises(LimitError, match=r"q_a: q1 = 3\.2 in sample 1 is outside .* rad"):
         mini.check_limits([[0.0, 0.01, 0.01], [3.2, 0.01, 0.01]])
+
+
+def test_errors_of_limits_tell_where_they_stand(tmp_path):
+    """Of a start, a path, a task and a posture; of a changed limit its parameter."""
+    path = copy_machine(MINI, tmp_path)
+    (file,) = tmp_path.rglob("chain_b1.urdf")
+    (line,) = (i for i, text in enumerate(file.read_text().splitlines(), 1) if "<limit" in text)
+    place = rf"0 to 0\.03 m \(chain_b1\.urdf:{line}\), choose one within them"
+    machine = crane.load(path)
+    far = machine.home[machine.closure.active] + [0, 0.02, 0]
+    task = "  far: {duration: 1, active: {q1: [0], X1: [0.04], X2: [0.01]}}\n"
+    text = path.read_text().replace("tasks:\n", f"tasks:\n{task}")
+    (tmp_path / "task.yaml").write_text(text)
+    for call in (
+        lambda: crane.simulate(machine, initial=far, duration=0.1),
+        lambda: crane.simulate(machine, crane.PI(machine, crane.point_to_point(far, far, 1.0))),
+        lambda: crane.task_path(crane.load(tmp_path / "task.yaml"), "far"),
+        lambda: crane.sketch(machine, tmp_path / "a.svg", far),
+    ):
+        with pytest.raises(LimitError, match=place):
+            call()
+    shorter = crane.load(path, {"X1.upper": 0.025})
+    with pytest.raises(LimitError, match=r"limits 0 to 0\.025 m \(changed by X1\.upper\), choose"):
+        shorter.check_limits([0.0, 0.029, 0.01])
+    with pytest.raises(crane.CraneError, match=r"0 to 0\.01 \(changed by X1\.upper\), choose"):
+        crane.load(path, {"X1.upper": 0.01})
 
 
 def test_unknown_names(mini):
@@ -279,3 +307,27 @@ class TestDrivenBy:
     def test_joints_that_cannot_drive(self, mini, names, error, text):
         with pytest.raises(error, match=text):
             mini.driven_by(names)
+
+
+@pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+@pytest.mark.parametrize("name", ["talos_reduced", "ur5_robot", "hyq_no_sensors", "kinova"])
+def test_a_tree_is_what_pinocchio_makes_of_the_urdf(name):
+    """Joints, frames and their order, placements to the last digit, inertias to rounding."""
+    path = examples().get(name)
+    if path is None:
+        pytest.skip("example-robot-data is not installed")
+    ours, theirs = crane.load(name).model, pin.buildModelFromUrdf(str(path))
+    turning = [joint.shortname().replace("RUB", "R") for joint in theirs.joints]
+    assert [joint.shortname() for joint in ours.joints] == turning
+    assert list(ours.names) == list(theirs.names)
+    assert list(ours.parents) == list(theirs.parents)
+    described = ("name", "type", "parentJoint", "parentFrame", "placement")
+    for one, two in zip(ours.frames, theirs.frames, strict=True):
+        assert [getattr(one, x) for x in described] == [getattr(two, x) for x in described]
+    for joint in range(ours.njoints):
+        assert ours.jointPlacements[joint] == theirs.jointPlacements[joint]
+        np.testing.assert_allclose(
+            ours.inertias[joint].toDynamicParameters(),
+            theirs.inertias[joint].toDynamicParameters(),
+            rtol=1e-12, atol=1e-15,
+        )  # fmt: skip

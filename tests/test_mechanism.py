@@ -163,7 +163,7 @@ MECHANISM = [
     case(
         "home outside of limits",
         "four_bar.yaml:15: home of 'crank' is 2.6, outside of its limits -1.5 to "
-        "2.5, choose one within them",
+        "2.5 (ground.urdf:14), choose one within them",
         swap("  crank: 1.2", "  crank: 2.6"),
     ),
     case(
@@ -291,7 +291,7 @@ MINI_FORWARDER = [
     case(
         "home in millimetres",
         "mini_forwarder.yaml:{line of X1: 22}: home of 'X1' is 22.1, outside of its"
-        " limits 0 to 0.03, choose one within them",
+        " limits 0 to 0.03 (chain_b1.urdf:57), choose one within them",
         swap("  X1: 0.0221", "  X1: 22.1", MINI),
         machine=MINI,
     ),

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 
 import numpy as np
 import pinocchio as pin
-from lxml import etree
 
 from crane.closure import Closure
 from crane.closure.equations import LoopEquations
@@ -104,7 +103,7 @@ def _warn_of_limits(spec: MachineSpec, closure: Closure) -> None:
         lower, upper = model.lowerPositionLimit[column], model.upperPositionLimit[column]
         q = closure.home[column]
         if not lower - 1e-9 <= q <= upper + 1e-9:
-            place = spec.where.get(f"joint {name}", spec.path.name)
+            place = spec.tree.joints[name].where
             warnings.warn(
                 f"{place}: passive joint '{name}' is at {q:.4g} with the loops closed at home, "
                 f"outside of its limits {lower:g} to {upper:g}, widen them or correct the home",
@@ -115,28 +114,23 @@ def _warn_of_limits(spec: MachineSpec, closure: Closure) -> None:
 
 def massless(spec: MachineSpec) -> Iterator[DescriptionError]:
     """Errors about bodies without mass in a tree that cannot be assembled."""
-    ends = {
-        joint.get("name"): (
-            joint.find("parent").get("link"), joint.find("child").get("link"), joint.get("type"),
-        )
-        for joint in spec.tree.iter("joint")
-        if joint.get("cut") is None
-    }  # fmt: skip
-    if not all(parent and child for parent, child, _ in ends.values()):
+    joints = [joint for joint in spec.tree.joints.values() if not joint.cut]
+    if not all(joint.parent and joint.child for joint in joints):
         return  # what has no place may be the mass that seems to be missing
     fixed: dict[str, list[str]] = {}
-    for parent, child, kind in ends.values():
-        if kind == "fixed":
-            fixed.setdefault(parent, []).append(child)
+    for joint in joints:
+        if not joint.moves:
+            fixed.setdefault(joint.parent, []).append(joint.child)
+    links = spec.tree.links
     heavy = {
-        link.get("name")
-        for link in spec.tree.iter("link")
-        if link.get("refused") or link.get("between") or _mass(link) > 0
+        link.name
+        for link in links.values()
+        if link.refused or link.between or (link.inertial and link.inertial.mass > 0)
     }
-    for name, (_, moved, kind) in ends.items():
-        if kind == "fixed" or f"link {moved}" not in spec.where:
+    for joint in joints:
+        if not joint.moves or joint.child not in links:
             continue
-        body, waiting = set(), [moved]
+        body, waiting = set(), [joint.child]
         while waiting:
             link = waiting.pop()
             if link not in body:
@@ -144,11 +138,6 @@ def massless(spec: MachineSpec) -> Iterator[DescriptionError]:
                 waiting += fixed.get(link, ())
         if not body & heavy:
             yield DescriptionError(
-                f"{spec.where[f'link {moved}']}: joint '{name}' moves link '{moved}', which has "
-                "no mass, give it an <inertial>"
+                f"{links[joint.child].where}: joint '{joint.name}' moves link '{joint.child}', "
+                "which has no mass, give it an <inertial>"
             )
-
-
-def _mass(link: etree._Element) -> float:
-    mass = link.find("inertial/mass")
-    return 0.0 if mass is None else float(mass.get("value"))

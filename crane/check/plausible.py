@@ -105,11 +105,7 @@ def _warn_angles(xml: XmlFile) -> None:
 
 
 def _warn_home(spec: MachineSpec) -> None:
-    turning = {
-        joint.get("name")
-        for joint in spec.tree.iter("joint")
-        if joint.get("type") in ("revolute", "continuous")
-    }
+    turning = {joint.name for joint in spec.tree.moving if joint.kind == "revolute"}
     for name, value in spec.home.items():
         if name in turning and abs(value) > 2 * _TURN:
             place = spec.where.get(f"home {name}", spec.path.name)

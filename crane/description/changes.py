@@ -1,7 +1,7 @@
 """Machines that differ from their files: other numbers, locked joints."""
 
-import copy
 import dataclasses
+import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from difflib import get_close_matches
@@ -9,13 +9,13 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from lxml import etree
 
 from crane.description.circuit_section import numbers_of
 from crane.description.hydraulics import Hydraulics
 from crane.description.magnitudes import doubt
 from crane.description.sources import bundled
 from crane.description.spec import Chain, Coupling, Friction, MachineSpec
+from crane.description.tree import Joint, Limits, Link, Tree, limit
 from crane.description.urdf import read_urdf
 from crane.errors import CraneWarning, InputError, known
 from crane.samples import FARTHEST, as_number
@@ -24,46 +24,46 @@ PAYLOAD = "payload.mass"
 _TURNS = ("roll", "pitch", "yaw")
 
 
-class _Number:
-    """One number in an attribute of the tree.
-
-    Args:
-        element: Its element.
-        attribute: Its attribute, numbers with blanks between.
-        index: Which of them.
-    """
-
-    def __init__(self, element: etree._Element, attribute: str, index: int = 0):
-        self._element, self._attribute, self._index = element, attribute, index
-
-    def get(self) -> float:
-        return float(self._element.get(self._attribute).split()[self._index])
-
-    def set(self, value: float) -> None:
-        words = self._element.get(self._attribute).split()
-        words[self._index] = repr(value)
-        self._element.set(self._attribute, " ".join(words))
+# Where a number stands: names of fields, and indices in tuples, from a link or a joint on
+_Way = tuple[str | int, ...]
+_TENSOR = ("xx", "xy", "xz", "yy", "yz", "zz")
 
 
-def _numbers(tree: etree._Element) -> Iterator[tuple[str, _Number]]:
-    for link in tree.iterfind("link"):
-        name, inertial = link.get("name"), link.find("inertial")
-        if inertial is not None:
-            yield f"{name}.mass", _Number(inertial.find("mass"), "value")
+def _numbers(spec: MachineSpec) -> Iterator[tuple[str, Link | Joint, _Way]]:
+    """Names of the tree's numbers, with the link or joint that has them, and where."""
+    for link in spec.tree.links.values():
+        if link.inertial is not None:
+            yield f"{link.name}.mass", link, ("inertial", "mass")
             for i, axis in enumerate("xyz"):
-                yield f"{name}.com.{axis}", _Number(inertial.find("origin"), "xyz", i)
-            for key in inertial.find("inertia").attrib:
-                yield f"{name}.inertia.{key[1:]}", _Number(inertial.find("inertia"), key)
-    for joint in tree.iterfind("joint"):
-        origin, limit = joint.find("origin"), joint.find("limit")
-        link = joint.find("child").get("link")
-        if origin is not None:
-            for i, (axis, turn) in enumerate(zip("xyz", _TURNS, strict=True)):
-                yield f"{link}.{axis}", _Number(origin, "xyz", i)
-                yield f"{link}.{turn}", _Number(origin, "rpy", i)
+                yield f"{link.name}.com.{axis}", link, ("inertial", "com", i)
+            for i, key in enumerate(_TENSOR):
+                yield f"{link.name}.inertia.{key}", link, ("inertial", "tensor", i)
+    attached = {chain.attachment for chain in spec.chains if chain.parent is not None}
+    for joint in spec.tree.joints.values():
+        if joint.name in attached:
+            continue  # whose place stands in no file
+        for i, (axis, turn) in enumerate(zip("xyz", _TURNS, strict=True)):
+            yield f"{joint.child}.{axis}", joint, ("xyz", i)
+            yield f"{joint.child}.{turn}", joint, ("rpy", i)
         for key in ("lower", "upper"):
-            if limit is not None and limit.get(key) is not None:
-                yield f"{joint.get('name')}.{key}", _Number(limit, key)
+            if joint.moves and math.isfinite(getattr(joint.limits, key)):
+                yield f"{joint.name}.{key}", joint, ("limits", key)
+
+
+def _number(part: Any, way: _Way) -> float:
+    for at in way:
+        part = part[at] if isinstance(at, int) else getattr(part, at)
+    return float(part)
+
+
+def _with(part: Any, way: _Way, value: float) -> Any:
+    """A part of the description with another number in it."""
+    if not way:
+        return value
+    at, rest = way[0], way[1:]
+    if isinstance(at, int):
+        return (*part[:at], _with(part[at], rest, value), *part[at + 1 :])
+    return dataclasses.replace(part, **{at: _with(getattr(part, at), rest, value)})
 
 
 def parameters(spec: MachineSpec) -> dict[str, float]:
@@ -75,9 +75,8 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
     `oil.bulk_modulus`, `cylinder.JOINT.area_a`, `valve.JOINT.c1`, and `payload.mass`, a point
     mass at the tip, or the load that the machine file names, scaled to that mass.
     """
-    found = {name: number.get() for name, number in _numbers(spec.tree)}
-    joints = [j.get("name") for j in spec.tree.iterfind("joint") if j.get("type") != "fixed"]
-    for joint in joints:
+    found = {name: _number(part, way) for name, part, way in _numbers(spec)}
+    for joint in (joint.name for joint in spec.tree.moving):
         friction = spec.friction.get(joint, Friction())
         for field in dataclasses.fields(Friction):
             found[f"friction.{joint}.{field.name}"] = getattr(friction, field.name)
@@ -103,21 +102,20 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
         InputError: Unknown name, or a value that cannot be.
     """
     names = parameters(spec)
-    tree = copy.deepcopy(spec.tree)
-    numbers = dict(_numbers(tree))
-    chains = spec.chains
+    numbers = {name: (part, way) for name, part, way in _numbers(spec)}
+    tree, chains = spec.tree, spec.chains
     friction, control = dict(spec.friction), dict(spec.control)
     circuit = _parts(spec.hydraulics) if spec.hydraulics else {}
     replaced: dict[str, dict[str, float]] = {}
-    for name, given in changes.items():
+    for name in sorted(changes, key=lambda name: name == PAYLOAD):  # last: it adds to a link
         if name not in names:
             raise InputError(f"parameter '{name}' is unknown, {_nearest(spec, names, name)}")
-        value = as_number(given, f"parameter '{name}'", "")
+        value = as_number(changes[name], f"parameter '{name}'", "")
         head, _, rest = name.partition(".")
         if name.endswith(".mass") and value < 0:
             raise InputError(f"parameter '{name}' is {value:g} kg, it must not be negative")
         if name == PAYLOAD:
-            chains = _load(spec, tree, value)
+            tree, chains = _load(spec, tree, value)
         elif head == "friction":
             _set(friction, rest, value, Friction)
         elif (part := name.rpartition(".")[0]) in circuit:
@@ -125,7 +123,9 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
         elif head == "control":
             _set(control, rest, value, None)
         else:
-            numbers[name].set(value)
+            owner, way = numbers[name]
+            now = (tree.links if isinstance(owner, Link) else tree.joints)[owner.name]
+            tree = tree.replacing(_changed(now, way, value, name))
     for part, values in replaced.items():
         circuit[part] = dataclasses.replace(circuit[part], **values)
     hydraulics = _circuit(circuit) if circuit else None
@@ -138,8 +138,17 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
         friction=MappingProxyType(friction),
         control=MappingProxyType(control),
         hydraulics=hydraulics,
-        where={**spec.where, "link payload": PAYLOAD},
     )
+
+
+def _changed(part: Link | Joint, way: _Way, value: float, name: str) -> Link | Joint:
+    """A link or joint with another number, called `name`, in it."""
+    if way[0] != "limits":
+        return _with(part, way, value)
+    assert isinstance(part, Joint)
+    end = {str(way[-1]): limit(value)}
+    limits = dataclasses.replace(part.limits, where=f"changed by {name}", **end)
+    return dataclasses.replace(part, limits=limits)
 
 
 def _nearest(spec: MachineSpec, names: Iterable[str], wanted: str) -> str:
@@ -155,10 +164,7 @@ def _nearest(spec: MachineSpec, names: Iterable[str], wanted: str) -> str:
 def _warn_of_units(spec: MachineSpec, part: str, values: Mapping[str, float]) -> None:
     """Warn of numbers of the circuit that can be, and hardly are in their SI unit."""
     joint = part.partition(".")[2]
-    turning = any(
-        element.get("name") == joint and element.get("type") != "prismatic"
-        for element in spec.tree.iterfind("joint")
-    )
+    turning = joint in spec.tree.joints and spec.tree.joints[joint].kind != "prismatic"
     for name, value in values.items():
         if text := doubt(name, value, turning):
             what = f"parameter '{part}.{name}' {text}"
@@ -197,13 +203,13 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
     Raises:
         InputError: No such joint, no finite coordinate, or the last active joint.
     """
-    tree = copy.deepcopy(spec.tree)
-    joints = {j.get("name"): j for j in tree.iterfind("joint") if j.get("type") != "fixed"}
+    joints = {joint.name: joint for joint in spec.tree.moving}
+    held = []
     lock, couplings = _coupled(spec.couplings, lock)
     for name, given in lock.items():
         if name not in joints:
             raise InputError(f"joint '{name}' to lock is unknown, {known(joints, name)}")
-        _fix(joints[name], given)
+        held.append(_fixed(joints[name], given))
     active = spec.active and tuple(name for name in spec.active if name not in lock)
     if (spec.active and not active) or not joints.keys() - lock.keys():
         raise InputError(f"with {', '.join(lock)} locked nothing drives the machine, lock less")
@@ -213,7 +219,7 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
     )
     return dataclasses.replace(
         spec,
-        tree=tree,
+        tree=spec.tree.replacing(*held),
         chains=chains,
         active=active,
         home={joint: value for joint, value in spec.home.items() if joint not in lock},
@@ -274,27 +280,19 @@ def _coupled(
     )
 
 
-def _fix(joint: etree._Element, value: float) -> None:
-    """Make a joint fixed where its coordinate has a value."""
+def _fixed(joint: Joint, value: float) -> Joint:
+    """A joint fixed where its coordinate has a value."""
     from scipy.spatial.transform import Rotation
 
-    origin = joint.find("origin")
-    xyz, rpy, axis = (
-        np.array([float(word) for word in text.split()])
-        for text in (origin.get("xyz"), origin.get("rpy"), joint.find("axis").get("xyz"))
-    )
-    turn = Rotation.from_euler("xyz", rpy)
-    if joint.get("type") == "prismatic":
-        xyz = xyz + turn.apply(value * axis)
-    else:
-        turn = turn * Rotation.from_rotvec(value * axis)
-    origin.set("xyz", " ".join(map(repr, xyz.tolist())))
-    if value and joint.get("type") != "prismatic":
-        origin.set("rpy", " ".join(map(repr, turn.as_euler("xyz").tolist())))
-    joint.set("type", "fixed")
-    for tag in ("axis", "limit"):
-        for element in joint.findall(tag):
-            joint.remove(element)
+    held = dataclasses.replace(joint, kind="fixed", limits=Limits())
+    turn, axis = Rotation.from_euler("xyz", joint.rpy), np.array(joint.axis)
+    if joint.kind == "prismatic":
+        x, y, z = (np.array(joint.xyz) + turn.apply(value * axis)).tolist()
+        return dataclasses.replace(held, xyz=(x, y, z))
+    if not value:
+        return held
+    roll, pitch, yaw = (turn * Rotation.from_rotvec(value * axis)).as_euler("xyz").tolist()
+    return dataclasses.replace(held, rpy=(roll, pitch, yaw))
 
 
 def _set(by_joint: dict, name: str, value: float, default: Callable | None) -> None:
@@ -303,37 +301,38 @@ def _set(by_joint: dict, name: str, value: float, default: Callable | None) -> N
     by_joint[joint] = dataclasses.replace(before, **{field: value})
 
 
-def _load(spec: MachineSpec, tree: etree._Element, mass: float) -> tuple[Chain, ...]:
+def _load(spec: MachineSpec, tree: Tree, mass: float) -> tuple[Tree, tuple[Chain, ...]]:
     """Fix a payload to the tip: the machine's own, scaled to the mass, or else a point mass.
 
     Masses and inertias are scaled, places are not: a load of another density.
 
     Returns:
-        The chains that the tree is made of now.
+        The tree with it, and the chains that it is made of now.
     """
     if mass == 0:
-        return spec.chains
+        return tree, spec.chains
     if spec.payload is None:
-        link = etree.SubElement(tree, "link", name="payload")
-        inertial = etree.SubElement(link, "inertial")
-        etree.SubElement(inertial, "origin", xyz="0 0 0", rpy="0 0 0")
-        etree.SubElement(inertial, "mass", value=repr(mass))
-        etree.SubElement(
-            inertial, "inertia", dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
-        )
-        _attach(tree, "payload_fixed", spec.tip, "payload")
-        return spec.chains
+        import pinocchio as pin
+
+        from crane.description.rigid import loaded
+
+        tip = str(spec.tip)
+        frame = Link("payload", PAYLOAD), Joint("payload_fixed", "fixed", tip, "payload", PAYLOAD)
+        point = pin.Inertia(mass, np.zeros(3), np.zeros((3, 3)))
+        return loaded(tree.replacing(*frame), tip, point), spec.chains
     load = read_urdf(spec.payload.urdf)
-    scale = mass / sum(float(element.get("value")) for element in load.robot.iter("mass"))
-    for element in load.robot.iter("mass", "inertia"):
-        for key, value in element.items():
-            element.set(key, repr(scale * float(value)))
-    _attach(tree, f"{spec.payload.name}_attachment", spec.tip, load.root)
-    tree.extend(load.robot)
-    return (*spec.chains, spec.payload)
+    scale = mass / load.tree.mass
+    parts = [
+        _scaled(part, scale) if isinstance(part, Link) else part
+        for part in (spec.payload.attached(load.root), *load.tree)
+    ]
+    return tree.replacing(*parts), (*spec.chains, spec.payload)
 
 
-def _attach(tree: etree._Element, name: str, parent: str | None, child: str) -> None:
-    joint = etree.SubElement(tree, "joint", name=name, type="fixed")
-    etree.SubElement(joint, "parent", link=str(parent))
-    etree.SubElement(joint, "child", link=child)
+def _scaled(link: Link, scale: float) -> Link:
+    """A link of another density."""
+    if (inertial := link.inertial) is None:
+        return link
+    tensor = tuple(scale * x for x in inertial.tensor)
+    inertial = dataclasses.replace(inertial, mass=scale * inertial.mass, tensor=tensor)
+    return dataclasses.replace(link, inertial=inertial)

@@ -21,7 +21,7 @@ from crane.description.hydraulics import (
 )
 from crane.description.magnitudes import doubt
 from crane.description.section import Section
-from crane.description.tree import Tree
+from crane.description.tree_builder import TreeBuilder
 from crane.errors import CraneWarning, InputError, known
 
 Made = TypeVar("Made")
@@ -37,7 +37,7 @@ def numbers_of(kind: type) -> list[str]:
     return [entry.name for entry in fields(kind) if entry.name not in _NOT_NUMBERS]
 
 
-def read_hydraulics(top: Section, tree: Tree, active: tuple[str, ...]) -> Hydraulics | None:
+def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) -> Hydraulics | None:
     """The circuit of a machine file, None where it has none.
 
     Raises:
@@ -72,10 +72,8 @@ def read_hydraulics(top: Section, tree: Tree, active: tuple[str, ...]) -> Hydrau
         named["cylinder"].append(joint)
         with kept():
             _check_joint(joint, item, active)
-            if not tree.has_limits(joint):
-                problem = (
-                    f"joint '{joint}' is continuous, a cylinder needs the limits of its stroke"
-                )
+            if lack := tree.unlimited(joint):
+                problem = f"joint '{joint}' {lack}, a cylinder needs the limits of its stroke"
                 note(item.fail(None, problem))
             turning = _turns(tree, joint)
             holds = _holding(item, holding)
@@ -124,11 +122,8 @@ def _check_joint(joint: str, item: Section, active: tuple[str, ...]) -> None:
         raise item.fail(None, f"'{joint}' is not an active joint, {known(active, joint)}")
 
 
-def _turns(tree: Tree, joint: str) -> bool:
-    return any(
-        element.get("name") == joint and element.get("type") != "prismatic"
-        for element in tree.robot.iterfind("joint")
-    )
+def _turns(tree: TreeBuilder, joint: str) -> bool:
+    return joint in tree.joints and tree.joints[joint].kind == "revolute"
 
 
 def _part(section: Section, kind: type[Part], turning: bool = False, **given: Any) -> Part:

@@ -5,11 +5,11 @@ import warnings
 from crane.description.findings import kept
 from crane.description.section import Section
 from crane.description.spec import EndStop, ForceElement, Friction, GasSpring
-from crane.description.tree import Tree
+from crane.description.tree_builder import TreeBuilder
 from crane.errors import CraneWarning
 
 
-def read_friction(top: Section, tree: Tree) -> dict[str, Friction]:
+def read_friction(top: Section, tree: TreeBuilder) -> dict[str, Friction]:
     """Friction by joint."""
     found: dict[str, Friction] = {}
     keys = (
@@ -47,7 +47,7 @@ def read_friction(top: Section, tree: Tree) -> dict[str, Friction]:
     return found
 
 
-def read_forces(top: Section, tree: Tree) -> tuple[ForceElement, ...]:
+def read_forces(top: Section, tree: TreeBuilder) -> tuple[ForceElement, ...]:
     """Springs, dampers and constant forces."""
     forces = []
     keys = ("joint", "stiffness", "rest", "damping", "force")
@@ -70,7 +70,7 @@ def read_forces(top: Section, tree: Tree) -> tuple[ForceElement, ...]:
     return tuple(forces)
 
 
-def read_gas_springs(top: Section, tree: Tree) -> tuple[GasSpring, ...]:
+def read_gas_springs(top: Section, tree: TreeBuilder) -> tuple[GasSpring, ...]:
     """Enclosed gas along joints."""
     springs = []
     keys = ("area", "pressure", "volume", "rest", "exponent")
@@ -88,16 +88,15 @@ def read_gas_springs(top: Section, tree: Tree) -> tuple[GasSpring, ...]:
     return tuple(springs)
 
 
-def read_end_stops(top: Section, tree: Tree) -> tuple[EndStop, ...]:
+def read_end_stops(top: Section, tree: TreeBuilder) -> tuple[EndStop, ...]:
     """Stops at the limits of joints."""
     stops = []
     for joint, item in top.mappings("end_stops", "end stop of", "stiffness", "damping"):
         with kept():
             tree.check_joint(joint, item.where())
-            if not tree.has_limits(joint):
-                raise item.fail(
-                    None, f"joint '{joint}' is continuous, a stop needs limits: make it revolute"
-                )
+            if lack := tree.unlimited(joint):
+                hint = "make it revolute" if lack == "is continuous" else "give it both"
+                raise item.fail(None, f"joint '{joint}' {lack}, a stop needs limits: {hint}")
             stiffness = item.number("stiffness", minimum=0.0)
             if stiffness == 0:
                 raise item.fail(

@@ -1,6 +1,5 @@
 """Machine files and single URDFs, read and checked into a `MachineSpec`."""
 
-import copy
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,7 +28,7 @@ from crane.description.spec import (
     unit_vector,
 )
 from crane.description.tasks import read_tasks
-from crane.description.tree import Tree
+from crane.description.tree_builder import TreeBuilder
 from crane.description.urdf import is_urdf, read_urdf
 from crane.errors import DescriptionError, known
 
@@ -68,24 +67,24 @@ def _read(path: Path) -> MachineSpec:
 def _read_single(path: Path) -> MachineSpec:
     urdf = read_urdf(path)
     chain = Chain(path.stem, path, None, path.name, urdf.moving)
-    tree = Tree()
+    tree = TreeBuilder()
     tree.add(chain, urdf)
     if not tree.joints:
         note(DescriptionError(f"{path.name}: no joint moves in this file, add one"))
     for loop in urdf.loops:
         with kept():
             tree.check_loop(loop)
-    where = tree.where | _places(urdf.loops, urdf.couplings)
+    where = _places(urdf.loops, urdf.couplings)
     where |= {f"home {joint}": place for joint, place in urdf.home_lines.items()}
     active = urdf.independent
     if urdf.loops and not active:
         active, where["active"] = (), urdf.loops[0].where
     return MachineSpec(
-        name=urdf.robot.get("name"),
+        name=urdf.name,
         source=path.name,
         path=path,
         chains=(chain,),
-        tree=tree.robot,
+        tree=tree.tree,
         loops=urdf.loops,
         active=active,
         home=urdf.home,
@@ -110,8 +109,7 @@ def _read_machine(path: Path) -> MachineSpec:
             tree.check_joint(joint, top.where("active"))
     if not all(joint in tree.joints for joint in active):
         active = Anything()
-    where = {key: top.where(key) for key in top} | tree.where
-    where |= _places(loops, couplings)
+    where = {key: top.where(key) for key in top} | _places(loops, couplings)
     home = {}
     section = None
     with kept():
@@ -146,7 +144,7 @@ def _read_machine(path: Path) -> MachineSpec:
         tasks = _part(read_tasks, tasks, top, active, tip, valves)
         control = _part(_control, control, top, active)
     return MachineSpec(
-        name, source, path, chains, tree.robot, loops, active, home, friction, forces,
+        name, source, path, chains, tree.tree, loops, active, home, friction, forces,
         gas_springs, end_stops, tip, tasks, control, hydraulics, couplings, where, payload,
     )  # fmt: skip
 
@@ -160,9 +158,9 @@ def _part(read: Callable[..., Part], nothing: Any, *arguments: object) -> Part:
 
 def _chains(
     top: Section, path: Path
-) -> tuple[tuple[Chain, ...], Tree, dict[str, Friction], tuple[Coupling, ...]]:
+) -> tuple[tuple[Chain, ...], TreeBuilder, dict[str, Friction], tuple[Coupling, ...]]:
     chains: list[Chain] = []
-    tree = Tree()
+    tree = TreeBuilder()
     friction: dict[str, Friction] = {}
     couplings: tuple[Coupling, ...] = ()
     for item in top.sections("chains", "chain", "name", "urdf", "parent"):
@@ -200,7 +198,7 @@ def _chains(
     return tuple(chains), tree, friction, couplings
 
 
-def _loops(top: Section, tree: Tree) -> tuple[LoopSpec, ...]:
+def _loops(top: Section, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
     loops: dict[str, LoopSpec] = {}
     for item in top.sections("loops", "loop", "name", "type", "predecessor", "successor", "axis"):
         with kept():
@@ -211,7 +209,7 @@ def _loops(top: Section, tree: Tree) -> tuple[LoopSpec, ...]:
     return tuple(loops.values())
 
 
-def _loop(section: Section, tree: Tree) -> LoopSpec:
+def _loop(section: Section, tree: TreeBuilder) -> LoopSpec:
     name, kind = section.text("name"), section.text("type")
     what = f"loop '{name}'" if name else "a loop"
     if kind and kind not in LOOP_TYPES:
@@ -243,7 +241,7 @@ def _places(loops: tuple[LoopSpec, ...], couplings: tuple[Coupling, ...]) -> dic
     return places | {f"loop {coupling.name}": coupling.where for coupling in couplings}
 
 
-def _couplings(top: Section, tree: Tree) -> tuple[Coupling, ...]:
+def _couplings(top: Section, tree: TreeBuilder) -> tuple[Coupling, ...]:
     found: dict[str, Coupling] = {}
     for item in top.sections("couplings", "coupling", "name", "joints", "offset"):
         with kept():
@@ -265,7 +263,7 @@ def _couplings(top: Section, tree: Tree) -> tuple[Coupling, ...]:
     return tuple(found.values())
 
 
-def _payload(top: Section, tree: Tree, tip: str | None) -> Chain | None:
+def _payload(top: Section, tree: TreeBuilder, tip: str | None) -> Chain | None:
     """The load that payload.mass hangs on the tip, as a chain without moving joints."""
     section = top.section("payload", "'payload'")
     if section is None:
@@ -274,17 +272,18 @@ def _payload(top: Section, tree: Tree, tip: str | None) -> Chain | None:
     if tip is None:
         raise section.fail(None, "a payload hangs on the tip, name its frame under 'tip:'")
     urdf = read_urdf(section.file("urdf"))
-    for joint in urdf.moving:
-        problem = f"joint '{joint}' moves, a payload is rigid: make it fixed"
-        note(DescriptionError(f"{urdf.lines['joint', joint]}: {problem}"))
+    for joint in urdf.tree.moving:
+        problem = f"joint '{joint.name}' moves, a payload is rigid: make it fixed"
+        note(DescriptionError(f"{joint.where}: {problem}"))
     for loop in urdf.loops:
         note(DescriptionError(f"{loop.where}: a payload has no <loop>, remove it"))
-    if not sum(float(mass.get("value")) for mass in urdf.robot.iter("mass")):
+    if not urdf.tree.mass:
         raise section.fail(
             "urdf", f"no link of {urdf.file.name} has a mass, give one an <inertial>"
         )
     chain = Chain("payload", urdf.file, tip, section.where("urdf"), ())
-    copy.deepcopy(tree).add(chain, urdf)  # checks that its names are not taken
+    for _ in tree.free([chain.attached(urdf.root), *urdf.tree]):
+        pass  # notes names that are taken
     return chain
 
 

@@ -1,33 +1,21 @@
 """MJCF files of MuJoCo: bodies, joints, equality constraints and actuators."""
 
-from dataclasses import dataclass
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
-from lxml import etree
 
-from crane.description.clean import add_joint, add_link, text
 from crane.description.mjcf_equality import Frames, read_equality
 from crane.description.mjcf_left_out import warn_of_the_rest
 from crane.description.mujoco_file import MujocoFile
-from crane.description.series import names_of, parts_of
+from crane.description.rigid import inertial, placement, vector
+from crane.description.series import parts_of, series
 from crane.description.spec import Chain, ForceElement, Friction, MachineSpec
-from crane.description.tree import Tree
+from crane.description.tree import Inertial, Joint, Limits, Link, Tree, limit
+from crane.description.tree_builder import TreeBuilder
 from crane.description.urdf import Urdf
 from crane.errors import DescriptionError
-
-
-@dataclass(frozen=True)
-class _Part:
-    """One freedom of a body: a joint of URDF on the frame before it."""
-
-    name: str
-    kind: str
-    axis: tuple[float, ...]
-    place: pin.SE3  # on the frame after the part before, or on the parent body
-    limits: tuple[float, float] | None
-    where: str
 
 
 def read_mjcf(path: Path) -> MachineSpec:
@@ -51,9 +39,8 @@ class _Reader:
 
     def __init__(self, mjcf: MujocoFile):
         self.mjcf, self.model = mjcf, mjcf.model
-        name = mjcf.file.stem
-        self.robot = etree.Element("robot", name=name)
-        self.lines: dict[tuple[str, str], str] = {}
+        self.links: dict[str, Link] = {}
+        self.joints: dict[str, Joint] = {}
         self.bodies: list[str] = []  # their links
         self.parts: dict[int, list[str]] = {}  # joint of MuJoCo -> joints
         self.friction: dict[str, Friction] = {}
@@ -71,25 +58,21 @@ class _Reader:
         frames = self._frames()
         loops, couplings = read_equality(mjcf, frames, self.parts)
         for link, (body, place) in frames.made.items():
-            fixed = f"{link}_fixed"
-            while ("joint", fixed) in self.lines:
-                fixed += "_"
-            add_link(self.robot, link)
-            add_joint(self.robot, fixed, "fixed", place, (self.bodies[body], link))
-            self.lines["link", link] = self.lines["joint", fixed] = frames.where[link]
+            self._add_link(link, frames.where[link])
+            self._fix(link, self.bodies[body], place)
         warn_of_the_rest(mjcf, joints)
         urdf = Urdf(
             mjcf.file,
-            self.robot,
+            mjcf.file.stem,
+            Tree(self.links, self.joints),
             self.bodies[0],
-            self.lines,
             loops,
             None,
             self.friction,
             couplings,
         )
         chain = Chain(mjcf.file.stem, mjcf.file, None, mjcf.file.name, urdf.moving)
-        tree = Tree()
+        tree = TreeBuilder()
         tree.add(chain, urdf)
         for loop in loops:
             tree.check_loop(loop)
@@ -99,13 +82,13 @@ class _Reader:
         home = self._home()
         places = {f"loop {loop.name}": loop.where for loop in loops}
         places |= {f"loop {coupling.name}": coupling.where for coupling in couplings}
-        places |= {f"home {joint}": self.lines["joint", joint] for joint in home}
+        places |= {f"home {joint}": self.joints[joint].where for joint in home}
         return MachineSpec(
             name=self._custom("name") or mjcf.file.stem,
             source=self._custom("source") or mjcf.file.name,
             path=mjcf.file,
             chains=(chain,),
-            tree=tree.robot,
+            tree=tree.tree,
             loops=loops,
             active=active,
             home=home,
@@ -113,7 +96,7 @@ class _Reader:
             forces=tuple(self.forces),
             tip=self._tip(tree),
             couplings=couplings,
-            where=tree.where | places,
+            where=places,
             motors=active or (),
         )
 
@@ -126,19 +109,31 @@ class _Reader:
     def _link(self, wanted: str) -> str:
         """A name for a link that no body and no other link has."""
         taken = {self._name("BODY", i) for i in range(self.model.nbody)}
-        taken |= {name for kind, name in self.lines if kind == "link"}
+        taken |= self.links.keys()
         while wanted in taken:
             wanted += "_"
         return wanted
+
+    def _add_link(
+        self, name: str, where: str, mass: Inertial | None = None, between: str | None = None
+    ) -> None:
+        self.links[name] = Link(name, where, mass, between)
+
+    def _fix(self, link: str, parent: str, place: pin.SE3) -> None:
+        """Fix a link to another."""
+        name = f"{link}_fixed"
+        while name in self.joints or name in self.names:
+            name += "_"
+        where = self.links[link].where
+        self.joints[name] = Joint(name, "fixed", parent, link, where, *placement(place))
 
     def _body(self, body: int) -> None:
         """A body with its joints."""
         model, name = self.model, self._name("BODY", body)
         where = self.mjcf.where(name, "body")
         self.bodies.append(name)
-        self.lines["link", name] = where
         if body == 0:
-            add_link(self.robot, name)
+            self._add_link(name, where)
             return
         turn = _rotation(model.body_iquat[body])
         tensor = turn @ np.diag(model.body_inertia[body]) @ turn.T
@@ -146,7 +141,7 @@ class _Reader:
         parent = self.bodies[model.body_parentid[body]]
         place = pin.SE3(_rotation(model.body_quat[body]), model.body_pos[body].copy())
         first = model.body_jntadr[body]
-        parts: list[_Part] = []
+        parts: list[Joint] = []
         at = np.zeros(3)  # anchor of the part before, in the body's frame
         for joint in range(first, first + model.body_jntnum[body]):
             if model.jnt_type[joint] == 0:
@@ -157,41 +152,27 @@ class _Reader:
             self.parts[joint] = [part.name for part in found]
             parts += found
             at = anchor
-        add_link(self.robot, name, inertia)
+        self._add_link(name, where, inertial(inertia))
         for i, part in enumerate(parts):
             last = i == len(parts) - 1
             child = name if last and not at.any() else self._link(f"{name}_{i + 1}")
             if child != name:
-                link = etree.SubElement(self.robot, "link", name=child)
-                if not last:
-                    link.set("between", name)
-                self.lines["link", child] = where
-            element = add_joint(self.robot, part.name, part.kind, part.place, (parent, child))
-            etree.SubElement(element, "axis", xyz=text(part.axis))
-            if part.limits is not None:
-                lower, upper = (text([x]) for x in part.limits)
-                etree.SubElement(element, "limit", lower=lower, upper=upper)
-            if ("joint", part.name) in self.lines:
+                self._add_link(child, where, between=None if last else name)
+            if part.name in self.joints:
                 raise DescriptionError(f"{part.where}: two joints '{part.name}', rename one")
-            self.lines["joint", part.name] = part.where
+            self.joints[part.name] = dataclasses.replace(part, parent=parent, child=child)
             parent = child
         if parent != name:
-            fixed = f"{name}_fixed"
-            while ("joint", fixed) in self.lines or fixed in self.names:
-                fixed += "_"
-            back = place if not parts else pin.SE3(np.eye(3), -at)
-            add_joint(self.robot, fixed, "fixed", back, (parent, name))
-            self.lines["joint", fixed] = where
+            self._fix(name, parent, place if not parts else pin.SE3(np.eye(3), -at))
 
-    def _joint(self, joint: int, place: pin.SE3) -> list[_Part]:
-        """The freedoms of a joint, and what acts on them."""
+    def _joint(self, joint: int, place: pin.SE3) -> list[Joint]:
+        """The freedoms of a joint, without their links, and what acts on them."""
         model, name = self.model, self.names[joint]
         where = self.mjcf.where(name, "joint", "freejoint")
         kind = self.mjcf.kind("Joint", model.jnt_type[joint])
         dof = model.jnt_dofadr[joint]
         if kind in ("BALL", "FREE"):
             parts = parts_of("spherical" if kind == "BALL" else "floating", (0.0, 0.0, 1.0))
-            names = names_of(name, parts)
             own = range(dof, dof + len(parts))
             if model.dof_damping[own].any() or model.dof_frictionloss[own].any() or (
                 model.jnt_stiffness[joint]
@@ -200,11 +181,8 @@ class _Reader:
                     f"damping, friction and stiffness of the {kind.lower()} joint '{name}' are "
                     "left out, a machine has them along single freedoms"
                 )
-            places = [place] + [pin.SE3.Identity()] * (len(parts) - 1)
-            return [
-                _Part(x, part[1], part[2], step, None, where)
-                for x, part, step in zip(names, parts, places, strict=True)
-            ]
+            made = series(name, parts, placement(place), ("", ""), where)
+            return [part for part in made if isinstance(part, Joint)]
         axis = model.jnt_axis[joint].copy()
         turns = kind == "HINGE"
         zero = float(model.qpos0[model.jnt_qposadr[joint]])
@@ -212,20 +190,22 @@ class _Reader:
             place = place * pin.SE3(pin.AngleAxis(-zero, axis).toRotationMatrix(), np.zeros(3))
         else:
             place = place * pin.SE3(np.eye(3), -zero * axis)
-        limited = bool(model.jnt_limited[joint])
-        limits = (float(model.jnt_range[joint, 0]), float(model.jnt_range[joint, 1]))
+        limits = Limits(where=where)
+        if model.jnt_limited[joint]:
+            lower, upper = (limit(float(x)) for x in model.jnt_range[joint])
+            limits = Limits(lower, upper, where=where)
         damping, loss = float(model.dof_damping[dof]), float(model.dof_frictionloss[dof])
         if damping or loss:
             self.friction[name] = Friction(viscous=damping, coulomb=loss)
         if stiffness := float(model.jnt_stiffness[joint]):
             rest = float(model.qpos_spring[model.jnt_qposadr[joint]])
             self.forces.append(ForceElement(name, stiffness=stiffness, rest=rest))
-        style = ("revolute" if limited else "continuous") if turns else "prismatic"
-        return [_Part(name, style, tuple(axis), place, limits if limited else None, where)]
+        style = "revolute" if turns else "prismatic"
+        return [Joint(name, style, "", "", where, *placement(place), vector(axis), limits)]
 
     def _frames(self) -> Frames:
         """Links of the named sites."""
-        frames = Frames(taken={name for kind, name in self.lines if kind == "link"})
+        frames = Frames(taken=set(self.links))
         model = self.model
         for site in range(model.nsite):
             name = self.mjcf.name("SITE", site).strip()
@@ -289,7 +269,7 @@ class _Reader:
                 return raw.split(b"\0")[0].decode("utf-8", "replace").strip()
         return ""
 
-    def _tip(self, tree: Tree) -> str | None:
+    def _tip(self, tree: TreeBuilder) -> str | None:
         tip = self._custom("tip")
         if tip in tree.links and tree.moves(tip):
             return tip

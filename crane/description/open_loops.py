@@ -12,9 +12,10 @@ import warnings
 from collections.abc import Mapping
 
 import numpy as np
-from lxml import etree
 
+from crane.description.rigid import se3
 from crane.description.spec import MachineSpec
+from crane.description.tree import Joint, Tree
 from crane.errors import CraneWarning
 
 _END = re.compile(r"((?:closing_|closed?_?loop|loop_?clos).*?)_?([12AB])", re.IGNORECASE)
@@ -24,10 +25,7 @@ _SHOWN = 4  # pairs in a line
 
 def warn_of_open_loops(spec: MachineSpec) -> None:
     """Warn of pairs of frames that are named like the two ends of a loop that nothing closes."""
-    above = {
-        joint.find("child").get("link"): (joint.find("parent").get("link"), joint)
-        for joint in spec.tree.iter("joint")
-    }
+    above = {joint.child: joint for joint in spec.tree.joints.values()}
     closed = {
         frozenset(_body(above, end) for end in (loop.predecessor, loop.successor))
         for loop in spec.loops
@@ -46,7 +44,7 @@ def warn_of_open_loops(spec: MachineSpec) -> None:
     ]
     more = [f"{len(pairs) - _SHOWN} more"] if len(pairs) > _SHOWN else []
     dots = ["..."] * bool(more)
-    place = spec.where.get(f"link {pairs[0][1]}", spec.path.name)
+    place = spec.tree.links[pairs[0][1]].where
     warnings.warn(
         f"{place}: nothing closes what looks like {len(pairs)} "
         f"loop{'s' * (len(pairs) > 1)}, {', '.join(told + more)}: write loops: "
@@ -57,11 +55,11 @@ def warn_of_open_loops(spec: MachineSpec) -> None:
     )
 
 
-def _pairs(tree: etree._Element) -> list[tuple[str, str, str]]:
+def _pairs(tree: Tree) -> list[tuple[str, str, str]]:
     """A name for each loop, and its two links, which have the names themselves or their joints."""
-    named = {link.get("name"): link.get("name") for link in tree.iter("link")}
-    for joint in tree.iter("joint"):
-        named.setdefault(joint.get("name"), joint.find("child").get("link"))
+    named = {name: name for name in tree.links}
+    for name, joint in tree.joints.items():
+        named.setdefault(name, joint.child)
     ends: dict[str, dict[str, str]] = {}
     for name, link in named.items():
         if match := _END.fullmatch(name):
@@ -73,18 +71,18 @@ def _pairs(tree: etree._Element) -> list[tuple[str, str, str]]:
     ]
 
 
-def _body(above: Mapping[str, tuple[str, etree._Element]], link: str) -> str:
+def _body(above: Mapping[str, Joint], link: str) -> str:
     """The link that moves with a link, nearest to the root."""
     seen = {link}
-    while link in above and above[link][1].get("type") == "fixed":
-        link = above[link][0]
+    while link in above and not above[link].moves:
+        link = above[link].parent
         if link in seen:
             break
         seen.add(link)
     return link
 
 
-def _gap(above: Mapping[str, tuple[str, etree._Element]], one: str, two: str) -> str:
+def _gap(above: Mapping[str, Joint], one: str, two: str) -> str:
     """How far two frames are apart with all joints at zero, in words."""
     import pinocchio as pin
 
@@ -92,16 +90,10 @@ def _gap(above: Mapping[str, tuple[str, etree._Element]], one: str, two: str) ->
     for link in (one, two):
         place, seen = pin.SE3.Identity(), {link}
         while link in above:
-            link, joint = above[link]
-            origin = joint.find("origin")
-            if origin is not None:
-                xyz, rpy = (
-                    np.array([float(x) for x in origin.get(key, "0 0 0").split()])
-                    for key in ("xyz", "rpy")
-                )
-                if not np.isfinite((*xyz, *rpy)).all():  # which has been told
-                    return ""
-                place = pin.SE3(pin.rpy.rpyToMatrix(*rpy), xyz) * place
+            joint = above[link]
+            if not np.isfinite((*joint.xyz, *joint.rpy)).all():  # which has been told
+                return ""
+            place, link = se3(joint.xyz, joint.rpy) * place, joint.parent
             if link in seen:
                 return ""
             seen.add(link)

@@ -1,13 +1,14 @@
 """The convention of Gepetto's example-parallel-robots: robot.urdf with robot.yaml beside it."""
 
+import dataclasses
 import re
 from pathlib import Path
 
-from lxml import etree
-
 from crane.description.section import Section
+from crane.description.series import series
 from crane.description.spec import Chain, LoopSpec, MachineSpec
-from crane.description.tree import Tree
+from crane.description.tree import Joint, Link, Tree
+from crane.description.tree_builder import TreeBuilder
 from crane.description.urdf import Urdf, read_urdf
 from crane.description.urdf_graph import MOVING
 from crane.description.xml import XmlFile
@@ -19,7 +20,7 @@ _KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
 _OWN = re.compile(r"^(closed_loop|name_mot)\s*:", re.MULTILINE)
 _MACHINE = re.compile(r"^(chains|name)\s*:", re.MULTILINE)
 _LOOPS = {"3d": "spherical", "6d": "fixed"}
-_AXES = {"X": "1 0 0", "Y": "0 1 0", "Z": "0 0 1"}
+_AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
 _TYPES = ("SPHERICAL", "FIXED", "UJOINT_XY", "UJOINT_YZ", "UJOINT_ZX", "CARDAN")
 _UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
 
@@ -45,13 +46,17 @@ def read_parallel_robot(path: Path) -> MachineSpec:
         raise DescriptionError(f"{path}: there is no {URDF} beside it, add it")
     replaced = _replaced(top)
     urdf = read_urdf(file, lambda xml: _replace(xml, replaced, top))
+    for joint, (kind, _) in replaced.items():
+        if kind not in ("SPHERICAL", "FIXED"):
+            pair = _UNIVERSAL.fullmatch(kind)
+            urdf = _split(urdf, joint, (pair[1], pair[2]) if pair else ("X", "Y"))
     if urdf.loops:
         raise DescriptionError(
             f"{urdf.loops[0].where}: the loops stand in {path.name}, keep <loop> or closed_loop"
         )
-    name = urdf.robot.get("name")
+    name = urdf.name
     chain = Chain(name, file, None, path.name, urdf.moving)
-    tree = Tree()
+    tree = TreeBuilder()
     tree.add(chain, urdf)
     if not tree.joints:
         raise DescriptionError(f"{file.name}: no joint moves in this file, add one")
@@ -64,7 +69,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
                 f"the motor '{joint}' is {replaced[joint][0]}, drive a joint with one freedom",
             )
         tree.check_joint(joint, top.where("name_mot"))
-    where = {"active": top.where("name_mot")} | tree.where
+    where = {"active": top.where("name_mot")}
     where |= {f"loop {loop.name}": loop.where for loop in loops}
     where |= {f"loop {coupling.name}": coupling.where for coupling in urdf.couplings}
     return MachineSpec(
@@ -72,7 +77,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
         source=path.name,
         path=path,
         chains=(chain,),
-        tree=tree.robot,
+        tree=tree.tree,
         loops=loops,
         active=motors,
         motors=motors,
@@ -113,54 +118,35 @@ def _replace(xml: XmlFile, replaced: dict[str, tuple[str, str]], top: Section) -
         for tag in ("limit", "dynamics", "mimic"):  # of the joint that it was
             for element in joint.findall(tag):
                 joint.remove(element)
-        if kind in ("SPHERICAL", "FIXED"):
-            joint.set("type", kind.lower())
-            joint.attrib.pop("independent", None)
-            continue
-        pair = _UNIVERSAL.fullmatch(kind)
-        _write_universal(xml, joint, name, (pair[1], pair[2]) if pair else ("X", "Y"))
+        joint.set("type", kind.lower() if kind in ("SPHERICAL", "FIXED") else "continuous")
+        joint.attrib.pop("independent", None)
 
 
-def _write_universal(
-    xml: XmlFile, joint: etree._Element, name: str, axes: tuple[str, str]
-) -> None:
+def _split(urdf: Urdf, name: str, axes: tuple[str, str]) -> Urdf:
     """A universal joint as two about axes of the joint's frame, the first at the parent."""
-    place, child = joint.find("origin"), joint.find("child")
-    if child is None:
-        raise xml.fail(joint, f"joint '{name}' has no child link, add <child link=\"...\"/>")
-    middle = f"{name}_1"
-    first, link, second = (etree.Element(tag) for tag in ("joint", "link", "joint"))
-    link.set("name", middle)
-    link.set("between", name)
-    for element, axis in ((first, axes[0]), (second, axes[1])):
-        element.set("name", f"{name}_{axis}")
-        element.set("type", "continuous")
-        etree.SubElement(element, "axis", xyz=_AXES[axis])
-    if place is not None:
-        first.append(place)
-    for parent in joint.findall("parent"):
-        first.append(parent)
-    etree.SubElement(first, "child", link=middle)
-    etree.SubElement(second, "parent", link=middle)
-    for element in joint.findall("child"):
-        second.append(element)
-    at, around = joint.sourceline, joint.getparent()
-    index = around.index(joint)
-    around[index : index + 1] = [first, link, second]
-    for top in (first, link, second):
-        for element in top.iter():
-            element.sourceline = at
+    parts: list[Link | Joint] = []
+    for part in urdf.tree:
+        if not isinstance(part, Joint) or part.name != name:
+            parts.append(part)
+            continue
+        freedoms = [(axis, "revolute", _AXES[axis]) for axis in axes]
+        place, ends = (part.xyz, part.rpy), (part.parent, part.child)
+        for made in series(name, freedoms, place, ends, part.where):
+            taken = urdf.tree.links if isinstance(made, Link) else urdf.tree.joints
+            if made.name in taken:
+                problem = f"joint '{name}' makes '{made.name}', which is there already, rename one"
+                raise DescriptionError(f"{part.where}: {problem}")
+            parts.append(made)
+    return dataclasses.replace(urdf, tree=Tree({}, {}).replacing(*parts))
 
 
-def _loops(top: Section, urdf: Urdf, tree: Tree) -> tuple[LoopSpec, ...]:
+def _loops(top: Section, urdf: Urdf, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
     """Loops between the frames of `closed_loop`: points that coincide, or frames."""
     pairs = top.pairs("closed_loop") if "closed_loop" in top else []
     kinds = top.texts("type") if "type" in top else ("6d",) * len(pairs)
     if len(kinds) != len(pairs):
         raise top.fail("type", f"{len(kinds)} types for {len(pairs)} closed loops, give each one")
-    below = {
-        joint.get("name"): joint.find("child").get("link") for joint in urdf.robot.iter("joint")
-    }
+    below = {joint.name: joint.child for joint in urdf.tree.joints.values()}
     loops: dict[str, LoopSpec] = {}
     for pair, kind in zip(pairs, kinds, strict=True):
         if kind.lower() not in _LOOPS:

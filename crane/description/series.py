@@ -7,16 +7,18 @@ three rotations is 90 degrees from its zero, the first and third turn about the 
 closure through the joint is at the edge of its branch.
 """
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from lxml import etree
 
-Part = tuple[str, str, tuple[float, float, float]]  # suffix, type, axis
+from crane.description.tree import Joint, Link, Placement, Vector
+
+Part = tuple[str, str, Vector]  # suffix, kind, axis
 
 _X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 _TURNS: tuple[Part, ...] = (
-    ("rx", "continuous", _X), ("ry", "continuous", _Y), ("rz", "continuous", _Z),
+    ("rx", "revolute", _X), ("ry", "revolute", _Y), ("rz", "revolute", _Z),
 )  # fmt: skip
 _SLIDES: tuple[Part, ...] = (
     ("x", "prismatic", _X), ("y", "prismatic", _Y), ("z", "prismatic", _Z),
@@ -41,14 +43,14 @@ def parts_of(kind: str, axis: Sequence[float]) -> tuple[Part, ...]:
     first /= np.linalg.norm(first)
     second = np.cross(normal, first)
 
-    def exact(vector: np.ndarray) -> tuple[float, float, float]:
+    def exact(vector: np.ndarray) -> Vector:
         x, y, z = (float(value) + 0.0 for value in vector)
         return x, y, z
 
     return (
         ("x", "prismatic", exact(first)),
         ("y", "prismatic", exact(second)),
-        ("rz", "continuous", exact(normal)),
+        ("rz", "revolute", exact(normal)),
     )
 
 
@@ -57,35 +59,21 @@ def names_of(name: str, parts: Sequence[Part]) -> list[str]:
     return [f"{name}_{suffix}" for suffix, _, _ in parts]
 
 
-def write_series(
-    robot: etree._Element,
-    name: str,
-    parts: Sequence[Part],
-    origin: dict[str, str],
-    ends: tuple[str, str],
-) -> list[tuple[str, str]]:
-    """Add the joints, and the links between them, to a robot.
+def series(
+    name: str, parts: Sequence[Part], place: Placement, ends: tuple[str, str], where: str
+) -> list[Link | Joint]:
+    """The joints, and the links between them.
 
     Args:
-        robot: Where to.
         name: Of the joint.
         parts: Its freedoms, from the parent on.
-        origin: Attributes of its `<origin>`.
+        place: Of the first in the parent's frame.
         ends: Parent and child link.
-
-    Returns:
-        What was added, as ("link", name) or ("joint", name).
+        where: File and line.
     """
-    added = []
     links = [ends[0], *(f"{name}_{i}" for i in range(1, len(parts))), ends[1]]
+    found: list[Link | Joint] = [Link(link, where, between=name) for link in links[1:-1]]
     for i, (suffix, kind, axis) in enumerate(parts):
-        if i:
-            etree.SubElement(robot, "link", name=links[i], between=name)
-            added.append(("link", links[i]))
-        joint = etree.SubElement(robot, "joint", name=f"{name}_{suffix}", type=kind)
-        etree.SubElement(joint, "origin", origin if i == 0 else {"xyz": "0 0 0", "rpy": "0 0 0"})
-        etree.SubElement(joint, "parent", link=links[i])
-        etree.SubElement(joint, "child", link=links[i + 1])
-        etree.SubElement(joint, "axis", xyz=" ".join(repr(float(x)) for x in axis))
-        added.append(("joint", f"{name}_{suffix}"))
-    return added
+        joint = Joint(f"{name}_{suffix}", kind, links[i], links[i + 1], where, axis=axis)
+        found.append(joint if i else dataclasses.replace(joint, xyz=place[0], rpy=place[1]))
+    return found

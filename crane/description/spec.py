@@ -5,9 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lxml import etree
-
 from crane.description.hydraulics import Hydraulics
+from crane.description.tree import Joint, Tree, Vector
 from crane.errors import InputError
 from crane.samples import as_number
 
@@ -39,6 +38,15 @@ class Chain:
     where: str
     joints: tuple[str, ...]
 
+    @property
+    def attachment(self) -> str:
+        """Name of the fixed joint between its parent frame and its root link."""
+        return f"{self.name}_attachment"
+
+    def attached(self, root: str) -> Joint:
+        """That joint, for a root link."""
+        return Joint(self.attachment, "fixed", str(self.parent), root, self.where)
+
 
 @dataclass(frozen=True)
 class LoopSpec:
@@ -58,7 +66,7 @@ class LoopSpec:
     type: str
     predecessor: str
     successor: str
-    axis: tuple[float, float, float]
+    axis: Vector
     where: str
 
 
@@ -79,7 +87,7 @@ class Coupling:
     where: str
 
 
-def unit_vector(xyz: Sequence[float]) -> tuple[float, float, float] | None:
+def unit_vector(xyz: Sequence[float]) -> Vector | None:
     """The direction of three numbers; None if they are not three, or all zero."""
     largest = max(abs(value) for value in xyz)
     if len(xyz) != 3 or largest == 0:
@@ -254,7 +262,7 @@ class MachineSpec:
     source: str
     path: Path
     chains: tuple[Chain, ...]
-    tree: etree._Element  # all chains merged into one <robot>
+    tree: Tree  # all chains hung onto each other
     loops: tuple[LoopSpec, ...] = ()
     active: tuple[str, ...] | None = None  # None: every joint of the tree; (): not named
     home: Mapping[str, float] = field(default_factory=dict)

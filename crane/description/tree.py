@@ -1,148 +1,159 @@
-"""The spanning tree: all sub-chains merged into one."""
+"""The tree of a machine: its links and joints in numbers, each with its place in a file."""
 
-import copy
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 
-from lxml import etree
+Vector = tuple[float, float, float]
+Placement = tuple[Vector, Vector]  # xyz [m], rpy [rad] as URDF has them: R_z(y) R_y(p) R_x(r)
 
-from crane.description.findings import FollowUpError, kept, note
-from crane.description.section import Section
-from crane.description.spec import Chain, LoopSpec
-from crane.description.urdf import Urdf
-from crane.description.urdf_graph import MOVING
-from crane.errors import CraneError, DescriptionError, known
+NO_LIMIT = 1e9  # in a file: a limit of this size, in whatever unit, says that there is none
 
 
-class Tree:
-    """The chains merged into one robot, so that Pinocchio builds it depth-first.
+def limit(value: float) -> float:
+    """A limit of a file, infinite where it says that there is none."""
+    return math.copysign(math.inf, value) if abs(value) >= NO_LIMIT else value
+
+
+@dataclass(frozen=True)
+class Inertial:
+    """Mass and inertia of a link.
 
     Attributes:
-        robot: One `<robot>` of all links and joints.
-        links: File and line of each link.
-        joints: File and line of each moving joint.
-        where: The same as "link NAME" and "joint NAME".
-        complete: Whether every name is here; where findings are collected, a chain or a name may
-            have been refused.
+        mass: [kg].
+        com: Centre of mass in the link's frame [m].
+        rpy: Turns the axes of the link's frame into those of the tensor [rad].
+        tensor: xx, xy, xz, yy, yz, zz about the centre of mass [kg m2].
     """
 
-    def __init__(self) -> None:
-        self.robot = etree.Element("robot", name="machine")
-        self.links: dict[str, str] = {}
-        self.joints: dict[str, str] = {}
-        self.where: dict[str, str] = {}
-        self.complete = True
-        self._fixed: dict[str, str] = {}
-        self._endless: set[str] = set()
-        self._body: dict[str, str] = {}  # link -> the link it is rigidly attached to
+    mass: float
+    com: Vector
+    rpy: Vector
+    tensor: tuple[float, ...]
 
-    def add(self, chain: Chain, urdf: Urdf) -> None:
-        """Hang a chain from its parent frame, the first from the world.
 
-        Raises:
-            DescriptionError: The frame is unknown, or a name is taken by an earlier chain.
-        """
-        self._body[urdf.root] = urdf.root
-        with kept():
-            self._hang(chain, urdf)
-        self.complete &= urdf.complete
-        for element in urdf.robot:
-            name, kind = element.get("name"), element.get("type")
-            names = self.links if kind is None else self.joints if kind in MOVING else self._fixed
-            where = urdf.lines[element.tag, name]
-            if self.where.get(f"{element.tag} {name}") == where:
-                note(self._taken(element.tag, name, where))
-                self.complete = False
-                break  # one file twice: the rest of it is there, too
-            if f"{element.tag} {name}" in self.where:
-                note(self._taken(element.tag, name, where))
-                self.complete = False  # what was meant goes by another name
-                continue
-            self._enter(element.tag, name, where, names)
-            if kind in MOVING and element.find("limit") is None:
-                self._endless.add(name)
-            self.robot.append(copy.deepcopy(element))
-        self._attach(urdf)
+@dataclass(frozen=True)
+class Link:
+    """A frame, with or without mass.
 
-    def _hang(self, chain: Chain, urdf: Urdf) -> None:
-        if chain.parent is not None:
-            if chain.parent not in self.links:
-                raise self._unknown(
-                    f"{chain.where}: chain '{chain.name}' hangs from '{chain.parent}', no frame "
-                    f"of an earlier chain, {known(self.links, chain.parent)}"
-                )
-            name = f"{chain.name}_attachment"
-            self._enter("joint", name, chain.where, self._fixed)
-            joint = etree.SubElement(self.robot, "joint", name=name, type="fixed")
-            etree.SubElement(joint, "parent", link=chain.parent)
-            etree.SubElement(joint, "child", link=urdf.root)
-            self._body[urdf.root] = self._body.get(chain.parent, urdf.root)
+    Attributes:
+        name: Its name.
+        where: File and line.
+        inertial: Mass and inertia, None for a frame.
+        between: What it is within, if it only stands between the joints of a series.
+        refused: Whether it has an inertial that was refused while findings are collected.
+    """
 
-    def _enter(self, kind: str, name: str, where: str, names: dict[str, str]) -> None:
-        if f"{kind} {name}" in self.where:
-            raise self._taken(kind, name, where)
-        names[name] = self.where[f"{kind} {name}"] = where
+    name: str
+    where: str
+    inertial: Inertial | None = None
+    between: str | None = None
+    refused: bool = False
 
-    def _taken(self, kind: str, name: str, where: str) -> DescriptionError:
-        there = self.where[f"{kind} {name}"]
-        return DescriptionError(f"{where}: {kind} '{name}' is also in {there}, rename one")
 
-    def _unknown(self, message: str) -> CraneError:
-        """The error about a name that is not there, unless a chain is not, either."""
-        return DescriptionError(message) if self.complete else FollowUpError(message)
+@dataclass(frozen=True)
+class Limits:
+    """What a joint may do; infinite where there is no limit.
 
-    def _attach(self, urdf: Urdf) -> None:
-        """Find out which links of a chain make one body."""
-        below: dict[str, list[tuple[str, bool]]] = {}
-        for joint in urdf.robot.iter("joint"):
-            parent, child = (joint.find(end).get("link") for end in ("parent", "child"))
-            if parent and child:  # which is a forest, see `crane.description.urdf_graph`
-                below.setdefault(parent, []).append((child, joint.get("type") == "fixed"))
-        waiting = [urdf.root]
-        while waiting:
-            link = waiting.pop()
-            for child, fixed in below.get(link, ()):
-                self._body[child] = self._body[link] if fixed else child
-                waiting.append(child)
+    Attributes:
+        lower: Of the coordinate [m], [rad]; NaN if refused while findings are collected.
+        upper: Of the coordinate.
+        effort: [N], [N m].
+        velocity: [m/s], [rad/s].
+        where: File and line.
+    """
 
-    def check_joint(self, joint: str, where: str) -> None:
-        """Raise for a joint that does not exist or does not move."""
-        if joint in self._fixed:
-            problem = f"{where}: joint '{joint}' is fixed, name a moving one"
-            raise DescriptionError(problem) if self.joints else FollowUpError(problem)
-        if joint not in self.joints:
-            raise self._unknown(
-                f"{where}: joint '{joint}' is unknown, {known(self.joints, joint)}"
-            )
+    lower: float = -math.inf
+    upper: float = math.inf
+    effort: float = math.inf
+    velocity: float = math.inf
+    where: str = ""
 
-    def check_link(self, link: str, where: str, what: str) -> None:
-        """Raise for a link that does not exist, called `what`."""
-        if link not in self.links:
-            raise self._unknown(f"{where}: {what} '{link}' is unknown, {known(self.links, link)}")
+    def __str__(self) -> str:
+        place = f" ({self.where})" if self.where else ""
+        return f"{self.lower:g} to {self.upper:g}{place}"
 
-    def joint(self, section: Section) -> str:
-        """The joint that a section names."""
-        joint = section.text("joint")
-        self.check_joint(joint, section.where("joint"))
-        return joint
 
-    def check_loop(self, loop: LoopSpec) -> None:
-        """Raise for a loop between frames that do not move against each other."""
-        body = self._body.get(loop.predecessor)
-        if body is not None and body == self._body.get(loop.successor):
-            raise DescriptionError(
-                f"{loop.where}: loop '{loop.name}' joins '{loop.predecessor}' and "
-                f"'{loop.successor}', both on the body '{body}': choose frames of two bodies"
-            )
+@dataclass(frozen=True)
+class Joint:
+    """A joint with one freedom, or none.
 
-    def moves(self, link: str) -> bool:
-        """Whether a link is not fixed to the world."""
-        return not self.complete or self._body.get(link) != next(iter(self._body))
+    Attributes:
+        name: Its name.
+        kind: "revolute", "prismatic" or "fixed".
+        parent: Link that it stands on.
+        child: Link that it moves, whose frame is that of the joint at coordinate zero.
+        where: File and line.
+        xyz: Its origin in the parent's frame [m].
+        rpy: Turns the parent's frame into its own [rad].
+        axis: Unit vector in its own frame; without meaning if it is fixed.
+        limits: Its limits.
+        cut: Whether it closes a ring, so that it has no ends, while findings are collected.
+    """
 
-    def has_limits(self, joint: str) -> bool:
-        """Whether a joint has a finite range."""
-        return joint not in self._endless
+    name: str
+    kind: str
+    parent: str
+    child: str
+    where: str
+    xyz: Vector = (0.0, 0.0, 0.0)
+    rpy: Vector = (0.0, 0.0, 0.0)
+    axis: Vector = (1.0, 0.0, 0.0)
+    limits: Limits = field(default_factory=Limits)
+    cut: bool = False
 
-    def only_leaf(self) -> str | None:
-        """The last link of an unbranched chain."""
-        parents = {tag.get("link") for tag in self.robot.iter("parent")}
-        leaves = [name for name in self.links if name not in parents]
-        return leaves[0] if len(leaves) == 1 else None
+    @property
+    def moves(self) -> bool:
+        """Whether it has a freedom."""
+        return self.kind != "fixed"
+
+
+@dataclass(frozen=True)
+class Tree:
+    """Links and the joints between them, in the order of the file.
+
+    Attributes:
+        links: By name.
+        joints: By name.
+    """
+
+    links: Mapping[str, Link]
+    joints: Mapping[str, Joint]
+
+    def __iter__(self) -> Iterator[Link | Joint]:
+        yield from self.links.values()
+        yield from self.joints.values()
+
+    @property
+    def moving(self) -> tuple[Joint, ...]:
+        """The joints that move."""
+        return tuple(joint for joint in self.joints.values() if joint.moves)
+
+    @property
+    def root(self) -> str:
+        """The link that stands on no other."""
+        children = {joint.child for joint in self.joints.values()}
+        return next(link for link in self.links if link not in children)
+
+    @property
+    def mass(self) -> float:
+        """Of all links [kg]."""
+        return sum(link.inertial.mass for link in self.links.values() if link.inertial)
+
+    def below(self) -> dict[str, list[Joint]]:
+        """The joints on each link that has some."""
+        found: dict[str, list[Joint]] = {}
+        for joint in self.joints.values():
+            if joint.parent and joint.child:
+                found.setdefault(joint.parent, []).append(joint)
+        return found
+
+    def replacing(self, *parts: Link | Joint) -> "Tree":
+        """The tree with other links and joints in place of those of the same names, or more."""
+        links, joints = dict(self.links), dict(self.joints)
+        for part in parts:
+            if isinstance(part, Link):
+                links[part.name] = part
+            else:
+                joints[part.name] = part
+        return Tree(links, joints)

@@ -1,5 +1,6 @@
-"""Strict reading of URDF files: what Pinocchio would swallow silently is caught here."""
+"""Strict reading of URDF files: what other readers swallow silently is caught here."""
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,20 +10,21 @@ from lxml import etree
 from crane.description.findings import FollowUpError, kept, note, noted
 from crane.description.series import SEVERAL
 from crane.description.spec import Coupling, Friction, LoopSpec
+from crane.description.tree import Joint, Link, Tree
 from crane.description.urdf_couplings import read_coupling
 from crane.description.urdf_elements import (
-    add_joint,
     read_friction,
-    write_joint,
-    write_link,
-    write_several,
+    read_joint,
+    read_limits,
+    read_link,
+    read_several,
 )
 from crane.description.urdf_graph import MOVING, read_graph
 from crane.description.urdf_home import read_home, read_tip
 from crane.description.urdf_loops import independent, read_loops
 from crane.description.urdf_strangers import warn_of_strangers
 from crane.description.xml import XmlFile
-from crane.errors import DescriptionError, known
+from crane.errors import known
 
 _CHILDREN = {
     "robot": {
@@ -70,9 +72,9 @@ class Urdf:
 
     Attributes:
         file: The file.
-        robot: Its links and joints for the dynamics, written anew in plain numbers.
+        name: The robot's.
+        tree: Its links and joints.
         root: Name of the root link.
-        lines: File and line of each link and joint, as ("link", name) or ("joint", name).
         loops: Loops of `<loop>` elements.
         independent: Joints marked `independent="true"`; None where no joint has the attribute.
         friction: Friction of `<dynamics>` elements.
@@ -84,9 +86,9 @@ class Urdf:
     """
 
     file: Path
-    robot: etree._Element
+    name: str
+    tree: Tree
     root: str
-    lines: Mapping[tuple[str, str], str]
     loops: tuple[LoopSpec, ...]
     independent: tuple[str, ...] | None
     friction: Mapping[str, Friction]
@@ -99,8 +101,7 @@ class Urdf:
     @property
     def moving(self) -> tuple[str, ...]:
         """Its moving joints."""
-        joints = self.robot.iter("joint")
-        return tuple(joint.get("name") for joint in joints if joint.get("type") in MOVING)
+        return tuple(joint.name for joint in self.tree.moving)
 
 
 def is_urdf(file: Path) -> bool:
@@ -132,55 +133,52 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
     warn_of_strangers(xml, _CHILDREN, _ATTRIBUTES, joints)
     if not links:
         raise xml.fail(xml.root, "no <link> in this file, add one")
-    robot = etree.Element("robot", name=xml.root.get("name") or file.stem)
-    ends, root = read_graph(xml, links, joints)
+    ends, root, cut = read_graph(xml, links, joints)
     moved = {ends[name][1] for name, joint in joints.items() if joint.get("type") != "fixed"}
+    parts: list[Link | Joint] = []
     for name, link in links.items():
         with kept():
-            write_link(xml, name, link, name in moved, robot)
+            parts.append(read_link(xml, name, link, name in moved))
     friction = {}
-    made: dict[tuple[str, str], str] = {}
     for name, joint in joints.items():
         if joint.get("type") in SEVERAL:
             with kept():
-                made |= write_several(xml, name, joint, ends[name], robot)
+                for part in read_several(xml, name, joint, ends[name]):
+                    kind, taken = ("link", links) if isinstance(part, Link) else ("joint", joints)
+                    if part.name in taken:
+                        problem = f"its {kind} '{part.name}' is there already, rename one"
+                        note(xml.fail(joint, problem))
+                    else:
+                        parts.append(part)
             continue
         with kept():
-            write_joint(xml, name, joint, ends[name], robot)
+            read = dataclasses.replace(read_joint(xml, name, joint, ends[name]), cut=name in cut)
+            parts.append(read)
+            if read.moves:
+                limits = read_limits(xml, name, joint)
+                parts[-1] = dataclasses.replace(read, limits=limits)
         with kept(harmless=True):
             if (found := read_friction(xml, name, joint)) is not None:
                 friction[name] = found
-    lines = {
-        (kind, name): xml.where(element)
-        for kind, elements in (("link", links), ("joint", joints))
-        for name, element in elements.items()
-    }
-    for (kind, name), where in made.items():
-        if (kind, name) in lines:
-            note(DescriptionError(f"{where}: its {kind} '{name}' is there already, rename one"))
-    lines |= made
     driven = independent(xml, joints)
     loops, frames = read_loops(xml, _named(xml, "loop"), links)
     for frame in frames:
-        etree.SubElement(robot, "link", name=frame.name)
-        joint = f"{frame.name}_fixed"
-        lines["link", frame.name] = frame.where
-        if joint in joints:
-            note(xml.fail(joints[joint], f"joint '{joint}' has the name of a loop's, rename it"))
+        parts.append(Link(frame.child, frame.where))
+        if (same := joints.get(frame.name)) is not None:
+            note(xml.fail(same, f"joint '{frame.name}' has the name of a loop's, rename it"))
             continue
-        add_joint(robot, joint, "fixed", frame.placement, (frame.link, frame.name))
-        lines["joint", joint] = frame.where
+        parts.append(frame)
     couplings = _mimics(xml, joints, driven)
     for name, element in _named(xml, "coupling").items():
         with kept():
             couplings += (read_coupling(xml, name, element, joints, ends, links),)
-    moving = {joint.get("name") for joint in robot.iter("joint") if joint.get("type") in MOVING}
-    home, home_lines = read_home(xml, moving)
+    tree = Tree({}, {}).replacing(*parts)
+    home, home_lines = read_home(xml, {joint.name for joint in tree.moving})
     return Urdf(
         file,
-        robot,
+        xml.root.get("name") or file.stem,
+        tree,
         root,
-        lines,
         loops,
         driven,
         friction,

@@ -20,12 +20,12 @@ _LISTED = 8  # joints of a ring in an error
 
 def read_graph(
     xml: XmlFile, links: Mapping[str, etree._Element], joints: Mapping[str, etree._Element]
-) -> tuple[Ends, str]:
-    """Parent and child link of every joint, and the root.
+) -> tuple[Ends, str, set[str]]:
+    """Parent and child link of every joint, the root, and the joints that are cut.
 
     Whatever the file says, joints with both ends make a forest: whoever follows them comes to an
     end. A joint that joins a link to itself has no ends once that was noted, nor has one that
-    gives a link a second parent or closes a ring, which is marked by the attribute `cut`.
+    gives a link a second parent or closes a ring, which is cut.
 
     Args:
         xml: The file.
@@ -36,7 +36,11 @@ def read_graph(
         DescriptionError: An end is missing or unknown, or the joints do not make one tree.
     """
     ends = {name: _ends(xml, name, joint, links) for name, joint in joints.items()}
-    return ends, _root(xml, links, joints, ends)
+    cut: set[str] = set()
+    root = _root(xml, links, joints, ends, cut)
+    for name in cut:
+        ends[name] = _CUT
+    return ends, root, cut
 
 
 def _ends(
@@ -55,9 +59,12 @@ def _ends(
             )
         )
         near = get_close_matches(kind or "", kinds, 1, 0.75)
-        joint.set("type", near[0] if near else "continuous")
-        if joint.find("limit") is None:  # whatever it is, nobody has to miss limits
-            etree.SubElement(joint, "limit", lower="-1", upper="1")
+        joint.set("type", near[0] if near else "revolute")
+        limit = joint.find("limit")
+        if limit is None:
+            limit = etree.SubElement(joint, "limit")
+        if limit.get("lower") is None and limit.get("upper") is None:
+            limit.attrib.update({"lower": "-1", "upper": "1"})  # nobody has to miss them
     ends = []
     for end in ("parent", "child"):
         tag = xml.only(joint, end, what)
@@ -80,8 +87,9 @@ def _root(
     links: Mapping[str, etree._Element],
     joints: Mapping[str, etree._Element],
     ends: Ends,
+    cut: set[str],
 ) -> str:
-    """The one link without a parent of joints that form a tree, which the others are cut to."""
+    """The one link without a parent of joints that form a tree; those to cut are added."""
     above: dict[str, tuple[str, str]] = {}  # link -> parent, joint
     for name, (parent, child) in ends.items():
         if child in above:
@@ -92,7 +100,7 @@ def _root(
                     "keep one and close the other as a loop",
                 )
             )
-            _cut(joints, ends, name)
+            cut.add(name)
         elif child:
             above[child] = (parent, name)
     roots = [name for name in links if name not in above]
@@ -112,7 +120,7 @@ def _root(
                         f"'{last}' and close it as a loop",
                     )
                 )
-                _cut(joints, ends, last)
+                cut.add(last)
                 del above[at]
                 break
             seen.add(at)
@@ -137,8 +145,3 @@ def _ring(above: Mapping[str, tuple[str, str]], link: str) -> str:
         found.append(joint)
     found.reverse()
     return ", ".join(found[:_LISTED]) + (", ..." if len(found) > _LISTED else "")
-
-
-def _cut(joints: Mapping[str, etree._Element], ends: Ends, name: str) -> None:
-    ends[name] = _CUT
-    joints[name].set("cut", "true")

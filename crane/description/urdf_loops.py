@@ -1,13 +1,13 @@
 """Loops in a URDF: the elements and attributes of URDF+ (Chignoli et al., arXiv 2411.19753)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 from lxml import etree
 
 from crane.description.findings import FollowUpError, kept, note
 from crane.description.series import SEVERAL, names_of, parts_of
 from crane.description.spec import LoopSpec
+from crane.description.tree import Joint
 from crane.description.xml import XmlFile
 from crane.errors import CraneError, known
 
@@ -17,30 +17,11 @@ _TYPES = (
 )  # fmt: skip
 _X = (1.0, 0.0, 0.0)  # axis of a URDF joint that names none
 
-Placement = tuple[tuple[float, ...], tuple[float, ...]]
-
-
-@dataclass(frozen=True)
-class LoopFrame:
-    """A frame that a loop puts on a link.
-
-    Attributes:
-        name: The frame's name.
-        link: The link.
-        placement: xyz [m] and rpy [rad] in the link's frame.
-        where: Where it was written, for errors.
-    """
-
-    name: str
-    link: str
-    placement: Placement
-    where: str
-
 
 def read_loops(
     xml: XmlFile, elements: Mapping[str, etree._Element], links: Mapping[str, etree._Element]
-) -> tuple[tuple[LoopSpec, ...], tuple[LoopFrame, ...]]:
-    """Loops of `<loop>` elements, and the two frames that each puts on links.
+) -> tuple[tuple[LoopSpec, ...], tuple[Joint, ...]]:
+    """Loops of `<loop>` elements, and the fixed joints of the two frames that each puts on links.
 
     Args:
         xml: The file.
@@ -61,7 +42,7 @@ def read_loops(
 
 def _loop(
     xml: XmlFile, name: str, element: etree._Element, links: Mapping[str, etree._Element]
-) -> tuple[LoopSpec, list[LoopFrame]]:
+) -> tuple[LoopSpec, list[Joint]]:
     what, where = f"loop '{name}'", xml.where(element)
     kind = element.get("type", "")
     if kind not in _TYPES:
@@ -81,14 +62,15 @@ def _loop(
             named = links[f"{name}_{end}"]
             problem = f"link '{name}_{end}' has the name of a frame of {what}, rename one"
             note(xml.fail(named, problem))
-        placement = xml.placement(tag, f"the {end} of {what}")
-        ends.append(LoopFrame(f"{name}_{end}", link, placement, where))
+        xyz, rpy = xml.placement(tag, f"the {end} of {what}")
+        frame = f"{name}_{end}"
+        ends.append(Joint(f"{frame}_fixed", "fixed", link, frame, where, xyz, rpy))
     axis = xml.direction(element, what, _X)
-    known_ends = [end for end in ends if end.link in links and end.name not in links]
+    known_ends = [end for end in ends if end.parent in links and end.child not in links]
     if kind not in _TYPES or len(known_ends) < 2:
         raise FollowUpError(f"{what} is not complete")
     kind = "revolute" if kind == "continuous" else kind
-    return LoopSpec(name, kind, ends[0].name, ends[1].name, axis, where), ends
+    return LoopSpec(name, kind, ends[0].child, ends[1].child, axis, where), ends
 
 
 def unknown_link(

@@ -9,6 +9,7 @@ from lxml import etree
 
 from crane.description.findings import note
 from crane.description.spec import unit_vector
+from crane.description.tree import Placement, Vector
 from crane.errors import DescriptionError, known
 
 _X = (1.0, 0.0, 0.0)
@@ -195,9 +196,7 @@ class XmlFile:
             raise self.fail(element, f"{given} is not finite, give a number")
         return values
 
-    def direction(
-        self, element: etree._Element, what: str, default: tuple[float, ...]
-    ) -> tuple[float, float, float]:
+    def direction(self, element: etree._Element, what: str, default: tuple[float, ...]) -> Vector:
         """Unit vector of the child `<axis xyz="..."/>`.
 
         Raises:
@@ -210,9 +209,7 @@ class XmlFile:
             return _X
         return unit
 
-    def placement(
-        self, element: etree._Element, what: str
-    ) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    def placement(self, element: etree._Element, what: str) -> Placement:
         """Numbers xyz [m] and rpy [rad] of the child `<origin/>`, zeros without one.
 
         Raises:
@@ -222,7 +219,7 @@ class XmlFile:
         zero = (0.0, 0.0, 0.0)
         if origin is None:
             return zero, zero
-        xyz, rpy = (
+        (x, y, z), (roll, pitch, yaw) = (
             self.vector(origin, key, f"the origin of {what}", 3, zero) for key in ("xyz", "rpy")
         )
-        return xyz, rpy
+        return (x, y, z), (roll, pitch, yaw)

@@ -8,14 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pinocchio as pin
 from lxml import etree
 
 from crane.description import Chain, Hydraulics, Task, Valve, read
 from crane.description.circuit_section import numbers_of
-from crane.description.clean import add_joint, add_link
 from crane.errors import CraneError, CraneWarning, InputError, OutputError
-from crane.formats.parts import Parts, finished, origin_of
+from crane.formats.parts import add_joint, add_link, draw, finished, origin_of
 from crane.machine import Machine
 from crane.output import file_name, staging
 
@@ -65,56 +63,32 @@ class _Chains:
     """
 
     def __init__(self, machine: Machine):
-        self.machine, self.parts = machine, Parts(machine)
+        self.machine, self.tree = machine, machine.tree
         self.chains = [chain for chain in machine.chains if chain.name != "payload"]
         self.names = [chain.name for chain in self.chains]
         self.files = {name: f"{i}_{file_name(name)}.urdf" for i, name in enumerate(self.names, 1)}
-        self.roots: dict[str, str] = {self.names[0]: self.parts.links[0]}
-        self.parents: dict[str, str] = {}
-        attached = {f"{chain.name}_attachment": chain for chain in self.chains[1:]}
-        for frame in self.parts.frames:
-            if (chain := attached.get(frame.fixed)) is not None:
-                self.roots[chain.name] = frame.name
-                self.parents[chain.name] = str(chain.parent)
-        self._frames = {frame.name: frame for frame in self.parts.frames}
-        self._chain_of: dict[str, str] = {root: name for name, root in self.roots.items()}
-        model = self.parts.model
-        for frame in model.frames:  # parents stand before their children
-            if frame.type != pin.FrameType.BODY or frame.name in self._chain_of:
-                continue
-            above = model.frames[model.frames[frame.parentFrame].parentFrame]
-            self._chain_of[frame.name] = self._chain_of.get(above.name, self.names[0])
+        self.parents = {chain.name: str(chain.parent) for chain in self.chains[1:]}
+        self._attached = {chain.attachment: chain.name for chain in self.chains[1:]}
+        root = self.tree.root
+        self._chain_of = {root: self.names[0]}
+        below, waiting = self.tree.below(), [root]
+        while waiting:
+            link = waiting.pop()
+            for joint in below.get(link, ()):
+                within = self._attached.get(joint.name, self._chain_of[link])
+                self._chain_of[joint.child] = within
+                waiting.append(joint.child)
 
     def robot(self, chain: str) -> etree._Element:
         """The URDF of a sub-chain."""
-        parts, model = self.parts, self.parts.model
         robot = etree.Element("robot", name=chain)
-        root = self.roots[chain]
-        base = self._frames[root].place if root in self._frames else pin.SE3.Identity()
-        foot = self._frames[root].joint if root in self._frames else 0
-        if root in self._frames:
-            add_link(robot, root)
-        else:
-            parts.write_link(robot, 0)
-        joints = [i for i in parts.joints if self._chain_of[parts.links[i]] == chain]
-        for joint in joints:
-            parts.write_link(robot, joint)
-            parent, place = model.parents[joint], model.jointPlacements[joint]
-            if parent in joints:
-                parts.write_joint(robot, joint, parts.links[parent], place)
-            else:
-                parts.write_joint(robot, joint, root, base.actInv(place))
-        for frame in parts.frames:
-            if self._chain_of[frame.name] != chain or frame.name == root:
-                continue
-            add_link(robot, frame.name)
-            if frame.joint in joints:
-                parent, place = parts.links[frame.joint], frame.place
-            else:
-                assert frame.joint == foot, "a frame of the chain's root"
-                parent, place = root, base.actInv(frame.place)
-            add_joint(robot, frame.fixed, "fixed", place, (parent, frame.name))
-        parts.draw(robot, [chain])
+        for link in self.tree.links.values():
+            if self._chain_of[link.name] == chain:
+                add_link(robot, link)
+        for joint in self.tree.joints.values():
+            if self._chain_of[joint.child] == chain and joint.name not in self._attached:
+                add_joint(robot, joint)
+        draw(robot, self.machine, [chain])
         return robot
 
 

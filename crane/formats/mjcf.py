@@ -8,16 +8,16 @@ import pinocchio as pin
 from lxml import etree
 
 from crane.description import Coupling, LoopSpec
-from crane.description.clean import text
 from crane.errors import CraneWarning, InputError
 from crane.formats.parts import (
-    Parts,
+    ends,
     finished,
     left_out,
     linear,
     only_in_machine_files,
     origin_of,
     plain_friction,
+    text,
 )
 from crane.machine import Machine
 from crane.output import replacing
@@ -60,8 +60,15 @@ class _Writer:
     """
 
     def __init__(self, machine: Machine):
-        self.machine, self.parts = machine, Parts(machine)
-        self.model = machine.model
+        self.machine, self.model, self.tree = machine, machine.model, machine.tree
+        self.joints = range(1, self.model.njoints)
+        moved = [self.tree.joints[name].child for name in machine.joints]
+        self.links = [self.tree.root, *moved]  # by index of the joint
+        self.frames = [  # all other links
+            frame
+            for frame in self.model.frames
+            if frame.type == pin.FrameType.BODY and frame.name not in self.links
+        ]
         self.root = etree.Element("mujoco", model=machine.name)
         self.bodies: dict[int, etree._Element] = {}  # by index of the joint
         self.home: list[float] = []
@@ -74,14 +81,12 @@ class _Writer:
         add(self.root, "option", timestep="0.001", gravity="0 0 -9.81", integrator="implicitfast")
         self._texts()
         self.bodies[0] = add(self.root, "worldbody")
-        for joint in self.parts.joints:
-            if self.model.parents[joint] == 0:
-                self._body(joint, self.bodies[0])
-        if self.parts.links[0] != "world":
-            self._site(self.bodies[0], self.parts.links[0], pin.SE3.Identity())
-        for frame in self.parts.frames:
-            if frame.joint in self.bodies:
-                self._site(self.bodies[frame.joint], frame.name, frame.place)
+        self._tree()
+        if self.tree.root != "world":
+            self._site(self.bodies[0], self.tree.root, pin.SE3.Identity())
+        for frame in self.frames:
+            if frame.parentJoint in self.bodies:
+                self._site(self.bodies[frame.parentJoint], frame.name, frame.placement)
         equations = self.machine.closure.equations
         if equations.loops or equations.couplings:
             tendons, equality = etree.Element("tendon"), etree.Element("equality")
@@ -108,48 +113,56 @@ class _Writer:
                 etree.SubElement(custom, "text", name=name, data=data)
 
     def _leaves(self) -> list[str]:
-        parents = {frame.parent for frame in self.parts.frames}
-        parents |= {self.parts.links[parent] for parent in list(self.model.parents)[1:]}
-        links = [*self.parts.links.values(), *(frame.name for frame in self.parts.frames)]
-        return [link for link in links if link not in parents]
+        parents = {joint.parent for joint in self.tree.joints.values()}
+        return [link for link in self.tree.links if link not in parents]
 
-    def _body(self, joint: int, parent: etree._Element) -> None:
-        """A body with the series of joints that moves it, and the bodies on it."""
-        series = [joint]
-        while self.parts.massless(series[-1]):
-            last = series[-1]
-            above = [i for i in self.parts.joints if self.model.parents[i] == last]
-            if len(above) != 1 or any(frame.joint == last for frame in self.parts.frames):
-                raise InputError(
-                    f"link '{self.parts.links[last]}' has no mass, which MuJoCo asks of "
-                    "every body with frames or several joints on it: give it some, or write URDF+"
-                )
-            series += above
+    def _above(self, joint: int) -> list[int]:
+        """The joints on the link that a joint moves."""
+        return [i for i in self.joints if self.model.parents[i] == joint]
+
+    def _tree(self) -> None:
+        """Bodies with the series of joints that move each, parents before children."""
+        waiting = [(joint, self.bodies[0]) for joint in reversed(self._above(0))]
+        while waiting:
+            joint, parent = waiting.pop()
+            series = [joint]
+            while not self.model.inertias[series[-1]].mass:
+                last = series[-1]
+                above = self._above(last)
+                if len(above) != 1 or any(frame.parentJoint == last for frame in self.frames):
+                    raise InputError(
+                        f"link '{self.links[last]}' has no mass, which MuJoCo asks of every body "
+                        "with frames or several joints on it: give it some, or write URDF+"
+                    )
+                series += above
+            body = self.bodies[series[-1]] = self._body(series, parent)
+            waiting += [(i, body) for i in reversed(self._above(series[-1]))]
+
+    def _body(self, series: list[int], parent: etree._Element) -> etree._Element:
+        """A body with the series of joints that moves it."""
         whole = pin.SE3.Identity()
         for i in series:
             whole = whole * self.model.jointPlacements[i]
-        name = self.parts.links[series[-1]]
+        name = self.links[series[-1]]
         body = etree.SubElement(parent, "body", {"name": name} | _placed(whole))
         _inertial(body, self.model.inertias[series[-1]])
         before = pin.SE3.Identity()
         for i in series:
             before = before * self.model.jointPlacements[i]
             self._joint(body, i, whole.actInv(before))
-        self.bodies[series[-1]] = body
-        for i in self.parts.joints:
-            if self.model.parents[i] == series[-1]:
-                self._body(i, body)
+        return body
 
     def _joint(self, body: etree._Element, joint: int, place: pin.SE3) -> None:
         """A joint, placed in its body's frame at zero."""
         machine, name = self.machine, self.model.names[joint]
+        described = self.tree.joints[name]
         values = {
             "name": name,
-            "type": "hinge" if self.parts.turns(joint) else "slide",
+            "type": "hinge" if described.kind == "revolute" else "slide",
             **_placed(pin.SE3(np.eye(3), place.translation)),
-            "axis": text(place.rotation @ self.parts.axis(joint)),
+            "axis": text(place.rotation @ np.array(described.axis)),
         }
-        if (limits := self.parts.limits(joint)) is not None:
+        if (limits := ends(described.limits)) is not None:
             values |= {"limited": "true", "range": text(limits)}
         law = machine.friction.get(name)
         acting = [item for item in machine.forces if item.joint == name]

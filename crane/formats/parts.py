@@ -1,159 +1,99 @@
-"""The links and joints of a machine, as they are written."""
+"""What is written alike in several formats: links and joints of URDF, words on what is lost."""
 
 import copy
 import math
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pinocchio as pin
 from lxml import etree
 
 from crane.description import Coupling
-from crane.description.clean import add_joint, add_link, text
 from crane.description.meshes import mesh_file
+from crane.description.tree import NO_LIMIT, Joint, Limits, Link
 from crane.errors import CraneWarning
 from crane.machine import Machine
-from crane.samples import Array
-
-ENDLESS = 1e9  # limit that is read as none, written where one has to stand
 
 
-@dataclass(frozen=True)
-class Frame:
-    """A link without mass, fixed to the link that a joint moves.
+def text(values: Sequence[float] | np.ndarray) -> str:
+    """Numbers with blanks between, exactly as they are."""
+    return " ".join(repr(float(value) + 0.0) for value in np.ravel(values))
 
-    Attributes:
-        name: The link.
-        fixed: Its fixed joint.
-        joint: Index of the joint whose link it is fixed to, 0 for the world.
-        place: In that link's frame.
-        parent: Link that it was fixed to when the machine was read.
+
+def ends(limits: Limits) -> tuple[float, float] | None:
+    """Lower and upper limit as files have them, None for a joint without limits."""
+    if math.isinf(limits.lower) and math.isinf(limits.upper):
+        return None
+    return max(limits.lower, -NO_LIMIT), min(limits.upper, NO_LIMIT)
+
+
+def add_origin(element: etree._Element, joint: Joint) -> None:
+    """`<origin>` of a joint."""
+    etree.SubElement(element, "origin", xyz=text(joint.xyz), rpy=text(joint.rpy))
+
+
+def add_link(robot: etree._Element, link: Link) -> None:
+    """A `<link>` of URDF."""
+    element = etree.SubElement(robot, "link", name=link.name)
+    if link.between is not None:
+        element.set("between", link.between)
+    if (mass := link.inertial) is None:
+        return
+    inertial = etree.SubElement(element, "inertial")
+    etree.SubElement(inertial, "origin", xyz=text(mass.com), rpy=text(mass.rpy))
+    etree.SubElement(inertial, "mass", value=text([mass.mass]))
+    tensor = zip(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), mass.tensor, strict=True)
+    etree.SubElement(inertial, "inertia", {key: text([value]) for key, value in tensor})
+
+
+def add_joint(robot: etree._Element, joint: Joint) -> etree._Element:
+    """A `<joint>` of URDF with its limits.
+
+    A joint that turns without limits is continuous. A slide, and a joint that is limited to one
+    side, has to have both: 1e9 stands for none, and is read so.
     """
-
-    name: str
-    fixed: str
-    joint: int
-    place: pin.SE3
-    parent: str
-
-
-class Parts:
-    """What a machine consists of, seen from its model: changes, locks and payloads are in it.
-
-    Args:
-        machine: The machine.
-
-    Attributes:
-        links: By index of a joint, the link that it moves; the root link for the world.
-        frames: All other links.
-    """
-
-    def __init__(self, machine: Machine):
-        self.machine = machine
-        model = self.model = machine.model
-        self.links: dict[int, str] = {}
-        self.frames: list[Frame] = []
-        for frame in model.frames:
-            if frame.type != pin.FrameType.BODY:
-                continue
-            above = model.frames[frame.parentFrame]
-            if frame.parentJoint not in self.links and (
-                above.type == pin.FrameType.JOINT or above.name == "universe"
-            ):
-                self.links[frame.parentJoint] = frame.name
-                continue
-            parent = model.frames[above.parentFrame].name
-            self.frames.append(
-                Frame(frame.name, above.name, frame.parentJoint, frame.placement, parent)
-            )
-
-    @property
-    def joints(self) -> range:
-        """Indices of the joints."""
-        return range(1, self.model.njoints)
-
-    def ordered(self) -> list[int]:
-        """Indices of the joints, the active ones first and in their order."""
-        active = [self.model.getJointId(name) for name in self.machine.active]
-        return active + [i for i in self.joints if i not in active]
-
-    def axis(self, joint: int) -> Array:
-        """(3,) direction of a joint in its frame."""
-        column = np.ravel(self.model.joints[joint].createData().S)
-        return column[3:] if self.turns(joint) else column[:3]
-
-    def turns(self, joint: int) -> bool:
-        """Whether a joint turns, and does not slide."""
-        return self.machine.unit(self.model.names[joint]) == "rad"
-
-    def limits(self, joint: int) -> tuple[float, float] | None:
-        """Lower and upper limit of a joint, None where it has none."""
-        column = self.model.joints[joint].idx_q
-        lower = float(self.model.lowerPositionLimit[column])
-        upper = float(self.model.upperPositionLimit[column])
-        return (lower, upper) if math.isfinite(lower) and math.isfinite(upper) else None
-
-    def massless(self, joint: int) -> bool:
-        """Whether a joint moves nothing but the next joint of a series."""
-        return bool(self.model.inertias[joint].mass == 0)
-
-    def write_link(self, robot: etree._Element, joint: int) -> None:
-        """The link that a joint moves, with the mass of all that is fixed to it."""
-        if joint == 0:
-            add_link(robot, self.links[0])
-            return
-        add_link(robot, self.links[joint], self.model.inertias[joint])
-        if self.massless(joint):
-            robot[-1].set("between", self.model.names[joint])
-
-    def write_joint(
-        self, robot: etree._Element, joint: int, parent: str, place: pin.SE3
-    ) -> etree._Element:
-        """A moving joint with its limits, placed on a link."""
-        limits, turns = self.limits(joint), self.turns(joint)
-        kind = "prismatic" if not turns else "continuous" if limits is None else "revolute"
-        element = add_joint(
-            robot, self.model.names[joint], kind, place, (parent, self.links[joint]),
-            self.axis(joint),
-        )  # fmt: skip
-        given: dict[str, str] = {}
-        if limits is not None or not turns:
-            lower, upper = limits or (-ENDLESS, ENDLESS)
-            given = {"lower": text([lower]), "upper": text([upper])}
-        column = self.model.joints[joint].idx_v
-        for key, values in (
-            ("effort", self.model.effortLimit), ("velocity", self.model.velocityLimit),
-        ):  # fmt: skip
-            if math.isfinite(values[column]):
-                given[key] = text([values[column]])
-        if given:
-            endless = {"effort": text([ENDLESS]), "velocity": text([ENDLESS])}
-            etree.SubElement(element, "limit", endless | given)
+    limits = joint.limits
+    given = ends(limits)
+    endless = given is None and joint.kind == "revolute"
+    kind = "continuous" if endless else joint.kind
+    element = etree.SubElement(robot, "joint", name=joint.name, type=kind)
+    add_origin(element, joint)
+    etree.SubElement(element, "parent", link=joint.parent)
+    etree.SubElement(element, "child", link=joint.child)
+    if not joint.moves:
         return element
+    etree.SubElement(element, "axis", xyz=text(joint.axis))
+    values = {key: min(getattr(limits, key), NO_LIMIT) for key in ("effort", "velocity")}
+    if not endless:
+        lower, upper = given or (-NO_LIMIT, NO_LIMIT)
+        values = {"lower": lower, "upper": upper} | values
+    elif math.isinf(limits.effort) and math.isinf(limits.velocity):
+        return element
+    etree.SubElement(element, "limit", {key: text([value]) for key, value in values.items()})
+    return element
 
-    def draw(self, robot: etree._Element, chains: Iterable[str] | None = None) -> None:
-        """Copy what the machine's URDFs draw to the links of the same names."""
-        links = {link.get("name"): link for link in robot.iterfind("link")}
-        materials: dict[str, etree._Element] = {}
-        for chain in self.machine.chains:
-            if chain.urdf.suffix.lower() != ".urdf" or (chains and chain.name not in chains):
-                continue
-            source = etree.parse(
-                str(chain.urdf),
-                etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True),
-            ).getroot()
-            for material in source.iterfind("material"):
-                materials.setdefault(material.get("name", ""), copy.deepcopy(material))
-            for link in source.iterfind("link"):
-                target = links.get(link.get("name", "").strip())
-                for drawn in (*link.iterfind("visual"), *link.iterfind("collision")):
-                    if target is not None:
-                        target.append(_located(drawn, chain.urdf.parent))
-        for material in reversed(materials.values()):
-            robot.insert(0, material)
+
+def draw(robot: etree._Element, machine: Machine, chains: Iterable[str] | None = None) -> None:
+    """Copy what a machine's URDFs draw to the links of the same names."""
+    links = {link.get("name"): link for link in robot.iterfind("link")}
+    materials: dict[str, etree._Element] = {}
+    for chain in machine.chains:
+        if chain.urdf.suffix.lower() != ".urdf" or (chains and chain.name not in chains):
+            continue
+        source = etree.parse(
+            str(chain.urdf),
+            etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True),
+        ).getroot()
+        for material in source.iterfind("material"):
+            materials.setdefault(material.get("name", ""), copy.deepcopy(material))
+        for link in source.iterfind("link"):
+            target = links.get(link.get("name", "").strip())
+            for drawn in (*link.iterfind("visual"), *link.iterfind("collision")):
+                if target is not None:
+                    target.append(_located(drawn, chain.urdf.parent))
+    for material in reversed(materials.values()):
+        robot.insert(0, material)
 
 
 def _located(drawn: etree._Element, folder: Path) -> etree._Element:

@@ -5,16 +5,20 @@ from pathlib import Path
 from lxml import etree
 
 from crane.description import Coupling, LoopSpec
-from crane.description.clean import add_joint, add_link, add_origin, text
+from crane.description.tree import Tree
 from crane.errors import InputError
 from crane.formats.parts import (
-    Parts,
+    add_joint,
+    add_link,
+    add_origin,
+    draw,
     finished,
     left_out,
     linear,
     only_in_machine_files,
     origin_of,
     plain_friction,
+    text,
 )
 from crane.machine import Machine
 from crane.output import replacing
@@ -35,7 +39,7 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
         InputError: A coupling binds several joints in a way that no `<coupling>` says.
         OutputError: It cannot be written.
     """
-    parts = Parts(machine)
+    tree = machine.tree
     robot = etree.Element("robot", name=machine.name)
     made = {  # which reading a loop makes again
         f"{loop.name}_{end}": frame
@@ -43,27 +47,26 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
         for end, frame in (("predecessor", loop.predecessor), ("successor", loop.successor))
         if frame == f"{loop.name}_{end}"
     }
-    for joint in (0, *parts.joints):
-        parts.write_link(robot, joint)
-    for frame in parts.frames:
-        if frame.name in made:
-            continue
-        add_link(robot, frame.name)
-        add_joint(robot, frame.fixed, "fixed", frame.place, (parts.links[frame.joint], frame.name))
-    for joint in parts.ordered():
-        _write_joint(parts, robot, joint)
+    for link in tree.links.values():
+        if link.name not in made:
+            add_link(robot, link)
+    for joint in tree.joints.values():
+        if not joint.moves and joint.child not in made:
+            add_joint(robot, joint)
+    passive = [joint for joint in machine.joints if joint not in machine.active]
+    for name in (*machine.active, *passive):
+        _add_moving(machine, robot, name)
     for loop in machine.closure.equations.loops:
-        _write_loop(parts, robot, loop)
+        _add_loop(tree, robot, loop)
     for coupling in machine.closure.equations.couplings:
-        _write_coupling(parts, robot, coupling)
+        _add_coupling(machine, robot, coupling)
     state = etree.SubElement(robot, "group_state", name="home", group="all")
-    for joint in parts.joints:
-        value = text([machine.home[machine.model.joints[joint].idx_q]])
-        etree.SubElement(state, "joint", name=machine.model.names[joint], value=value)
+    for name, value in zip(machine.joints, machine.home, strict=True):
+        etree.SubElement(state, "joint", name=name, value=text([value]))
     if machine.tip is not None:
         tip = {"name": "tip", "parent_link": machine.tip, "group": "all"}
         etree.SubElement(robot, "end_effector", tip)
-    parts.draw(robot)
+    draw(robot, machine)
     lost = plain_friction(machine) + only_in_machine_files(machine)
     lost += ["springs and forces"] if machine.forces else []
     with replacing(path) as part:
@@ -71,10 +74,8 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
     left_out(machine, "URDF+", lost)
 
 
-def _write_joint(parts: Parts, robot: etree._Element, joint: int) -> None:
-    machine, name = parts.machine, parts.model.names[joint]
-    parent = parts.links[parts.model.parents[joint]]
-    element = parts.write_joint(robot, joint, parent, parts.model.jointPlacements[joint])
+def _add_moving(machine: Machine, robot: etree._Element, name: str) -> None:
+    element = add_joint(robot, machine.tree.joints[name])
     element.set("independent", str(name in machine.active).lower())
     law = machine.friction.get(name)
     if law is not None and (law.viscous or law.coulomb):
@@ -82,24 +83,22 @@ def _write_joint(parts: Parts, robot: etree._Element, joint: int) -> None:
         etree.SubElement(element, "dynamics", values)
 
 
-def _write_loop(parts: Parts, robot: etree._Element, loop: LoopSpec) -> None:
+def _add_loop(tree: Tree, robot: etree._Element, loop: LoopSpec) -> None:
     element = etree.SubElement(robot, "loop", name=loop.name, type=loop.type)
-    frames = {frame.name: frame for frame in parts.frames}
+    above = {joint.child: joint for joint in tree.joints.values()}
     for end, name in (("predecessor", loop.predecessor), ("successor", loop.successor)):
         if name != f"{loop.name}_{end}":
             etree.SubElement(element, end, link=name)
             continue
-        frame = frames[name]
-        side = etree.SubElement(element, end, link=parts.links[frame.joint])
-        add_origin(side, frame.place)
+        add_origin(etree.SubElement(element, end, link=above[name].parent), above[name])
     etree.SubElement(element, "axis", xyz=text(loop.axis))
 
 
-def _write_coupling(parts: Parts, robot: etree._Element, coupling: Coupling) -> None:
+def _add_coupling(machine: Machine, robot: etree._Element, coupling: Coupling) -> None:
     """A <coupling> where one says the same, else a <mimic>."""
     joints, slopes, offset = linear(coupling)
     mimics = len(joints) <= 2 and coupling.name == f"{joints[0]}_mimic"
-    ends = None if mimics or offset else _rolling(parts, joints, slopes)
+    ends = None if mimics or offset else _rolling(machine, joints, slopes)
     if ends is not None:
         element = etree.SubElement(robot, "coupling", name=coupling.name, type="rolling")
         etree.SubElement(element, "predecessor", link=ends[0])
@@ -111,7 +110,7 @@ def _write_coupling(parts: Parts, robot: etree._Element, coupling: Coupling) -> 
             f"coupling '{coupling.name}' of {len(joints)} joints has no place in URDF+, write a "
             "machine file"
         )
-    others = [name for name in parts.machine.joints if name != joints[0]]
+    others = [name for name in machine.joints if name != joints[0]]
     other = joints[1] if slopes else others[0]  # that of a joint which is held counts for nothing
     (follower,) = (j for j in robot.iterfind("joint") if j.get("name") == joints[0])
     multiplier = text([slopes[0] if slopes else 0.0])
@@ -125,13 +124,13 @@ def _write_coupling(parts: Parts, robot: etree._Element, coupling: Coupling) -> 
 
 
 def _rolling(
-    parts: Parts, joints: list[str], slopes: list[float]
+    machine: Machine, joints: list[str], slopes: list[float]
 ) -> tuple[str, str, float] | None:
     """Predecessor, successor and ratio with ratio sum_P q = sum_S q, if there are such links.
 
     Joints of one way have one factor: those of the successor's that of the first joint.
     """
-    model = parts.model
+    model = machine.model
     after = [joints[0]] + [x for x, slope in zip(joints[1:], slopes, strict=True) if slope == -1]
     before = [x for x in joints if x not in after]
     ratios = {slope for x, slope in zip(joints[1:], slopes, strict=True) if x in before}
@@ -144,5 +143,10 @@ def _rolling(
     tops = [model.parents[way[0]] for way in ways if way]
     if len(set(tops)) > 1:
         return None
-    links = [parts.links[way[-1]] if way else parts.links[tops[0]] for way in ways]
+    links = [_moved(machine, way[-1] if way else tops[0]) for way in ways]
     return links[0], links[1], ratios.pop() if ratios else 1.0
+
+
+def _moved(machine: Machine, joint: int) -> str:
+    """The link that a joint of the model moves, the root link for the world."""
+    return machine.tree.joints[machine.model.names[joint]].child if joint else machine.tree.root

@@ -137,15 +137,12 @@ def _files(spec: MachineSpec) -> tuple[Chain, ...]:
 
 def _carried(spec: MachineSpec) -> set[str]:
     """Links that are fixed to one that a joint moves."""
-    above = {
-        joint.find("child").get("link"): (joint.find("parent").get("link"), joint.get("type"))
-        for joint in spec.tree.iterfind("joint")
-    }
+    above = {joint.child: joint for joint in spec.tree.joints.values()}
     found = set()
     for link in above:
         at = link
-        while at in above and above[at][1] == "fixed":
-            at = above[at][0]
+        while at in above and not above[at].moves:
+            at = above[at].parent
         if at != link and at in above:
             found.add(link)
     return found

@@ -1,22 +1,26 @@
 """The spanning tree and its closure, from a description."""
 
-import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
-from lxml import etree
 
 from crane.closure import Closure, frame_id
 from crane.description import LoopSpec, MachineSpec, inertia_problem
 from crane.description.findings import kept, note
+from crane.description.rigid import inertia, se3
+from crane.description.tree import Joint, Link
 from crane.errors import DescriptionError, MechanismError, at
 from crane.machine.axes import wrong_axis
 from crane.samples import Array
 
-_NO_LIMIT = 1e9  # stands for infinity in the text handed to Pinocchio
-_DEEPEST = 2000  # links in a row; Pinocchio's reader needs stack for each and ends the process
 _MOST = 1000  # joints that move; closing takes the cube of it
+_SAME = 1e-12  # difference of two directions that is none, as Pinocchio has it
+_ALIGNED = (
+    (pin.JointModelRX, pin.JointModelPX),
+    (pin.JointModelRY, pin.JointModelPY),
+    (pin.JointModelRZ, pin.JointModelPZ),
+)
 
 
 def active_joints(spec: MachineSpec, model: pin.Model) -> tuple[str, ...]:
@@ -40,8 +44,8 @@ def home_guess(spec: MachineSpec, model: pin.Model) -> Array:
         column = model.joints[model.getJointId(joint)].idx_q
         if joint in active and not lower[column] <= value <= upper[column]:
             problem = (
-                f"home of '{joint}' is {value:g}, outside of its limits {lower[column]:g} to "
-                f"{upper[column]:g}, choose one within them"
+                f"home of '{joint}' is {value:g}, outside of its limits "
+                f"{spec.tree.joints[joint].limits}, choose one within them"
             )
             note(DescriptionError(f"{spec.where[f'home {joint}']}: {problem}"))
         guess[column] = value
@@ -88,83 +92,101 @@ def _closure(
 
 
 def assemble(spec: MachineSpec) -> pin.Model:
-    """Pinocchio's model of the merged chains.
+    """Pinocchio's model of the tree.
 
-    One text for all chains, because Pinocchio then adds the joints depth-first: joints appended
-    chain by chain make its crba wrong without a word.
+    Joints are added depth-first, because joints appended chain by chain make Pinocchio's crba
+    wrong without a word; those on one link in the order of their names, as Pinocchio's reader of
+    URDF adds them.
 
     Raises:
         DescriptionError: The tree is too large, or a body has no mass or an impossible inertia.
     """
-    robot = copy.deepcopy(spec.tree)
-    _check_size(spec, robot)
-    for joint in robot.iter("joint"):
-        if joint.get("type") == "continuous":
-            joint.set("type", "revolute")  # Pinocchio's continuous joint has two coordinates
-        if joint.get("type") != "fixed":
-            limit = joint.find("limit")
-            if limit is None:
-                limit = etree.SubElement(joint, "limit")
-            for key, sign in (("lower", "-"), ("upper", ""), ("effort", ""), ("velocity", "")):
-                limit.set(key, limit.get(key, f"{sign}{_NO_LIMIT}"))
-    try:
-        model = pin.buildModelFromXML(etree.tostring(robot).decode())
-    except (ValueError, RuntimeError) as error:
-        reason = str(error).strip().splitlines()[0]
-        raise DescriptionError(f"{spec.path.name}: cannot be assembled ({reason})") from None
-    for limits in (
-        model.lowerPositionLimit, model.upperPositionLimit, model.effortLimit, model.velocityLimit,
-    ):  # fmt: skip
-        endless = np.abs(limits) >= _NO_LIMIT
-        limits[endless] = np.copysign(np.inf, limits[endless])
-    model.name = spec.name
-    _check_bodies(spec, model, robot)
-    return model
-
-
-def _check_size(spec: MachineSpec, robot: etree._Element) -> None:
-    below: dict[str, list[str]] = {}
-    children = set()
-    moving = 0
-    for joint in robot.iter("joint"):
-        parent, child = (joint.find(end).get("link") for end in ("parent", "child"))
-        below.setdefault(parent, []).append(child)
-        children.add(child)
-        moving += joint.get("type") != "fixed"
-    if moving > _MOST:
+    tree, below = spec.tree, spec.tree.below()
+    if (moving := len(tree.moving)) > _MOST:
         raise DescriptionError(
             f"{spec.path.name}: {moving} joints move, lock or leave out all but {_MOST}"
         )
-    row, depth = [link for link in below if link not in children], 1
-    while row := [child for link in row for child in below.get(link, ())]:
-        depth += 1
-        if depth > _DEEPEST:
-            where = spec.where.get(f"link {row[0]}", spec.path.name)
-            raise DescriptionError(
-                f"{where}: link '{row[0]}' is the {depth}th in a row, join links to have at most "
-                f"{_DEEPEST}"
-            )
+    model = pin.Model()
+    model.name = spec.name
+    root = tree.root
+    frame = pin.Frame(
+        root, 0, 0, pin.SE3.Identity(), pin.FrameType.BODY, inertia(tree.links[root].inertial)
+    )
+    frames = {root: model.addFrame(frame)}
+    waiting = _last_first(below, root)
+    while waiting:
+        joint = waiting.pop()
+        mass = inertia(tree.links[joint.child].inertial)
+        try:
+            frames[joint.child] = _add(model, frames[joint.parent], joint, mass)
+        except (ValueError, RuntimeError) as error:  # it has its own words for names
+            reason = str(error).strip().splitlines()[0]
+            raise DescriptionError(f"{joint.where}: cannot be assembled ({reason})") from None
+        waiting += _last_first(below, joint.child)
+    _check_bodies(spec, model)
+    return model
 
 
-def _check_bodies(spec: MachineSpec, model: pin.Model, robot: etree._Element) -> None:
-    links = list(robot.iter("link"))
-    between = {link.get("name") for link in links if link.get("between")}
-    refused = {link.get("name") for link in links if link.get("refused")}
-    doubtful = {model.frames[frame_id(model, link)].parentJoint for link in refused}
-    moved = {joint.get("name"): joint.find("child").get("link") for joint in robot.iter("joint")}
+def _last_first(below: Mapping[str, list[Joint]], link: str) -> list[Joint]:
+    return sorted(below.get(link, ()), key=lambda joint: joint.name, reverse=True)
+
+
+def _add(model: pin.Model, parent: int, joint: Joint, mass: pin.Inertia) -> int:
+    """Add a joint and the link that it moves; the frame of the link.
+
+    Args:
+        model: Where to.
+        parent: Frame of the link that the joint stands on.
+        joint: The joint.
+        mass: Inertia of the link that it moves.
+    """
+    above = model.frames[parent]
+    moved_by, place = above.parentJoint, above.placement * se3(joint.xyz, joint.rpy)
+    if not joint.moves:
+        fixed = pin.FrameType.FIXED_JOINT
+        frame = model.addFrame(pin.Frame(joint.name, moved_by, parent, place, fixed, mass))
+        return int(model.addBodyFrame(joint.child, moved_by, place, frame))
+    limits = (
+        np.array([getattr(joint.limits, key)]) for key in ("effort", "velocity", "lower", "upper")
+    )
+    index = model.addJoint(moved_by, _kind(joint), place, joint.name, *limits)
+    frame = model.addJointFrame(index, parent)
+    model.appendBodyToJoint(index, mass, pin.SE3.Identity())
+    return int(model.addBodyFrame(joint.child, index, pin.SE3.Identity(), frame))
+
+
+def _kind(joint: Joint) -> pin.JointModel:
+    """Pinocchio's joint, one for each direction of the frame's axes: they are faster."""
+    turns, axis = joint.kind == "revolute", np.array(joint.axis)
+    for direction, kinds in zip(np.eye(3), _ALIGNED, strict=True):
+        if np.linalg.norm(axis - direction) < _SAME:
+            return kinds[0]() if turns else kinds[1]()
+    kind = pin.JointModelRevoluteUnaligned if turns else pin.JointModelPrismaticUnaligned
+    return kind(axis)
+
+
+def _check_bodies(spec: MachineSpec, model: pin.Model) -> None:
+    links = spec.tree.links
+    doubtful = {
+        model.frames[frame_id(model, link.name)].parentJoint
+        for link in links.values()
+        if link.refused
+    }
     for index in range(1, model.njoints):
-        name = model.names[index]
-        link = moved[name]
-        if link not in between and index not in doubtful:
+        joint = spec.tree.joints[model.names[index]]
+        link = links[joint.child]
+        if link.between is None and index not in doubtful:
             with kept(harmless=True):
-                _check_body(spec.where[f"link {link}"], name, link, model.inertias[index])
+                _check_body(link, joint.name, model.inertias[index])
 
 
-def _check_body(where: str, joint: str, link: str, inertia: pin.Inertia) -> None:
+def _check_body(link: Link, joint: str, inertia: pin.Inertia) -> None:
     if not inertia.mass > 0:
         raise DescriptionError(
-            f"{where}: joint '{joint}' moves link '{link}', which has no mass, give it an "
-            "<inertial>"
+            f"{link.where}: joint '{joint}' moves link '{link.name}', which has no mass, give it "
+            "an <inertial>"
         )
     if problem := inertia_problem(inertia.mass, inertia.inertia):
-        raise DescriptionError(f"{where}: link '{link}' with what is fixed to it has {problem}")
+        raise DescriptionError(
+            f"{link.where}: link '{link.name}' with what is fixed to it has {problem}"
+        )

@@ -1,6 +1,5 @@
 """An axis that keeps a linkage from moving in its plane, which shows as other errors."""
 
-import copy
 import dataclasses
 from collections.abc import Callable, Sequence
 
@@ -111,11 +110,8 @@ def _turned(axis: Array, normal: Array, turns: bool) -> tuple[float, float, floa
 
 
 def _with_axis(spec: MachineSpec, name: str, axis: tuple[float, float, float]) -> MachineSpec:
-    tree = copy.deepcopy(spec.tree)
-    for joint in tree.iterfind("joint"):
-        if joint.get("name") == name:
-            joint.find("axis").set("xyz", " ".join(map(repr, axis)))
-    return dataclasses.replace(spec, tree=tree)
+    joint = dataclasses.replace(spec.tree.joints[name], axis=axis)
+    return dataclasses.replace(spec, tree=spec.tree.replacing(joint))
 
 
 def _error(
@@ -131,7 +127,7 @@ def _error(
     angle = np.degrees(np.arccos(min(1.0, share)) if turns else np.arcsin(min(1.0, share)))
     is_loop = label.startswith("loop ")
     what = f"loop '{label.removeprefix('loop ')}'" if is_loop else f"joint '{label}'"
-    place = spec.where.get(label if is_loop else f"joint {label}", spec.path.name)
+    place = spec.where[label] if is_loop else spec.tree.joints[label].where
     numbers = [f"{value:.6g}" for value in turned]
     in_xml = not is_loop or spec.path.suffix.lower() != ".yaml"
     right = f'<axis xyz="{" ".join(numbers)}"/>' if in_xml else f"axis: [{', '.join(numbers)}]"

@@ -50,6 +50,7 @@ def load(
         source=spec.source,
         path=spec.path,
         chains=spec.chains,
+        tree=spec.tree,
         model=model,
         closure=closure,
         active=closure.active_names,

@@ -25,10 +25,11 @@ from crane.description import (
     examples,
     inertia_problem,
 )
+from crane.description.rigid import loaded
+from crane.description.tree import Tree
 from crane.errors import InputError, LimitError, known
 from crane.samples import Array, as_number, as_sample, as_samples
 
-_NO_LIMIT = 1e9  # stands for infinity in the text handed to Pinocchio
 _LIMIT_SLACK = 1e-9  # [m], [rad] beyond a limit that counts as on it
 
 
@@ -59,6 +60,7 @@ class Machine:
         source: Where its numbers come from.
         path: The machine file or URDF it was read from.
         chains: Its open sub-chains.
+        tree: Its links and joints, all sub-chains hung onto each other.
         model: Pinocchio's model of the spanning tree, depth-first, nq = nv.
         closure: Its loops.
         active: Names of the active joints, in the order of q_A.
@@ -81,6 +83,7 @@ class Machine:
     source: str
     path: Path
     chains: tuple[Chain, ...]
+    tree: Tree
     model: pin.Model
     closure: Closure
     active: tuple[str, ...]
@@ -172,8 +175,7 @@ class Machine:
     def unit(self, joint: str) -> str:
         """Unit of a joint's coordinate, "m" or "rad"."""
         self.column(joint)
-        kind = self.model.joints[self.model.getJointId(joint)].shortname()
-        return "m" if kind.startswith("JointModelP") else "rad"
+        return "m" if self.tree.joints[joint].kind == "prismatic" else "rad"
 
     def frame(self, link: str) -> int:
         """Pinocchio's index of a link's frame.
@@ -199,10 +201,12 @@ class Machine:
             index = tuple(int(i) for i in np.argwhere(outside)[0])
             joint = index[-1]
             sample = f" in sample {index[0]}" if q_a.ndim == 2 else ""
+            name = self.active[joint]
+            place = self.tree.joints[name].limits.where
             raise LimitError(
-                f"{what}: {self.active[joint]} = {q_a[index]:.6g}{sample} is outside of its "
-                f"limits {self.lower[joint]:.6g} to {self.upper[joint]:.6g} "
-                f"{self.unit(self.active[joint])}, choose one within them"
+                f"{what}: {name} = {q_a[index]:.6g}{sample} is outside of its limits "
+                f"{self.lower[joint]:.6g} to {self.upper[joint]:.6g} {self.unit(name)}"
+                f"{f' ({place})' if place else ''}, choose one within them"
             )
         return q_a
 
@@ -320,9 +324,11 @@ class Machine:
         problem = inertia_problem(mass, tensor)
         if problem and tensor.any():
             raise InputError(f"the payload has {problem}")
+        load = pin.Inertia(mass, com, tensor)
         model = pin.Model(self.model)
-        model.appendBodyToJoint(frame.parentJoint, pin.Inertia(mass, com, tensor), frame.placement)
-        return dataclasses.replace(self, model=model)
+        model.appendBodyToJoint(frame.parentJoint, load, frame.placement)
+        tree = loaded(self.tree, payload.frame, load)
+        return dataclasses.replace(self, model=model, tree=tree)
 
 
 def fixed(array: Array) -> Array:

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from lxml import etree
 
-from crane.description import Friction, parameters, read
+from crane.description import Friction, MachineSpec, parameters, read
 from crane.errors import InputError
 from crane.machine import Machine
 from crane.samples import as_number
@@ -62,10 +61,10 @@ def drawn(
     changes = dict(machine.changes)
 
     def move(name: str, by: float) -> None:
-        if nominal[name]:
+        if nominal.get(name):  # no number of a file: where a chain is attached
             changes[name] = nominal[name] + by * random.uniform(-1, 1)
 
-    for link in (link.get("name") for link in spec.tree.iterfind("link")):
+    for link in spec.tree.links:
         if f"{link}.mass" not in nominal:
             continue
         mass = 1 + tolerances.mass * random.uniform(-1, 1)
@@ -75,7 +74,7 @@ def drawn(
             changes[name] = mass * shape * nominal[name]
         for axis in "xyz":
             move(f"{link}.com.{axis}", tolerances.com)
-    for link, axis in _pins(machine, spec.tree):
+    for link, axis in _pins(machine, spec):
         move(f"{link}.{axis}", tolerances.pins)
     for joint in machine.joints:
         friction = _stuck(machine, joint, tolerances, random)
@@ -106,7 +105,7 @@ def _stuck(
     )
 
 
-def _pins(machine: Machine, tree: etree._Element) -> list[tuple[str, str]]:
+def _pins(machine: Machine, spec: MachineSpec) -> list[tuple[str, str]]:
     """Links and axes along which their joints' places on the parents may be off.
 
     Loops of a plane close only if the pins stay in it; a machine of other loops, or of loops in
@@ -121,11 +120,9 @@ def _pins(machine: Machine, tree: etree._Element) -> list[tuple[str, str]]:
     ):
         return []
     out = []
-    for joint in tree.iterfind("joint"):
-        if joint.find("origin") is None:
-            continue
-        parent, link = joint.find("parent").get("link"), joint.find("child").get("link")
-        turn = data.oMf[machine.frame(parent)].rotation
+    for joint in spec.tree.joints.values():
+        turn = data.oMf[machine.frame(joint.parent)].rotation
         across = turn.T @ normals[0] if normals else np.zeros(3)
-        out += [(link, axis) for axis, part in zip("xyz", across, strict=True) if abs(part) < 1e-9]
+        along = [axis for axis, part in zip("xyz", across, strict=True) if abs(part) < 1e-9]
+        out += [(joint.child, axis) for axis in along]
     return out

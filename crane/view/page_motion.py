@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pinocchio as pin
 
-from crane.description.urdf import read_urdf
 from crane.errors import InputError, RecordingError, known
 from crane.machine import Machine
 from crane.samples import Array
@@ -72,15 +71,15 @@ def payload_place(machine: Machine) -> dict[str, Any] | None:
         there = any(f.name == "payload" and f.type == pin.FrameType.BODY for f in model.frames)
         return place(machine, "payload") if there else None
     total, moment, joint = 0.0, np.zeros(3), 0
-    for link in read_urdf(loads[0].urdf).robot.iter("link"):
-        frame = model.frames[machine.frame(link.get("name"))]
+    below, waiting = machine.tree.below(), [machine.tree.joints[loads[0].attachment].child]
+    while waiting:
+        link = waiting.pop()
+        waiting += [joint.child for joint in below.get(link, ())]
+        frame = model.frames[machine.frame(link)]
         joint = frame.parentJoint
-        if (inertial := link.find("inertial")) is not None:
-            mass = float(inertial.find("mass").get("value"))
-            origin = inertial.find("origin")
-            text = "0 0 0" if origin is None else origin.get("xyz", "0 0 0")
-            total += mass
-            moment += mass * frame.placement.act(np.array(text.split(), dtype=float))
+        if (inertial := machine.tree.links[link].inertial) is not None:
+            total += inertial.mass
+            moment += inertial.mass * frame.placement.act(np.array(inertial.com))
     if not total:
         return None
     return {"joint": joint - 1, "placement": matrix(pin.SE3(np.eye(3), moment / total))}
