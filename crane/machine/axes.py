@@ -127,7 +127,7 @@ def _error(
     angle = np.degrees(np.arccos(min(1.0, share)) if turns else np.arcsin(min(1.0, share)))
     is_loop = label.startswith("loop ")
     what = f"loop '{label.removeprefix('loop ')}'" if is_loop else f"joint '{label}'"
-    place = spec.where[label] if is_loop else spec.tree.joints[label].where
+    place = spec.where.get(label, spec.path.name) if is_loop else spec.tree.joints[label].where
     numbers = [f"{value:.6g}" for value in turned]
     in_xml = not is_loop or spec.path.suffix.lower() != ".yaml"
     right = f'<axis xyz="{" ".join(numbers)}"/>' if in_xml else f"axis: [{', '.join(numbers)}]"
