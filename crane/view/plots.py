@@ -20,6 +20,7 @@ from crane.output import replacing
 from crane.recording import FORCE_UNITS, Recording
 from crane.samples import Array
 from crane.summary import READING_UNITS, points
+from crane.view.thinning import envelope, thinned
 
 FORMATS: dict[str, dict[str, None] | None] = {  # with the date left out of what is written
     "png": None,
@@ -181,9 +182,11 @@ def _tip_error(tip: Array, reference: Array) -> _Panel:
 
 def _draw_panel(axes: Axes, time: Array, panel: _Panel) -> None:
     marker = "o" if len(time) == 1 else None
-    axes.plot(time, panel.values, color=RECORDED, marker=marker, label="recording")
+    curve = envelope(time, panel.values)
+    axes.plot(*curve, color=RECORDED, marker=marker, label="recording")
     if panel.reference is not None:
-        axes.plot(time, panel.reference, marker=marker, label="reference", **DASHED)
+        curve = envelope(time, panel.reference)
+        axes.plot(*curve, marker=marker, label="reference", **DASHED)
     axes.set_ylabel(f"{panel.quantity} [{panel.unit}]")
     axes.margins(x=0.0, y=0.08)
     low, high = axes.get_ylim()
@@ -195,6 +198,7 @@ def _draw_panel(axes: Axes, time: Array, panel: _Panel) -> None:
 
 def _draw_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
     """The path of the tip [m] in space, to scale, with its shadow on the ground of the box."""
+    tip, reference = thinned(tip), None if reference is None else thinned(reference)
     shown = tip if reference is None else np.vstack([tip, reference])
     low, high = shown.min(axis=0), shown.max(axis=0)
     span = np.maximum(high - low, 0.4 * max(float((high - low).max()), 1e-2)) * 1.1
