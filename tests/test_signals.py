@@ -89,7 +89,7 @@ def fixed(monkeypatch):
 @pytest.mark.parametrize("count", [60, 100])
 def test_smoother_is_the_solution_of_all_equations_at_once(fixed, h, count):
     y = np.random.default_rng(1).standard_normal(count).cumsum()
-    states, stds, sigma = fixed(y, 0.01, h)
+    states, stds, sigma, _ = fixed(y, 0.01, h)
     exact, variances = whole(y, h)
     units = (h / 0.01) ** np.arange(3)
     np.testing.assert_allclose(states, exact[:, :3] * units, atol=1e-7 * units.max(), rtol=1e-7)
@@ -99,7 +99,7 @@ def test_smoother_is_the_solution_of_all_equations_at_once(fixed, h, count):
 def test_smoother_agrees_with_the_textbook_recursion(fixed):
     """Within what its wide prior costs in rounding and bias."""
     h, y = 0.5, np.random.default_rng(2).standard_normal(1500).cumsum()
-    states, stds, sigma = fixed(y, 0.01, h)
+    states, stds, sigma, _ = fixed(y, 0.01, h)
     exact, P = rts(y, h)
     units = (h / 0.01) ** np.arange(3)
     np.testing.assert_allclose(states / units, exact[:, :3], atol=1e-4)
@@ -173,7 +173,21 @@ def test_without_noise_and_without_motion():
     found = differentiate(time, np.column_stack([q, np.full(4000, 0.3)]))
     np.testing.assert_allclose(found.v[:, :2], v, atol=1e-8)
     np.testing.assert_allclose(found.a[50:-50, :2], a[50:-50], atol=1e-4)
-    assert not found.v[:, 2].any()
+    assert not found.v[:, 2].any() and found.passed[2] == math.inf
+
+
+def test_the_frequency_of_which_a_smoother_leaves_half():
+    """Found from noise, checked with a movement of that frequency through the same smoother."""
+    step, rng = 1e-3, np.random.default_rng(6)
+    time = step * np.arange(20_000)
+    found = differentiate(time, movement(time)[0] + 1e-4 * rng.standard_normal((20_000, 2)))
+    for passed in found.passed:
+        F, _, K = smoother._stationary(2 * np.pi * passed * step)
+        z = np.exp(2j * np.pi * passed * step)
+        gain = np.linalg.solve(z * np.eye(4) - F @ (np.eye(4) - np.outer(K, np.eye(4)[0])), F @ K)
+        innovation = 1 - gain[0]  # of the predictions; |1 - innovation spectrum| is what is left
+        left = 1 - abs(innovation) ** 2 * (1 - K[0])
+        assert left == pytest.approx(0.5, abs=0.01)
 
 
 def test_low_pass_halves_at_the_cutoff_without_delay():
@@ -246,6 +260,28 @@ def test_thinning_lets_nothing_fold_back():
     high = np.sin(2 * np.pi * 75.1 * time)[:, None]  # seen as 24.9 Hz at 100 Hz
     _, y = signals.filter_rows(high[:, None], high, 1e-3, 25.0, 10)
     assert np.abs(y[100:-100]).max() < 1.6e-4
+
+
+@pytest.mark.parametrize(("cutoff", "decimation"), [(5.0, 50), (5.0, 7), (60.0, 4)])
+def test_a_filtered_row_sees_its_neighbourhood_and_nothing_else(cutoff, decimation):
+    """Gain 1/2 at the cutoff, 3e-5 from three times that on, and an end to every answer."""
+    weights = signals.filter_kernel(1e-3, cutoff)
+    reach = len(weights) // 2
+    assert reach < 0.667 / (cutoff * 1e-3) and weights.min() > 0
+    frequency = np.array([1.0, 3.0, 4.5]) * cutoff
+    turns = 2 * np.pi * 1e-3 * frequency[:, None] * np.arange(-reach, reach + 1)
+    gain = np.cos(turns) @ weights
+    assert abs(gain[0] - 0.5) < 2e-3 and np.abs(gain[1:]).max() < 5e-5
+    forces = np.zeros((3001, 2))
+    forces[1234, 0], forces[:, 1] = 1.0, 7.0
+    W, y = signals.filter_rows(forces[:, :, None], forces, 1e-3, cutoff, decimation)
+    assert len(y) == -(-3001 // decimation)
+    at = np.arange(0, 3001, decimation)
+    near = np.abs(at - 1234) <= reach
+    assert near.any() and (y[near, 0] > 0).all() and not y[~near, 0].any()
+    np.testing.assert_allclose(y[near, 0], weights[1234 - at[near] + reach], rtol=1e-12)
+    np.testing.assert_allclose(y[:, 1], 7.0, rtol=1e-12)  # at the ends too
+    np.testing.assert_array_equal(W[:, :, 0], y)
 
 
 def test_moving():

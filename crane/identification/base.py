@@ -13,6 +13,7 @@ from crane.machine import Machine
 from crane.samples import Array
 
 _RANK = 1e-8  # of a column's norm, what of it must be new
+_ALIKE = 1e12  # condition number of columns of length one that depend on each other
 _NOTHING = 1e-10  # of the largest norm, below which a column is zero
 _SPAN = 1.0  # [m], [rad] of joints without limits
 # Preferred as base parameters, first: what is told from one axis before what needs many.
@@ -53,7 +54,12 @@ class Base:
 
     def narrowed(self, rows: Array) -> "Base":
         """What of the base parameters a motion tells, rows (m, r) of their columns."""
-        told = group([self.names[i] for i in self.independent], rows)
+        names, tolerance = [self.names[i] for i in self.independent], _RANK
+        told = group(names, rows)
+        # many columns, each of them new by a little, may together hold nothing new
+        while _dependent(rows[:, told.independent]) and tolerance < 1e-2:
+            tolerance *= 10
+            told = group(names, rows, tolerance=tolerance)
         if told.rank == self.rank:
             return self
         independent = self.independent[told.independent]
@@ -139,9 +145,15 @@ def base_parameters(model: Model, samples: Samples | None = None, seed: int = 0)
 
 
 def group(
-    names: Sequence[str], rows: Array, preference: Callable[[int], Any] = lambda column: column
+    names: Sequence[str],
+    rows: Array,
+    preference: Callable[[int], Any] = lambda column: column,
+    tolerance: float = _RANK,
 ) -> Base:
-    """Base parameters of a regressor (m, p), columns of small preference first."""
+    """Base parameters of a regressor (m, p), columns of small preference first.
+
+    A column counts if what is new of it exceeds the tolerance of its norm.
+    """
     norms = np.linalg.norm(rows, axis=0)
     zero = norms <= _NOTHING * norms.max(initial=0.0)
     scaled = rows / np.where(zero, 1.0, norms)
@@ -152,7 +164,7 @@ def group(
         for _ in range(2):  # twice is enough (Kahan, Parlett)
             rest = rest - directions @ (directions.T @ rest)
         length = np.linalg.norm(rest)
-        if length > _RANK:
+        if length > tolerance:
             chosen.append(i)
             directions = np.column_stack([directions, rest / length])
     independent = np.array(sorted(chosen), dtype=np.intp)
@@ -163,6 +175,12 @@ def group(
     grouping[:, independent] = np.eye(len(independent))
     gone = tuple(name for name, nothing in zip(names, zero, strict=True) if nothing)
     return Base(tuple(names), independent, grouping, gone)
+
+
+def _dependent(columns: Array) -> bool:
+    if columns.shape[1] < 2:
+        return False
+    return float(np.linalg.cond(columns / np.linalg.norm(columns, axis=0))) > _ALIKE
 
 
 def _preference(model: Model, column: int) -> tuple[int, int, int]:

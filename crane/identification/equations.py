@@ -11,7 +11,7 @@ from crane.identification.base import Base
 from crane.identification.model import Model
 from crane.identification.regressor import add_rows, triangular
 from crane.identification.result import Comparison
-from crane.identification.signals import Motion, filter_reach, filter_rows, moving
+from crane.identification.signals import Motion, filter_kernel, filter_rows, moving
 from crane.samples import Array
 
 _FEWEST = 5.0  # periods of the filter's cutoff in a recording
@@ -25,9 +25,8 @@ class Equations:
     """tau_A + gamma^T f = W(q_A, v_A, a_A) beta of a motion, both sides through one low-pass.
 
     The regressor of a long recording is larger than memory. It is computed, filtered and thinned
-    block by block, each with as many samples before and after as the filter's answer to an
-    impulse takes to fall below rounding (`signals.filter_reach`), so that the blocks are those of
-    the whole to rounding.
+    block by block, each with as many samples before and after as the filter's kernel has,
+    so that the blocks are those of the whole.
 
     Args:
         model: The model.
@@ -70,15 +69,14 @@ class Equations:
         self._model, self._motion = model, motion
         self._progress = progress
         self._step = step
-        self._thinning, self._reach = 1, 0
+        self._thinning, seen = 1, 0
         if bandwidth * step < 0.25:
             self._thinning = max(1, int(0.25 / (step * bandwidth)))
-            periods = -(-filter_reach(step, bandwidth) // self._thinning)
-            self._reach = periods * self._thinning
-        # near standstill friction is none of its shapes, as far as the filter carries it
+            seen = len(filter_kernel(step, bandwidth)) // 2
+        self._reach = -(-seen // self._thinning) * self._thinning
+        # near standstill friction is none of its shapes, and in no row that the filter mixes it in
         stuck = ~moving(motion.v, slow)
-        window = 2 * round(0.5 / (step * bandwidth)) + 1
-        near = maximum_filter1d(stuck.view(np.uint8), window, axis=0, mode="constant")
+        near = maximum_filter1d(stuck.view(np.uint8), 2 * seen + 1, axis=0, mode="constant")
         self.moving = near[:: self._thinning] == 0
         self.time = motion.time[:: self._thinning]
         self.forces, self.offset = np.empty((2, *self.moving.shape))

@@ -1,5 +1,6 @@
 """From a recording to parameters."""
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,13 +17,18 @@ from crane.identification.estimators import Prior, conditions, huber, least_squa
 from crane.identification.model import Model, Term
 from crane.identification.possible import possible, prior_of_bodies
 from crane.identification.result import Identification
-from crane.identification.signals import Motion, differentiate, resample
+from crane.identification.signals import Derivatives, Motion, differentiate, resample
 from crane.machine import Machine
 from crane.recording import Recording
 from crane.samples import Array, as_number
 
 METHODS = {"ols": least_squares, "wls": weighted, "huber": huber}
 _SLOW = 0.02  # of a joint's largest velocity, below which its rows are left out
+_SETTLED = 4.0  # of the velocity over which friction's sign changes, tanh 4 = 0.9993
+_MOVING = 0.5  # of a joint's largest velocity, above which rows count always
+_MOVES = 3.0  # standard deviations of a joint's velocity, above which it moves
+_KNOWN = 0.75  # of the frequency where a smoother passes half: there it passes 91 %
+_TIMES = 3.0  # times the frequency below which 99 % of the velocities are, the filter's least
 _FAST = 40.0  # times the frequency below which 99 % of the accelerations are
 _PART = 0.3  # of what is left to do that one pass over a recording is taken for
 
@@ -70,7 +76,17 @@ def motion_of(
         time, columns = resample(time, np.column_stack([q, tau]), step)
         q, tau = np.split(columns, 2, axis=1)
     found = differentiate(time, q, derivatives, cutoff, progress)
-    return Motion(time, found.q, found.v, found.a, tau)
+    return Motion(time, found.q, found.v, found.a, tau, _passed(found))
+
+
+def _passed(found: Derivatives) -> float:
+    """Least of the frequencies [Hz] of which half is left, of the joints that move."""
+    if found.passed is None:
+        return math.inf
+    if found.std_v is None:
+        return float(found.passed.min())
+    moves = found.v.std(axis=0) > _MOVES * np.sqrt(np.mean(found.std_v**2, axis=0))
+    return float(found.passed[moves].min(initial=math.inf))
 
 
 def identify(
@@ -102,10 +118,12 @@ def identify(
         feasible: Whether the bodies have to be able to exist and friction must not be negative;
             all parameters come out.
         terms: Of the model; bodies and friction if not given, see `model.default_terms`.
-        bandwidth: [Hz] of the low-pass; far above the frequencies of the motion if not given.
-            Lower where the motion is measured badly, as by a coarse potentiometer.
-        slow: Velocities below which rows are left out, (n,) or by joint; a share of a joint's
-            largest if not given. A few times that over which friction at rest fades.
+        bandwidth: [Hz] of the low-pass; if not given, far above the frequencies of the motion,
+            but no higher than the motion is known where noise asked for smoothing, as of a coarse
+            potentiometer.
+        slow: Velocities below which rows are left out, (n,) or by joint: a few times that over
+            which friction at rest fades. If not given, 4 times the description's smoothing and
+            Stribeck velocity, or 2 % of a joint's largest.
         progress: Takes the finished share.
 
     Returns:
@@ -208,8 +226,17 @@ def in_parts(progress: Progress | None) -> Progress | None:
 
 
 def _slow(machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastest: Array) -> Array:
-    """Velocities (n,) below which rows are left out."""
+    """Velocities (n,) below which rows are left out.
+
+    If not given, a share of the largest, or where the described friction comes from rest to what
+    it is in motion, which it does in reality at velocities that nobody knows better.
+    """
     out = _SLOW * fastest
+    for i, joint in enumerate(machine.active):
+        law = machine.friction.get(joint)
+        if law is not None:
+            near = max(_SETTLED * law.smoothing, _SETTLED * law.stribeck * (law.stiction > 0))
+            out[i] = max(out[i], min(near, _MOVING * fastest[i]))
     if isinstance(slow, Mapping):
         for joint, value in slow.items():
             if joint not in machine.active:
@@ -220,19 +247,28 @@ def _slow(machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastes
 
 
 def _bandwidth(motion: Motion) -> float:
-    """Far above the frequency below which 99 % of the accelerations' power is [Hz].
+    """[Hz] of the low-pass, far above the frequencies of the motion where it is measured well.
 
-    What is modelled lies below it; above it is noise, which has to be seen to be known.
+    What is modelled lies below it; above it is noise, which has to be seen to be known. But what
+    smoothing takes from the accelerations is missing in the regressor and not in the forces, most
+    at reversals, where friction jumps: so no higher than smoothing lets through, unless that is
+    hardly above the motion.
     """
+    step = float(motion.time[1] - motion.time[0])
+    highest = max(_KNOWN * motion.passed, _TIMES * _fastest(motion.v, step))
+    return min(_FAST * _fastest(motion.a, step), highest, 0.24 / step)
+
+
+def _fastest(x: Array, step: float) -> float:
+    """Frequency [Hz] below which 99 % of the power of each of the signals (N, n) is."""
     from scipy.signal import periodogram
 
-    step = float(motion.time[1] - motion.time[0])
-    size = np.maximum(motion.a.std(axis=0), 1e-300)
-    frequency, power = periodogram(motion.a / size, 1 / step, axis=0, window="hann")
+    size = np.maximum(x.std(axis=0), 1e-300)
+    frequency, power = periodogram(x / size, 1 / step, axis=0, window="hann")
     share = np.cumsum(power, axis=0)
-    last = max(
+    last = [
         float(frequency[np.searchsorted(column, 0.99 * column[-1])])
-        for column, a in zip(share.T, motion.a.T, strict=True)
-        if np.ptp(a) > 0
-    )
-    return min(_FAST * max(last, frequency[1]), 0.24 / step)
+        for column, moved in zip(share.T, np.ptp(x, axis=0), strict=True)
+        if moved > 0
+    ]
+    return max([*last, float(frequency[1])])

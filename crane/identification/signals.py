@@ -14,6 +14,8 @@ from crane.samples import Array, as_number
 _FEWEST = 50  # samples
 _LONGEST_GAP = 5.0  # steps
 _JITTER = 0.01  # steps
+_WINDOW = np.array([0.35875, 0.48829, 0.14128, 0.01168])  # Blackman and Harris, about its middle
+_WINDOW_LENGTH = 1.3332  # over 1 / cutoff
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +28,8 @@ class Motion:
         v: Velocities (N, n) [rad/s or m/s].
         a: Accelerations (N, n) [rad/s2 or m/s2].
         tau: Generalized forces (N, n) [N m or N].
+        passed: Frequency [Hz] above which what the joints did is lost in smoothing, so that v
+            and a hold less than half of it; infinite where nothing was smoothed.
     """
 
     time: Array
@@ -33,6 +37,7 @@ class Motion:
     v: Array
     a: Array
     tau: Array
+    passed: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +51,7 @@ class Derivatives:
         std_v: Standard deviation of the velocities, None where the method knows none.
         std_a: Standard deviation of the accelerations, likewise.
         noise: Estimated standard deviation (n,) of the measured coordinates, likewise.
+        passed: Frequencies (n,) of which half is left [Hz]; infinite of a joint at rest.
     """
 
     q: Array
@@ -54,6 +60,7 @@ class Derivatives:
     std_v: Array | None = None
     std_a: Array | None = None
     noise: Array | None = None
+    passed: Array | None = None
 
 
 def differentiate(
@@ -86,16 +93,17 @@ def differentiate(
     if cutoff is not None:
         passed = low_pass(time, q, cutoff)
         v = central_differences(time, passed)
-        return Derivatives(passed, v, central_differences(time, v))
+        half = np.full(q.shape[1], float(cutoff))
+        return Derivatives(passed, v, central_differences(time, v), passed=half)
     position, v, a, std_v, std_a = (np.empty(q.shape) for _ in range(5))
-    noise = np.empty(q.shape[1])
+    noise, half = np.empty((2, q.shape[1]))
     for i, column in enumerate(q.T):
-        states, std, noise[i] = smooth(column, step)
+        states, std, noise[i], half[i] = smooth(column, step)
         position[:, i], v[:, i], a[:, i] = states.T
         std_v[:, i], std_a[:, i] = std.T[1:]
         if progress is not None:
             progress((i + 1) / q.shape[1])
-    return Derivatives(position, v, a, std_v, std_a, noise)
+    return Derivatives(position, v, a, std_v, std_a, noise, half)
 
 
 def sampling(time: Array) -> float:
@@ -165,15 +173,21 @@ def low_pass(time: Array, x: Array, cutoff: float, order: int = 4) -> Array:
     return np.asarray(sosfiltfilt(butter(order, cutoff, output="sos", fs=1 / step), x, axis=0))
 
 
-def filter_reach(step: float, cutoff: float, order: int = 4) -> int:
-    """Samples after which what `low_pass` answers to an impulse is below rounding, e^-40 = 4e-18.
+def filter_kernel(step: float, cutoff: float) -> Array:
+    """Weights (2 n + 1,) of a low-pass that sees nothing beyond n samples, for `filter_rows`.
 
-    It decays, both ways, like the largest of the filter's poles to the power of the samples.
+        w(t) = sum_k c_k cos(2 pi k t / T), |t| < T / 2,   T = 1.3332 / cutoff
+
+    The 4-term window of Blackman and Harris as an impulse response. Its gain is 1/2 at the cutoff
+    and below 3e-5 from three times the cutoff on; no weight is negative.
+
+    Source: Harris 1978, On the use of windows for harmonic analysis, Proc. IEEE 66(1).
     """
-    from scipy.signal import butter
-
-    slowest = float(np.abs(butter(order, cutoff, output="zpk", fs=1 / step)[1]).max())
-    return math.ceil(-40 / math.log(slowest))
+    length = _WINDOW_LENGTH / (cutoff * step)
+    n = math.ceil(0.5 * length) - 1
+    phase = 2 * math.pi * np.arange(-n, n + 1.0) / length
+    weights = np.cos(np.outer(phase, np.arange(4.0))) @ _WINDOW
+    return np.asarray(weights / weights.sum())
 
 
 def central_differences(time: Array, x: Array) -> Array:
@@ -218,9 +232,14 @@ def filter_rows(
 ) -> tuple[Array, Array]:
     """Both sides of forces = regressor parameters through one filter, then every n-th sample.
 
-    The filter is `low_pass`: linear, so the parameters stay what they are. The cutoff may be at
-    most a quarter of the new sampling frequency; what decimation folds to below the cutoff then
-    comes from above three times the cutoff, where less than 1.6e-4 of it is left.
+    The filter is `filter_kernel`: linear, so the parameters stay what they are, and of finite
+    length, so that rows which cannot be explained, as near standstill, spoil those within it and
+    no others. A recursive filter's ringing carries the jump of friction at a reversal, which no
+    smoothed velocity tells to the millisecond, into every row. At the ends the weights that
+    remain are scaled to a sum of one.
+
+    The cutoff may be at most a quarter of the new sampling frequency; what decimation folds to
+    below the cutoff then comes from above three times the cutoff.
 
     Args:
         regressor: (N, n, p).
@@ -244,12 +263,28 @@ def filter_rows(
         raise InputError(
             f"cutoff is {cutoff:g} Hz, give at most {highest:g} Hz for every {decimation}th sample"
         )
-    time = step * np.arange(float(len(forces)))
+    weights = filter_kernel(step, cutoff)
     thinned = np.stack(  # joint by joint, to hold no second whole regressor
-        [low_pass(time, regressor[:, i], cutoff)[::decimation] for i in range(forces.shape[1])],
-        axis=1,
+        [_weighted(regressor[:, i], weights, decimation) for i in range(forces.shape[1])], axis=1
     )
-    return thinned, low_pass(time, forces, cutoff)[::decimation]
+    return thinned, _weighted(forces, weights, decimation)
+
+
+def _weighted(x: Array, weights: Array, decimation: int) -> Array:
+    """Means of x (N, ...) about every n-th sample, with these weights."""
+    from scipy.signal import upfirdn
+
+    reach, count = len(weights) // 2, len(x)
+    lead = -reach % decimation  # so that the kept samples of the convolution begin at the first
+    kept = slice((reach + lead) // decimation, None)
+
+    def convolved(x: Array) -> Array:
+        edges = [(lead, reach), *[(0, 0)] * (x.ndim - 1)]
+        whole = upfirdn(weights, np.pad(x, edges), down=decimation, axis=0)
+        return np.asarray(whole[kept][: -(-count // decimation)])
+
+    there = convolved(np.ones(count))
+    return convolved(x) / there.reshape(-1, *[1] * (x.ndim - 1))
 
 
 def moving(v: Array, threshold: ArrayLike) -> np.ndarray:

@@ -10,7 +10,7 @@ _BOUNDS = (8.0, 10.0)  # of h N and h in the search for the smoother's noise rat
 _AT_ONCE = 1 << 16  # samples whose complex modes are held
 
 
-def smooth(y: Array, step: float) -> tuple[Array, Array, float]:
+def smooth(y: Array, step: float) -> tuple[Array, Array, float, float]:
     """Rauch-Tung-Striebel smoother of the constant-jerk model with an unknown initial state.
 
     The state x = (p, p', p'', p''') follows p'''' = white noise of intensity s, measured is
@@ -39,14 +39,15 @@ def smooth(y: Array, step: float) -> tuple[Array, Array, float]:
         step: dt [s].
 
     Returns:
-        Position, velocity and acceleration (N, 3), their standard deviations (N, 3), sigma.
+        Position, velocity and acceleration (N, 3), their standard deviations (N, 3), sigma, and
+        the frequency at which half passes [Hz].
 
     Source: Rauch, Tung, Striebel 1965; de Jong 1991 (unknown initial states).
     """
     from scipy.optimize import minimize_scalar
 
     if np.ptp(y) == 0:
-        return np.column_stack([y, 0 * y, 0 * y]), np.zeros((len(y), 3)), 0.0
+        return np.column_stack([y, 0 * y, 0 * y]), np.zeros((len(y), 3)), 0.0, math.inf
     mean = y.mean()
     y = y - mean
 
@@ -89,7 +90,7 @@ def smooth(y: Array, step: float) -> tuple[Array, Array, float]:
     states[:, 0] += mean
     std = np.sqrt(np.maximum(covariance, 0, out=covariance), out=covariance)
     std *= sigma * units
-    return states, std, sigma
+    return states, std, sigma, h / (2 * math.pi * step)
 
 
 def _stationary(h: float) -> tuple[Array, Array, Array]:
