@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.errors import InputError
+from crane.identification.jackknife import Jackknife
 from crane.identification.noise import Noise, between
 from crane.identification.regressor import Regressor, Stored, factors, triangular
 from crane.samples import Array
@@ -24,7 +25,6 @@ _CONVERGED = 1e-6  # standard deviations
 _ROUNDING = 1e-10  # of the forces
 _ROUNDS = 100
 _WAITING = 4096  # instants without rows that are passed at once
-_LEAST_SHARE = 0.2  # of the degrees of freedom, however many parameters take theirs
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,7 @@ class Estimate:
         noise: Standard deviation of the noise of each group (g,).
         effective: Number of independent rows that tell the mean of a group's noise as well as
             its N correlated rows, N variance / spectral density at zero (g,).
-        freedom: Degrees of freedom behind the standard deviations.
+        freedom: Degrees of freedom behind the standard deviations, see `Jackknife`.
         condition: Condition number of W.
         scaled_condition: The same with columns of length one.
     """
@@ -119,7 +119,8 @@ def huber(
 
     Beyond k = 1.345 robust standard deviations sigma (1.4826 median |e|, of each joint) a row
     counts by its sign alone: weight min(1, k sigma / |e|) / sigma^2. The covariance is that of
-    sum_i w_i psi(e_i), psi clipping at k sigma, divided by the share of unclipped rows.
+    sum_i w_i psi(e_i), psi clipping at k sigma, over the information sum_i w_i psi'(e_i) w_i^T of
+    the unclipped rows: where noise depends on the motion, their share does so too.
 
     Arguments and errors as for `least_squares`.
     """
@@ -367,45 +368,61 @@ class _Rows:
         is then a_i^-1 S_ij a_j^-T, and Q^T (...) Q comes from filtering Q by a_i^-1 backwards
         in time. Rows that are missing are zero in Q.
 
-        The spectral densities at low frequencies, where motions are, are known with some degrees
-        of freedom f (`Noise.known`, m for white noise), of which the fit takes p: the
-        covariance is multiplied by f / (f - p), and f - p are those of the intervals.
+        Where parameters take many of the degrees of freedom at low frequencies, where motions
+        are, the residuals there are smaller than the noise, and noise may be more than a steady
+        spectrum. So the standard deviations are those of the `Jackknife` where these are larger;
+        the correlations between parameters stay. R and A are of the rows that are not clipped,
+        with which alone the estimate moves, Q of all.
         """
         every = s[self.groups]
         clipped = np.clip(e, -turn * every, turn * every)
-        unclipped = float(np.mean(np.abs(e) <= turn * every))
+        counted = np.abs(e) <= turn * every
         count, inflated = len(e), math.sqrt(len(e) / max(len(e) - len(theta), 1))
         noise = inflated * np.array([_rms(clipped[rows]) for rows in self.members])
         clipped /= every
         del every
         noises = [Noise.of(clipped[rows], self.samples[rows]) for rows in self.members]
-        del clipped
-        weights = s / math.sqrt(unclipped)
-        _, R, A = self._solve(self.plain, weights)
-        middle = self._coloured(R, weights, noises)
-        known = sum(noise.known for noise in noises)
-        freedom = max(known - len(theta), _LEAST_SHARE * known)
-        middle *= known / freedom / unclipped
+        rows = self.plain if counted.all() else factors(self.W, self.y, self.groups, counted)
+        _, R, A = self._solve(rows, s)
+        left_out = Jackknife(self.samples, noises, len(theta))
+        middle = self._coloured(R, s, noises, left_out, clipped, counted)
+        del clipped, counted
         prior = np.linalg.solve(R.T, self.pull.T)
-        middle += prior @ prior.T
         inverse = np.linalg.inv(A)
+        covariance, moved = (
+            inverse @ (x + prior @ prior.T) @ inverse.T
+            for x in (0.5 * (middle + middle.T), left_out.covariance())
+        )
+        larger = np.sqrt(np.maximum(np.diag(moved) / np.diag(covariance), 1.0))
         plain, scaled = conditions(np.vstack(list(self.plain[:, :, -1 - len(theta) : -1])))
         if self._order is not None:
             e, ordered = np.empty(count), e
             e[self._order] = ordered
         return Estimate(
             values=theta,
-            covariance=inverse @ (0.5 * (middle + middle.T)) @ inverse.T,
+            covariance=covariance * np.outer(larger, larger),
             residuals=e,
             noise=noise,
             effective=np.array([noise.effective for noise in noises]),
-            freedom=freedom,
+            freedom=left_out.freedom,
             condition=plain,
             scaled_condition=scaled,
         )
 
-    def _coloured(self, R: Array, s: Array, noises: list[Noise]) -> Array:
-        """Q^T (covariance of the noise) Q (p, p), Q = Z / s R^-1, from the last row on."""
+    def _coloured(
+        self,
+        R: Array,
+        s: Array,
+        noises: list[Noise],
+        left_out: Jackknife,
+        e: Array,
+        counted: np.ndarray,
+    ) -> Array:
+        """Q^T (covariance of the noise) Q (p, p), Q = Z / s R^-1, from the last row on.
+
+        The rows are handed to a jackknife on the way, with their weighted residuals e (m,) and
+        whether the estimate moves with them.
+        """
         from scipy.linalg import solve_triangular
 
         S, size = between(noises), len(R)
@@ -432,6 +449,7 @@ class _Rows:
         for rows, block in self.Z.blocks(backwards=True):
             at, groups = self.samples[rows], self.groups[rows]
             Q = solve_triangular(R, (block / s[groups, None]).T, trans="T")
+            left_out.add(self.samples[rows], Q, e[rows], counted[rows])
             wait(last - 1 - int(at[-1]))
             pass_on(int(at[-1] - at[0]) + 1, at[-1] - at, groups, Q)
             last = int(at[0])

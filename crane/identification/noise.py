@@ -7,6 +7,7 @@ import numpy as np
 
 from crane.samples import Array
 
+_FREQUENCIES = 1 << 14  # at which a spectrum is known
 _LONGEST_MEMORY = 60  # samples in the autoregressive model of the noise
 
 
@@ -19,9 +20,9 @@ class Noise:
         innovations: u (T,) over all instants from the first to the last, nan where unknown.
         first: Number of the first instant.
         effective: See `Estimate`.
-        known: Degrees of freedom of the spectral density at zero: 2 over the variance of its
-            logarithm, which is 4 order / N for high orders (Berk 1974), and 4 / `effective` for
-            the first order.
+        correlated: Samples over which it is correlated, the sum of its squared autocorrelations
+            at all lags (Bartlett 1946), mean S^2 / (mean S)^2 of its spectrum S: 1 for white
+            noise, (1 + c^2) / (1 - c^2) where a = (1, -c).
         memory: Samples until the noise has forgotten its past.
     """
 
@@ -29,7 +30,7 @@ class Noise:
     innovations: Array
     first: int
     effective: float
-    known: float
+    correlated: float
     memory: int
 
     @classmethod
@@ -50,12 +51,15 @@ class Noise:
                 u = np.convolve(run, a, mode="valid")
                 series[start + len(a) - 1 : start + len(run)] = u
         largest = np.abs(np.roots(a)).max() if len(a) > 1 else 0.0
-        memory = min(math.ceil(-20 / math.log(largest)) if largest > 1e-3 else 3, len(series))
+        # of what can be predicted to rounding a root may lie on the unit circle, or beyond
+        rate = -math.log(min(max(largest, 1e-3), 1.0))
+        memory = len(series) if rate * len(series) <= 20 else math.ceil(20 / rate)
         answer = lfilter([1.0], a, np.eye(1, 4 * memory)[0])  # of e to an impulse in u
         # mean of its spectrum, by Parseval, over the spectrum at zero
         effective = float(len(e) * (answer @ answer) / answer.sum() ** 2)
-        known = min(effective, len(e) / (len(a) - 1)) / 2 if len(a) > 1 else len(e)
-        return cls(a, series, int(samples[0]), effective, known, memory)
+        spectrum = np.abs(np.fft.fft(a, _FREQUENCIES)) ** -2.0
+        correlated = float(np.mean(spectrum**2) / spectrum.mean() ** 2)
+        return cls(a, series, int(samples[0]), effective, correlated, memory)
 
     def at_rest(self, count: int) -> Array:
         """What `pass_on` starts from, for so many signals."""
