@@ -21,7 +21,7 @@ from crane.identification.excitation import excite
 from crane.identification.identify import identify
 from crane.identification.model import Inertial, Model, Term, friction
 from crane.identification.possible import prior_of_bodies
-from crane.rig import Rig, Tolerances, default_sensors
+from crane.rig import Converter, Rig, Tolerances, default_sensors
 
 SLOW = (0.05, 0.004, 0.004)  # beyond Stribeck velocities [rad/s], [m/s]: below, friction sticks
 BANDWIDTH = 5.0  # [Hz], five times the highest harmonic
@@ -47,6 +47,26 @@ def prior(model: Model) -> Prior:
     return model.nominal, std
 
 
+def rig(machine: crane.Machine, seed: int, noise: float = 1.0) -> Rig:
+    """A rig with calibrated currents, whose sensors are so many times as coarse as the paper's."""
+
+    def scaled(converter: Converter) -> Converter:
+        return dataclasses.replace(converter, step=noise * converter.step)
+
+    sensors = {}
+    for joint in machine.active:
+        usual = default_sensors(machine, joint)
+        sensors[joint] = dataclasses.replace(
+            usual,
+            position=scaled(usual.position),
+            noise=noise * usual.noise,
+            current=scaled(usual.current),
+            current_noise=noise * usual.current_noise,
+            error=(0.0, 0.0),
+        )
+    return Rig(machine, seed, Tolerances(pins=0.0), sensors)
+
+
 def main() -> None:
     """Identify and judge."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -54,10 +74,6 @@ def main() -> None:
     options = parser.parse_args()
     warnings.simplefilter("ignore", crane.CraneWarning)
     machine = crane.load("mini_forwarder")
-    sensors = {
-        joint: dataclasses.replace(default_sensors(machine, joint), error=(0.0, 0.0))
-        for joint in machine.active
-    }
     learn, judge = (excite(machine, Model(machine, terms(machine)), seed=k) for k in (0, 1))
     print(learn.to_text())
     print(
@@ -65,18 +81,18 @@ def main() -> None:
     )
     covered, floors = [], []
     for seed in range(1, options.rigs + 1):
-        rig = Rig(machine, seed, Tolerances(pins=0.0), sensors)
-        one, other = (rig.run(reference.path) for reference in (learn, judge))
+        virtual = rig(machine, seed)
+        one, other = (virtual.run(reference.path) for reference in (learn, judge))
         settings = {"terms": terms(machine), "slow": SLOW, "bandwidth": BANDWIDTH}
         result = identify(machine, one, **settings)
-        truth = result.base.values(Model(rig.plant, terms(rig.plant)).nominal)
+        truth = result.base.values(Model(virtual.plant, terms(virtual.plant)).nominal)
         low, high = result.interval().T
         covered.append(float(np.mean((low <= truth) & (truth <= high))))
         model = identify(
             machine, one, other, prior=prior(Model(machine, terms(machine))), **settings
         )
         # the floor: what the true parameters leave of the same recording
-        exact = identify(rig.plant, other, terms=terms(rig.plant), prior=1e-6, slow=SLOW,
+        exact = identify(virtual.plant, other, terms=terms(virtual.plant), prior=1e-6, slow=SLOW,
                          bandwidth=BANDWIDTH)  # fmt: skip
         ratio = model.validation.rmse / exact.training.rmse
         floors.append(ratio)
