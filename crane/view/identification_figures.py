@@ -12,6 +12,7 @@ from crane.identification.result import Comparison
 from crane.samples import Array
 from crane.view.figure_text import plain
 from crane.view.plots import DASHED, INK
+from crane.view.thinning import envelope
 
 _SEGMENTS = 8  # of a recording, whose periodograms are averaged
 
@@ -22,7 +23,8 @@ def time_figure(fit: Comparison, i: int, unit: str, name: str) -> Figure:
     grid = {"height_ratios": (2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
     upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})
     gaps = np.where(fit.moving[:, i], 1.0, np.nan)
-    upper.plot(fit.time, fit.measured[:, i], color="#9db8d6", linewidth=1.6, label="measured")
+    measured = envelope(fit.time, fit.measured[:, i])
+    upper.plot(*measured, color="#9db8d6", linewidth=1.6, label="measured")
     upper.plot(fit.time, fit.modelled[:, i] * gaps, **{**DASHED, "linewidth": 0.9}, label="model")
     upper.set_ylabel(f"force [{unit}]")
     upper.set_title(name, loc="left", fontsize=8.5)

@@ -23,6 +23,7 @@ from crane.samples import Array
 from crane.summary import points, subject, title
 from crane.units import reading
 from crane.view.figure_text import plain
+from crane.view.thinning import envelope, thinned
 
 FORMATS: dict[str, dict[str, None] | None] = {  # with the date left out of what is written
     "png": None,
@@ -211,7 +212,7 @@ def _tip_error(tip: Array, reference: Array) -> _Panel:
 def _draw_panel(axes: Axes, time: Array, panel: _Panel, unit: str, scale: float) -> None:
     marker = "o" if len(time) == 1 else None
     for label, values in panel.lines.items():
-        axes.plot(time, scale * values, marker=marker, label=label, **LINES[label])
+        axes.plot(*envelope(time, scale * values), marker=marker, label=label, **LINES[label])
     axes.set_ylabel(f"{panel.quantity} [{unit}]")
     axes.margins(x=0.0, y=0.08)
     low, high = axes.get_ylim()
@@ -223,6 +224,7 @@ def _draw_panel(axes: Axes, time: Array, panel: _Panel, unit: str, scale: float)
 
 def _draw_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
     """The path of the tip [m] in space, to scale, with its shadow on the ground of the box."""
+    tip, reference = thinned(tip), None if reference is None else thinned(reference)
     shown = tip if reference is None else np.vstack([tip, reference])
     low, high = shown.min(axis=0), shown.max(axis=0)
     span = np.maximum(high - low, 0.4 * max(float((high - low).max()), 1e-2)) * 1.1
