@@ -209,9 +209,11 @@ def beyond_limits(machine: Machine, path: Path, until: float = np.inf) -> str:
     joint, value = machine.active[i], q_a[k, i]
     limit = machine.lower[i] if value < machine.lower[i] else machine.upper[i]
     unit = machine.unit(joint)
+    place = machine.tree.joints[joint].limits.where
     others = int((excess > LIMIT_SLACK).any(axis=0).sum()) - 1
     more = f" ({others} other joint{'s' * (others > 1)} likewise)" if others else ""
     return (
         f"the reference of '{joint}' goes to {value:.6g} {unit} at t = {times[k]:.4g} s, beyond "
-        f"its limit {limit:.6g} {unit}{more}: keep it within, or widen the limits"
+        f"its limit {limit:.6g} {unit}{f' ({place})' if place else ''}{more}: keep it within, or "
+        "widen the limits"
     )

@@ -81,6 +81,7 @@ CALLS = {
     "convert": ["slider.yaml {out}.urdf", "slider.yaml {out}", "slider.yaml {out}.xml"],
     "study": ["slider.yaml --out {out} --vary crank.mass=0.7:0.9:2 --processes 1"],
     "excite": ["slider.yaml --out {out} --period 4 --harmonics 1 --step 0.05"],
+    "import": ["motion.csv columns.txt --out {out}.csv"],
     "identify": ["slider.yaml motion.csv --out {out}"],
     "payload": ["slider.yaml motion.csv"],
     "circuit": [
@@ -176,6 +177,10 @@ def prepare(folder):
         np.savetxt(folder / f"{name}.csv", rows, delimiter=",", header=names, comments="")
         text = (folder / f"{name}.csv").read_text()
         (folder / f"{name}.csv").write_text(f"# machine: {folder / 'slider.yaml'}\n{text}")
+    (folder / "columns.txt").write_text(
+        "time [s] = 'time [s]'\ntheta [rad] = 'theta [rad]' - 0.1\n"
+        "theta_force [N m] = 2 * 'theta_force [N m]' / 2\n"
+    )
     rig(folder, mass=700.0, control={"kp": 20.0, "kd": 1.0})
     text = (folder / "rig.yaml").read_text()
     (folder / "rig.yaml").write_text(

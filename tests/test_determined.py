@@ -159,8 +159,9 @@ def test_a_feasible_estimate_is_as_known_as_its_own_objective_says(mini, plain):
     # on what forces alone tell well, both agree
     well = plain.std < 0.01 * plain.magnitude
     assert well.sum() > 3
-    assert (found.std[well] < 3 * plain.std[well]).all()
-    assert (found.std[well] > 0.2 * plain.std[well]).all()
+    ratio = found.std[well] / plain.std[well]
+    assert ratio.max() < 3 and np.median(ratio) > 0.4
+    assert ratio.min() > 0.1  # where few stretches of the recording tell, the prior tells more
 
 
 @pytest.mark.slow

@@ -138,11 +138,12 @@ def test_errors_of_limits_tell_where_they_stand(tmp_path):
     for call in (
         lambda: crane.simulate(machine, initial=far, duration=0.1),
         lambda: crane.simulate(machine, crane.PI(machine, crane.point_to_point(far, far, 1.0))),
-        lambda: crane.task_path(crane.load(tmp_path / "task.yaml"), "far"),
         lambda: crane.sketch(machine, tmp_path / "a.svg", far),
     ):
         with pytest.raises(LimitError, match=place):
             call()
+    with pytest.raises(LimitError, match=rf"limit 0\.03 m \(chain_b1\.urdf:{line}\): keep"):
+        crane.task_path(crane.load(tmp_path / "task.yaml"), "far")
     shorter = crane.load(path, {"X1.upper": 0.025})
     with pytest.raises(LimitError, match=r"limits 0 to 0\.025 m \(changed by X1\.upper\), choose"):
         shorter.check_limits([0.0, 0.029, 0.01])

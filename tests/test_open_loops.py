@@ -18,7 +18,7 @@ LINK = """<link name="{}"><inertial><origin xyz="{} 0 0"/><mass value="1"/>
   <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
 """
 JOINT = """<joint name="{}" type="{}"><origin xyz="{}"/><parent link="{}"/><child link="{}"/>
-  <axis xyz="0 0 1"/><limit lower="-2" upper="3"/></joint>
+  <axis xyz="0 0 1"/><limit lower="-2" upper="3" effort="1" velocity="1"/></joint>
 """
 
 

@@ -7,6 +7,8 @@ from crane.errors import InputError
 from crane.paths import Path
 from crane.samples import Array, as_count, as_number, as_samples
 
+_DENSE = 200  # instants in the shortest period
+
 
 class Fourier(Path):
     """A finite Fourier series in the active coordinates (Swevers et al., 1997).
@@ -48,6 +50,11 @@ class Fourier(Path):
         self.lead = self.period / 2
         self.duration = self.periods * self.period + 2 * self.lead
         self.tip = None
+
+    def turns(self) -> Array:
+        """See `Path`: so many instants that the largest is missed by 1e-4 of its harmonic's."""
+        shortest = self.period / self.harmonics
+        return np.linspace(0.0, self.duration, 1 + round(_DENSE * self.duration / shortest))
 
     @property
     def harmonics(self) -> int:
