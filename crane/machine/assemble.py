@@ -88,7 +88,9 @@ def closed(
 def _closure(
     spec: MachineSpec, model: pin.Model, guess: Array, loops: Sequence[LoopSpec]
 ) -> Closure:
-    return Closure(model, loops, active_joints(spec, model), guess, spec.couplings)
+    # while findings are collected, joints that close rings are no part of the tree
+    there = [x for x in spec.couplings if all(map(model.existJointName, x.factors))]
+    return Closure(model, loops, active_joints(spec, model), guess, there)
 
 
 def assemble(spec: MachineSpec) -> pin.Model:
