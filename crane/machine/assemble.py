@@ -1,5 +1,6 @@
 """The spanning tree and its closure, from a description."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -67,13 +68,16 @@ def closed(
         MechanismError: The parts do not make a machine that can be driven; with file and line.
     """
     loops = spec.loops if loops is None else loops
+    # while findings are collected, joints that close rings are no part of the tree
+    there = tuple(x for x in spec.couplings if all(map(model.existJointName, x.factors)))
+    spec = dataclasses.replace(spec, couplings=there)
     try:
         return _closure(spec, model, guess, loops)
     except MechanismError as error:
         if spec.active != () and (error.about == "active" or error.about.startswith("loop ")):
 
             def close(changed: MachineSpec, some: Sequence[LoopSpec]) -> object:
-                tree = model if changed is spec else assemble(changed)
+                tree = model if changed.tree is spec.tree else assemble(changed)
                 return _closure(changed, tree, guess, some)
 
             if (suspect := wrong_axis(spec, model, loops, close)) is not None:
@@ -88,9 +92,7 @@ def closed(
 def _closure(
     spec: MachineSpec, model: pin.Model, guess: Array, loops: Sequence[LoopSpec]
 ) -> Closure:
-    # while findings are collected, joints that close rings are no part of the tree
-    there = [x for x in spec.couplings if all(map(model.existJointName, x.factors))]
-    return Closure(model, loops, active_joints(spec, model), guess, there)
+    return Closure(model, loops, active_joints(spec, model), guess, spec.couplings)
 
 
 def assemble(spec: MachineSpec) -> pin.Model:
