@@ -5,7 +5,7 @@ import numpy as np
 from crane.identification.noise import Noise
 from crane.samples import Array
 
-_CORRELATED = 4.0  # correlation times of the noise in a stretch, at least
+_CORRELATED = 4.0  # mean correlation times of the joints' noise in a stretch, at least
 _FEWEST, _MOST = 20, 200  # stretches
 _ALONE = 1e-8  # of a direction's information, what others than one stretch have at least
 
@@ -33,7 +33,7 @@ class Jackknife:
     """
 
     def __init__(self, samples: np.ndarray, noises: list[Noise], size: int):
-        longest = _CORRELATED * max(noise.correlated for noise in noises)
+        longest = _CORRELATED * np.mean([noise.correlated for noise in noises])
         span = int(samples[-1] - samples[0]) + 1
         wanted = int(np.clip(span / longest, _FEWEST, _MOST))
         starts = samples[np.arange(wanted) * len(samples) // wanted]
