@@ -4,8 +4,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from crane.batch import Batch, simulate_batch
     from crane.closure import Closure
+    from crane.common.errors import CraneError, CraneWarning
     from crane.control import (
         PI,
         ComputedTorque,
@@ -18,29 +18,29 @@ if TYPE_CHECKING:
     )
     from crane.description import EndStop, ForceElement, Friction, GasSpring, PIGains
     from crane.dynamics import Dynamics
-    from crane.errors import CraneError, CraneWarning
     from crane.formats import write_machine, write_mjcf, write_urdf_plus
-    from crane.identification.cylinder_friction import cylinder_friction
-    from crane.identification.identify import identify
-    from crane.identification.orifices import identify_orifices
-    from crane.identification.result import Identification
-    from crane.identification.valve import identify_valve
-    from crane.kinematics import Kinematics
+    from crane.identification.hydraulics.cylinder_friction import cylinder_friction
+    from crane.identification.hydraulics.orifices import identify_orifices
+    from crane.identification.hydraulics.valve import identify_valve
+    from crane.identification.mechanics.identify import identify
+    from crane.identification.mechanics.result import Identification
     from crane.machine import Machine, Payload, load
-    from crane.measured import read_measured
-    from crane.paths import Path, point_to_point, polynomial, task_path, tip_path
-    from crane.recording import Recording
-    from crane.replays import Comparison, replay
-    from crane.simulation import simulate
+    from crane.motion import Kinematics, Path, point_to_point, polynomial, task_path, tip_path
+    from crane.motion.workspaces import Workspace, workspace
+    from crane.recordings import Recording, read_measured
+    from crane.simulation import Batch, Comparison, replay, simulate, simulate_batch
     from crane.studies import Study, study
     from crane.view.page import report
     from crane.view.sketch import sketch
-    from crane.workspaces import Workspace, workspace
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "crane.closure": ("Closure",),
+    "crane.common.errors": (
+        "CraneError",
+        "CraneWarning",
+    ),
     "crane.control": (
         "PI",
         "ComputedTorque",
@@ -51,26 +51,57 @@ _HOMES = {
         "ValvePD",
         "joystick",
     ),
-    "crane.description": ("EndStop", "ForceElement", "Friction", "GasSpring", "PIGains"),
+    "crane.description": (
+        "EndStop",
+        "ForceElement",
+        "Friction",
+        "GasSpring",
+        "PIGains",
+    ),
     "crane.dynamics": ("Dynamics",),
-    "crane.errors": ("CraneError", "CraneWarning"),
-    "crane.formats": ("write_machine", "write_mjcf", "write_urdf_plus"),
-    "crane.identification.cylinder_friction": ("cylinder_friction",),
-    "crane.identification.identify": ("identify",),
-    "crane.identification.orifices": ("identify_orifices",),
-    "crane.identification.valve": ("identify_valve",),
-    "crane.identification.result": ("Identification",),
-    "crane.kinematics": ("Kinematics",),
-    "crane.machine": ("Machine", "Payload", "load"),
-    "crane.measured": ("read_measured",),
-    "crane.paths": ("Path", "point_to_point", "polynomial", "task_path", "tip_path"),
-    "crane.recording": ("Recording",),
-    "crane.batch": ("Batch", "simulate_batch"),
-    "crane.replays": ("Comparison", "replay"),
-    "crane.simulation": ("simulate",),
-    "crane.studies": ("Study", "study"),
+    "crane.formats": (
+        "write_machine",
+        "write_mjcf",
+        "write_urdf_plus",
+    ),
+    "crane.identification.hydraulics.cylinder_friction": ("cylinder_friction",),
+    "crane.identification.hydraulics.orifices": ("identify_orifices",),
+    "crane.identification.hydraulics.valve": ("identify_valve",),
+    "crane.identification.mechanics.identify": ("identify",),
+    "crane.identification.mechanics.result": ("Identification",),
+    "crane.machine": (
+        "Machine",
+        "Payload",
+        "load",
+    ),
+    "crane.motion": (
+        "Kinematics",
+        "Path",
+        "point_to_point",
+        "polynomial",
+        "task_path",
+        "tip_path",
+    ),
+    "crane.motion.workspaces": (
+        "Workspace",
+        "workspace",
+    ),
+    "crane.recordings": (
+        "Recording",
+        "read_measured",
+    ),
+    "crane.simulation": (
+        "Batch",
+        "Comparison",
+        "replay",
+        "simulate",
+        "simulate_batch",
+    ),
+    "crane.studies": (
+        "Study",
+        "study",
+    ),
     "crane.view.page": ("report",),
-    "crane.workspaces": ("Workspace", "workspace"),
     "crane.view.sketch": ("sketch",),
 }
 

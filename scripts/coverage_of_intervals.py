@@ -17,9 +17,9 @@ import numpy as np
 from identify_mini_forwarder import BANDWIDTH, SLOW, rig, terms
 
 import crane
-from crane.identification.excitation import excite
-from crane.identification.identify import METHODS, identify
-from crane.identification.model import Model, default_terms
+from crane.identification.excitation.excite import excite
+from crane.identification.mechanics.identify import METHODS, identify
+from crane.identification.mechanics.model import Model, default_terms
 
 
 def main() -> None:

@@ -11,8 +11,8 @@ from subject import START, Array, Runner
 
 import crane
 from crane.control import Free
-from crane.integration import PythonStepper
-from crane.kinematics import Kinematics
+from crane.motion.kinematics import Kinematics
+from crane.simulation.integration import PythonStepper
 
 STEPS = (0.04, 0.03, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005)  # [s]
 

@@ -8,7 +8,7 @@ from subject import START, FormulaLoop, Runner, along
 
 import crane
 from crane.control import PI, Free
-from crane.paths import task_path
+from crane.motion.trajectories import task_path
 
 
 def agree(machine: crane.Machine) -> str:

@@ -19,8 +19,9 @@ from pathlib import Path
 import numpy as np
 
 import crane
-from crane.identification.feasible import Feasible, feasible
-from crane.identification.model import (
+from crane.common.samples import Array
+from crane.identification.mechanics.feasible import Feasible, feasible
+from crane.identification.mechanics.model import (
     PER_BODY,
     Along,
     GasScale,
@@ -32,8 +33,7 @@ from crane.identification.model import (
     Term,
     friction,
 )
-from crane.identification.signals import Motion, differentiate, filter_rows
-from crane.samples import Array
+from crane.identification.signals.motion import Motion, differentiate, filter_rows
 
 RATIO = np.array([1798 / 7, 1872 / 7, 757 / 3, 221, 5032 / 21, 206793 / 1340])
 ROTORS = np.array([0.00923, 0.0118, 0.0118, 0.00173, 0.00173, 0.00173])  # [kg m2], motor side

@@ -14,14 +14,14 @@ import dataclasses
 import warnings
 
 import numpy as np
+from rig import Converter, Rig, Tolerances, default_sensors
 
 import crane
-from crane.identification.estimators import Prior
-from crane.identification.excitation import excite
-from crane.identification.identify import identify
-from crane.identification.model import Inertial, Model, Term, friction
-from crane.identification.possible import prior_of_bodies
-from crane.rig import Converter, Rig, Tolerances, default_sensors
+from crane.identification.estimation.estimators import Prior
+from crane.identification.excitation.excite import excite
+from crane.identification.mechanics.identify import identify
+from crane.identification.mechanics.model import Inertial, Model, Term, friction
+from crane.identification.mechanics.possible import prior_of_bodies
 
 SLOW = (0.05, 0.004, 0.004)  # beyond Stribeck velocities [rad/s], [m/s]: below, friction sticks
 BANDWIDTH = 5.0  # [Hz], five times the highest harmonic

@@ -19,9 +19,10 @@ from pathlib import Path
 import numpy as np
 
 import crane
-from crane.identification.base import base_parameters
-from crane.identification.estimators import least_squares, weighted
-from crane.identification.model import (
+from crane.common.samples import Array
+from crane.identification.estimation.estimators import least_squares, weighted
+from crane.identification.mechanics.base import base_parameters
+from crane.identification.mechanics.model import (
     PER_BODY,
     Direction,
     Inertial,
@@ -30,8 +31,7 @@ from crane.identification.model import (
     Term,
     friction,
 )
-from crane.identification.signals import differentiate, filter_rows
-from crane.samples import Array
+from crane.identification.signals.motion import differentiate, filter_rows
 
 RATIO = np.diag([32.0, 32.0, 45.0, -48.0, 45.0, 32.0])  # motors by joints
 RATIO[5, 4] = 32.0

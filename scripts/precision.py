@@ -7,7 +7,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from crane.view.plots import INK, RECORDED, STYLE
+from crane.view.plots.recording import INK, RECORDED, STYLE
 
 Tip = Callable[[], np.ndarray | None]  # its position (3,) [m], None if unstable
 Engine = Callable[[float], Tip]  # runs with a step [s]

@@ -16,8 +16,8 @@ from hydraulic_forwarder import figures, page
 from hydraulic_forwarder.results import Results, compute
 
 import crane
-from crane.output import replacing
-from crane.view.hydraulic_figures import sides_figure
+from crane.common.output import replacing
+from crane.view.plots.hydraulics import sides_figure
 
 
 def draw(found: Results, folder: Path) -> None:

@@ -25,10 +25,10 @@ from forwarder.runs import (
     simulate,
     tip_errors,
 )
+from rig import Rig
 
 import crane
-from crane.output import replacing
-from crane.rig import Rig
+from crane.common.output import replacing
 
 SEED = 1  # of the virtual rig that is shown
 RIGS = 12  # how many in all

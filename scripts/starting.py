@@ -16,8 +16,8 @@ from measuring import table
 import crane
 from crane.control import PI
 from crane.dynamics.compiled import QUANTITIES
-from crane.integration import CompiledStepper
-from crane.paths import task_path
+from crane.motion.trajectories import task_path
+from crane.simulation.integration import CompiledStepper
 
 
 def starts(rounds: int) -> str:

@@ -8,7 +8,7 @@ import pinocchio as pin
 import crane
 from crane.codegen import Program
 from crane.control import TracedController
-from crane.integration import CompiledStepper
+from crane.simulation.integration import CompiledStepper
 
 Array = np.ndarray
 

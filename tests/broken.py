@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import crane
-from crane.errors import CraneError
+from crane.common.errors import CraneError
 
 DATA = Path(__file__).parent / "data"
 MODELS = Path(__file__).parents[1] / "models"

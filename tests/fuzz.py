@@ -24,8 +24,8 @@ import yaml  # noqa: E402
 from work import TooMuchWorkError, at_most  # noqa: E402
 
 import crane  # noqa: E402
-from crane.description import read  # noqa: E402
-from crane.errors import CraneError, CraneWarning  # noqa: E402
+from crane.common.errors import CraneError, CraneWarning  # noqa: E402
+from crane.formats import read  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 MOST = 200_000  # lines of the package for one file; those drawn run up to 20,000

@@ -26,15 +26,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np  # noqa: E402
 
 import crane  # noqa: E402
-from crane.check import check  # noqa: E402
+from crane.cli.runs import read_run  # noqa: E402
+from crane.common.errors import CraneError, CraneWarning  # noqa: E402
 from crane.control import controller, joystick  # noqa: E402
-from crane.errors import CraneError, CraneWarning  # noqa: E402
-from crane.identification.identify import identify  # noqa: E402
-from crane.paths import task_path  # noqa: E402
-from crane.replays import replay  # noqa: E402
-from crane.runs import read_run  # noqa: E402
-from crane.view import report  # noqa: E402
-from crane.view.plots import plot_recording  # noqa: E402
+from crane.identification.mechanics.identify import identify  # noqa: E402
+from crane.machine.check import check  # noqa: E402
+from crane.motion.trajectories import task_path  # noqa: E402
+from crane.simulation.replays import replay  # noqa: E402
+from crane.view.page import report  # noqa: E402
+from crane.view.plots.recording import plot_recording  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 SECONDS, MEMORY = 20, 2 << 30  # of computing per case, bytes

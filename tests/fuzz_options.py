@@ -33,13 +33,14 @@ from typer.main import get_command  # noqa: E402
 
 import crane  # noqa: E402
 import crane.cli.entry as entry  # noqa: E402
-import crane.live.serve  # noqa: E402
 import crane.studies  # noqa: E402
-import crane.view.page  # noqa: E402
-import crane.view.plots  # noqa: E402
-from crane.description import parameters, read  # noqa: E402
-from crane.errors import CraneWarning  # noqa: E402
-from crane.identification.fourier import Fourier  # noqa: E402
+import crane.view.live.serve  # noqa: E402
+import crane.view.page.build  # noqa: E402
+import crane.view.plots.recording  # noqa: E402
+from crane.common.errors import CraneWarning  # noqa: E402
+from crane.description import parameters
+from crane.formats import read  # noqa: E402
+from crane.identification.excitation.fourier import Fourier  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 SECONDS = 20  # of computing
@@ -287,7 +288,7 @@ def begin(words, place):
     size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (size + MEMORY, size + MEMORY))
     sys.argv = ["crane", *words]
-    crane.live.serve._take = lambda *_: None  # serving ends at once
+    crane.view.live.serve._take = lambda *_: None  # serving ends at once
     show = entry._show_warning
     entry._show_warning = lambda message, category, *rest: (
         show(message) if issubclass(category, CraneWarning) else entry.say(f"LEAK {message}")

@@ -21,8 +21,8 @@ import numpy as np
 from work import TooMuchWorkError, at_most
 
 import crane
-from crane.check import check
-from crane.errors import CraneError, CraneWarning
+from crane.common.errors import CraneError, CraneWarning
+from crane.machine.check import check
 
 MOST = 500_000  # lines of the package for one file; the longest of 2500 draws ran a fifth
 

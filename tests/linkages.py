@@ -9,7 +9,7 @@ import pytest
 from broken import DATA
 
 import crane
-from crane.errors import CraneWarning
+from crane.common.errors import CraneWarning
 from crane.formats import write_machine, write_mjcf, write_urdf_plus
 
 MACHINES = {  # file, degrees of freedom, how far the tests go from home [m], [rad]

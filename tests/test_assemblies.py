@@ -11,10 +11,10 @@ from broken import DATA, LOOPED, copy_machine, swap
 from work import at_most
 
 import crane
-from crane.check import check
 from crane.closure.assemblies import ambiguities
+from crane.common.errors import CraneWarning
 from crane.description import bundled
-from crane.errors import CraneWarning
+from crane.machine.check import check
 
 STROKES = np.arange(0.14, 0.96, 0.02).round(2).tolist()
 CHOICES = re.compile(r"under 'home:' write (.+) for the other \(.+\) or (.+) to keep this one")

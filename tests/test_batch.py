@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import crane
-from crane.errors import CraneWarning, InputError
+from crane.common.errors import CraneWarning, InputError
 
 
 @pytest.fixture(scope="module")

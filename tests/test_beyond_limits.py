@@ -5,12 +5,12 @@ import warnings
 
 import numpy as np
 import pytest
+from rig import Rig
 
 import crane
+from crane.common.errors import ClosureError, CraneWarning, InputError, LimitError, SimulationError
 from crane.control import Sampled, ValvePD
-from crane.errors import ClosureError, CraneWarning, InputError, LimitError, SimulationError
-from crane.paths import beyond_limits, polynomial
-from crane.rig import Rig
+from crane.motion.trajectories import beyond_limits, polynomial
 
 TOLD = (
     "the reference of 'X1' goes to 0.06 m at t = 0.1 s, beyond its limit 0.03 m "

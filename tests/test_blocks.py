@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 import crane
-from crane.identification import equations, estimators, regressor, smoother
-from crane.identification.equations import Equations
-from crane.identification.estimators import huber, instrumental, least_squares, weighted
-from crane.identification.identify import equations_of, identify
-from crane.identification.model import Model, Presliding, default_terms
-from crane.identification.signals import Motion, filter_rows
+from crane.identification.estimation import estimators, regressor
+from crane.identification.estimation.estimators import huber, instrumental, least_squares, weighted
+from crane.identification.mechanics import equations
+from crane.identification.mechanics.equations import Equations
+from crane.identification.mechanics.identify import equations_of, identify
+from crane.identification.mechanics.model import Model, Presliding, default_terms
+from crane.identification.signals import smoother
+from crane.identification.signals.motion import Motion, filter_rows
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 
@@ -74,7 +76,7 @@ def test_covariance_is_that_of_all_rows_at_once():
     """Q^T C Q by a dense C = (a^-1 a^-T) of one group with missing rows."""
     from scipy.linalg import toeplitz
 
-    from crane.identification.noise import Noise
+    from crane.identification.estimation.noise import Noise
 
     W, y, groups, samples = (x[rows()[2] == 1] for x in rows())
     found = least_squares(W, y, groups - 1, samples)
@@ -151,8 +153,8 @@ def test_what_is_held_does_not_grow_with_the_recording(mini, monkeypatch):
 LONG = """
 import resource, sys, numpy as np, crane
 from test_blocks import motion
-from crane.identification.identify import identify
-from crane.identification.signals import Motion
+from crane.identification.mechanics.identify import identify
+from crane.identification.signals.motion import Motion
 machine = crane.load("mini_forwarder")
 one = motion(machine, 10.0, 1e-3)
 parts = [np.tile(x, (30, 1)) for x in (one.q, one.v, one.a, one.tau)]

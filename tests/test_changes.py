@@ -10,8 +10,9 @@ from broken import DATA
 
 import crane
 import crane.cli.entry
-from crane.description import bundled, parameters, read
-from crane.errors import InputError
+from crane.common.errors import InputError
+from crane.description import bundled, parameters
+from crane.formats import read
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 POSE = np.array([0.3, 0.021, 0.012])

@@ -24,9 +24,9 @@ from broken import (
 from work import TooMuchWorkError, at_most
 
 import crane
-from crane.check import Report, check
 from crane.description import bundled, examples
 from crane.formats import write_machine
+from crane.machine.check import Report, check
 
 CHAIN_B1 = "urdf/mini_forwarder/chain_b1.urdf"
 CHAIN_B2 = "urdf/mini_forwarder/chain_b2.urdf"
@@ -727,7 +727,7 @@ def refused():
 
 
 @pytest.mark.parametrize("broken", list(refused()))
-@pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+@pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 def test_what_load_raises_is_among_the_findings(broken, tmp_path):
     path = copy_machine(broken.machine, tmp_path)
     for edit in broken.edits:

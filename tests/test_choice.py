@@ -10,7 +10,7 @@ import pytest
 
 import crane
 from crane.closure.choice import choose, condition, motions, scales
-from crane.errors import CraneError, MechanismError
+from crane.common.errors import CraneError, MechanismError
 
 BODY = (
     '<inertial><origin xyz="0.05 0.01 0.02"/><mass value="1"/><inertia ixx="0.01" ixy="0" ixz="0"'

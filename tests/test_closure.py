@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import crane
-from crane.errors import (
+from crane.common.errors import (
     BranchEdgeError,
     ClosureError,
     CraneWarning,

@@ -12,7 +12,13 @@ import pytest
 import crane
 import crane.codegen.program
 import crane.dynamics.tree
-from crane.errors import CraneError, CraneWarning, InputError, OutOfReachError, WrongBranchError
+from crane.common.errors import (
+    CraneError,
+    CraneWarning,
+    InputError,
+    OutOfReachError,
+    WrongBranchError,
+)
 
 DATA = Path(__file__).parent / "data"
 # name: arguments besides q_a, and keywords

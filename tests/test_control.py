@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import crane
+from crane.common.errors import CraneWarning, InputError
 from crane.control import CONTROLLERS, controller
-from crane.errors import CraneWarning, InputError
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ import pytest
 from broken import DATA, GROUND, LOOPED, MACHINE, MINI, MODELS, ROCKER, Edit, copy_machine, swap
 
 import crane
+from crane.common.errors import CraneError, CraneWarning, MechanismError, known
 from crane.description import LOOP_TYPES, Friction, bundled, examples, inertia_problem
 from crane.description.sources import find
-from crane.errors import CraneError, CraneWarning, MechanismError, known
 
 NO_MACHINE = "not a machine, give a machine file (.yaml), a URDF (.urdf) or a MJCF (.xml)"
 
@@ -255,7 +255,7 @@ class TestSources:
             )
         )  # fmt: skip
 
-    @pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+    @pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
     def test_every_example_loads_or_is_refused_with_a_line(self):
         loaded = 0
         for name in examples():
@@ -386,7 +386,7 @@ class TestMutations:
                 lines[i] = b" ".join(words)
         return b"\n".join(lines)
 
-    @pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+    @pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
     @pytest.mark.parametrize("seed", range(4))
     def test_mutated_files(self, seed, tmp_path):
         chance = random.Random(seed)

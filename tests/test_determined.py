@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import crane
-from crane.errors import CraneWarning
-from crane.identification.determined import weak_directions
-from crane.identification.feasible import body_parameters, curvature, pseudo_inertia
-from crane.identification.identify import identify
-from crane.identification.model import Model
-from crane.identification.possible import thick
-from crane.identification.signals import Motion
+from crane.common.errors import CraneWarning
+from crane.identification.mechanics.determined import weak_directions
+from crane.identification.mechanics.feasible import body_parameters, curvature, pseudo_inertia
+from crane.identification.mechanics.identify import identify
+from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.possible import thick
+from crane.identification.signals.motion import Motion
 
 NOISE = np.array([5e-3, 0.5, 0.3])  # [N m], [N], [N]
 

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rig import Rig, Tolerances
 
 import crane
-from crane.errors import CraneWarning, RecordingError
-from crane.identification.fourier import Fourier
-from crane.identification.hum import line
-from crane.identification.identify import identify, motion_of
-from crane.identification.outliers import outliers, repaired
-from crane.logs import read_log
-from crane.measured import read_measured
-from crane.rig import Rig, Tolerances
+from crane.common.errors import CraneWarning, RecordingError
+from crane.identification.excitation.fourier import Fourier
+from crane.identification.mechanics.identify import identify, motion_of
+from crane.identification.signals.hum import line
+from crane.identification.signals.outliers import outliers, repaired
+from crane.recordings.logs import read_log
+from crane.recordings.measured import read_measured
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
 COLUMNS = Path(__file__).parents[1] / "scripts" / "columns"
@@ -222,7 +222,7 @@ def test_clean_rigs_raise_no_alarm_and_late_ones_do(mini, rig, seed):
 @pytest.mark.slow
 def test_measured_arms_run_through(tmp_path):
     """Their doubts are the joints where friction and rotors outweigh, and some outliers."""
-    from crane import timeseries
+    from crane.recordings import timeseries
 
     runs = {}
     for name, log in (("kr300", "kr300_A"), ("kr300", "kr300_B"), ("tx40", "tx40_recording")):

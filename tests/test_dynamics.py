@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from lxml import etree
 
 import crane
-from crane.errors import CraneWarning, InputError
+from crane.common.errors import CraneWarning, InputError
 
 CRANK = oracles.SliderCrank()
 STROKE = 0.030  # [m]

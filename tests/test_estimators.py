@@ -3,8 +3,8 @@ import pytest
 from scipy.signal import butter, lfilter, sosfiltfilt
 from scipy.stats import f, t
 
-from crane.errors import InputError
-from crane.identification.estimators import (
+from crane.common.errors import InputError
+from crane.identification.estimation.estimators import (
     essential,
     huber,
     instrumental,

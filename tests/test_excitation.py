@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import crane
-from crane.errors import InputError
-from crane.identification.base import base_parameters, random_samples
-from crane.identification.excitation import excite
-from crane.identification.fourier import Fourier, bases
-from crane.identification.information import Information
-from crane.identification.limits import gear
-from crane.identification.model import Model
+from crane.common.errors import InputError
+from crane.identification.excitation.excite import excite
+from crane.identification.excitation.fourier import Fourier, bases
+from crane.identification.excitation.information import Information
+from crane.identification.excitation.limits import gear
+from crane.identification.mechanics.base import base_parameters, random_samples
+from crane.identification.mechanics.model import Model
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 QUICK = {"harmonics": 3, "periods": 2, "starts": 1}

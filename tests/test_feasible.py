@@ -3,8 +3,8 @@ import pinocchio as pin
 import pytest
 from scipy.optimize import minimize
 
-from crane.errors import InputError
-from crane.identification.feasible import body_parameters, feasible, pseudo_inertia
+from crane.common.errors import InputError
+from crane.identification.mechanics.feasible import body_parameters, feasible, pseudo_inertia
 
 
 def body(rng, size, mass):

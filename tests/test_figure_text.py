@@ -10,15 +10,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import crane
-from crane.recording import Recording
-from crane.view.comparison_plots import plot_comparison
-from crane.view.figure_text import plain
-from crane.view.identification_figures import matrix_figure
-from crane.view.plots import joint_symbol, plot_recording
-from crane.view.sketch import sketch
-from crane.view.sketch_sheet import symbol
-from crane.view.study_plots import plot_study
-from crane.view.workspace_plots import plot_workspace
+from crane.recordings.recording import Recording
+from crane.view.plots.comparison import plot_comparison
+from crane.view.plots.identification import matrix_figure
+from crane.view.plots.recording import joint_symbol, plot_recording
+from crane.view.plots.study import plot_study
+from crane.view.plots.text import plain
+from crane.view.plots.workspace import plot_workspace
+from crane.view.sketch.draw import sketch
+from crane.view.sketch.sheet import symbol
 
 NAMES = [r"$\bad$", "$", "$$", "a$b$c", r"a\$b", r"\$\bad\$", r"$x^{", r"\frac{", "x^y_z", "50 %"]
 

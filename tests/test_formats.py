@@ -13,9 +13,9 @@ from broken import DATA
 from linkages import MACHINES, WRITERS, assert_same, loaded, postures, rewritten
 
 import crane
-from crane.description import parameters, read
-from crane.errors import CraneError, CraneWarning
-from crane.formats import write_machine, write_mjcf, write_urdf_plus
+from crane.common.errors import CraneError, CraneWarning
+from crane.description import parameters
+from crane.formats import read, write_machine, write_mjcf, write_urdf_plus
 
 
 @pytest.fixture(params=MACHINES)
@@ -62,7 +62,7 @@ def test_mujoco_computes_the_written_machine_alike(case, tmp_path):
         )
 
 
-@pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+@pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 @pytest.mark.parametrize("kind", WRITERS)
 @pytest.mark.parametrize("name", ["mini_forwarder", "patu655", "kr300", "four_bar"])
 def test_round_trip_of_machine_files(name, kind, tmp_path):
@@ -93,7 +93,7 @@ def numbers(tree):
     return plain | limits | links
 
 
-@pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+@pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 @pytest.mark.parametrize("kind", ["urdf+", "machine"])
 @pytest.mark.parametrize("name", ["mini_forwarder", "patu655", "four_bar_loop.urdf"])
 def test_every_number_of_links_and_joints_is_kept(name, kind, tmp_path):

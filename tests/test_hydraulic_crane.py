@@ -8,7 +8,7 @@ import pytest
 import crane
 from crane.control import Sampled, Signals, TipVelocity, ValveDrive, ValvePD, joystick
 from crane.hydraulics.circuit import BALANCES
-from crane.paths import task_path
+from crane.motion.trajectories import task_path
 
 LOAD = {"payload.mass": 211.4}
 LIFT = 1  # column of X_lift

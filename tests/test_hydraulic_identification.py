@@ -7,20 +7,23 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import crane
-from crane.description.hydraulics import Counterbalance, Valve
-from crane.errors import InputError, RecordingError
-from crane.identification.cylinder_friction import cylinder_friction, direction_difference
-from crane.identification.cylinder_signals import (
+from crane.common.errors import InputError, RecordingError
+from crane.hydraulics.components import Counterbalance, Valve
+from crane.identification.hydraulics.cylinder_friction import (
+    cylinder_friction,
+    direction_difference,
+)
+from crane.identification.hydraulics.cylinder_signals import (
     cylinder_signals,
     noise_level,
     opening,
     spool_position,
 )
-from crane.identification.orifice_rows import terms
-from crane.identification.orifices import identify_orifices
-from crane.identification.steady import steady
-from crane.identification.valve import identify_valve
-from crane.identification.weak_form import Windows
+from crane.identification.hydraulics.orifice_rows import terms
+from crane.identification.hydraulics.orifices import identify_orifices
+from crane.identification.hydraulics.valve import identify_valve
+from crane.identification.signals.steady import steady
+from crane.identification.signals.weak_form import Windows
 
 # A lift of 8 t on one cylinder of the size of a forestry crane's; equations (21) to (23) below.
 MASS, LOAD, STROKE, LOWER = 8000.0, 40e3, 0.5, -0.1

@@ -7,11 +7,11 @@ import pytest
 from hydraulic_rig import COMPENSATED, ORIFICE, rig
 
 import crane
-from crane.check import check
+from crane.common.errors import CraneWarning, DescriptionError, InputError
+from crane.common.magnitudes import TURNING, USUAL, doubt
 from crane.control import Signals
-from crane.description import Supply
-from crane.description.magnitudes import TURNING, USUAL, doubt
-from crane.errors import CraneWarning, DescriptionError, InputError
+from crane.hydraulics import Supply
+from crane.machine.check import check
 
 
 def told(folder, **numbers):

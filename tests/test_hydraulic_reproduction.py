@@ -10,8 +10,8 @@ import pytest
 from test_cli import one_error, run
 
 import crane
-from crane.errors import RecordingError
-from crane.identification.fourier import Fourier
+from crane.common.errors import RecordingError
+from crane.identification.excitation.fourier import Fourier
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "scripts"))

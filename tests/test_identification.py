@@ -7,9 +7,9 @@ import pinocchio as pin
 import pytest
 
 import crane
-from crane.errors import InputError
-from crane.identification.base import base_parameters, group, random_samples
-from crane.identification.model import (
+from crane.common.errors import InputError
+from crane.identification.mechanics.base import base_parameters, group, random_samples
+from crane.identification.mechanics.model import (
     Along,
     Direction,
     GasScale,

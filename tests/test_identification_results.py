@@ -14,20 +14,20 @@ from scipy.interpolate import CubicSpline
 
 import crane
 from crane import cli
-from crane.errors import InputError, OutputError, RecordingError
-from crane.identification.division import divided
-from crane.identification.identify import identify
-from crane.identification.model import (
+from crane.common.errors import InputError, OutputError, RecordingError
+from crane.identification.mechanics.division import divided
+from crane.identification.mechanics.identify import identify
+from crane.identification.mechanics.model import (
     Inertial,
     RotorInertia,
     body_names,
     default_terms,
     friction,
 )
-from crane.identification.payload import estimate_payload
-from crane.identification.signals import Motion
-from crane.identification.write import write_machine, write_parameters
-from crane.view.identification_report import write_report
+from crane.identification.mechanics.payload import estimate_payload
+from crane.identification.mechanics.write import write_machine, write_parameters
+from crane.identification.signals.motion import Motion
+from crane.view.page.identification import write_report
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 NOISE = np.array([5e-3, 0.5, 0.3])  # [N m], [N], [N]

@@ -4,17 +4,17 @@ import dataclasses
 
 import numpy as np
 import pytest
+from rig import Rig, Tolerances, default_sensors
 
 import crane
-from crane.errors import InputError, RecordingError
-from crane.identification.base import base_parameters, random_samples
-from crane.identification.estimators import least_squares
-from crane.identification.excitation import excite
-from crane.identification.feasible import pseudo_inertia
-from crane.identification.identify import identify, motion_of
-from crane.identification.model import Inertial, Model, friction
-from crane.identification.signals import Motion
-from crane.rig import Rig, Tolerances, default_sensors
+from crane.common.errors import InputError, RecordingError
+from crane.identification.estimation.estimators import least_squares
+from crane.identification.excitation.excite import excite
+from crane.identification.mechanics.base import base_parameters, random_samples
+from crane.identification.mechanics.feasible import pseudo_inertia
+from crane.identification.mechanics.identify import identify, motion_of
+from crane.identification.mechanics.model import Inertial, Model, friction
+from crane.identification.signals.motion import Motion
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 NOISE = np.array([5e-3, 0.5, 0.3])  # [N m], [N], [N]

@@ -8,10 +8,10 @@ from scipy.integrate import solve_ivp
 
 import crane
 import crane.codegen.program
-import crane.integration
-from crane.errors import CraneWarning, SimulationError
+import crane.simulation.integration
+from crane.common.errors import CraneWarning, SimulationError
 
-pytestmark = pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,10 @@ class Push:
 def steps(monkeypatch):
     """How many steps were done in machine code and how many in Python."""
     done = {"compiled": 0, "python": 0}
-    run, advance = crane.integration.CompiledStepper.run, crane.integration.PythonStepper.advance
+    run, advance = (
+        crane.simulation.integration.CompiledStepper.run,
+        crane.simulation.integration.PythonStepper.advance,
+    )
 
     def counted_run(self, *rest):
         count = run(self, *rest)
@@ -90,8 +93,8 @@ def steps(monkeypatch):
         done["python"] += 1
         return advance(self, *rest)
 
-    monkeypatch.setattr(crane.integration.CompiledStepper, "run", counted_run)
-    monkeypatch.setattr(crane.integration.PythonStepper, "advance", counted_advance)
+    monkeypatch.setattr(crane.simulation.integration.CompiledStepper, "run", counted_run)
+    monkeypatch.setattr(crane.simulation.integration.PythonStepper, "advance", counted_advance)
     return done
 
 
@@ -210,7 +213,7 @@ def test_chunks_are_seamless(forwarder, path, steps, monkeypatch):
     whole = crane.simulate(forwarder, control, duration=0.253)
     assert steps["python"] == 0
     for chunk in (1, 7, 11, 252, 253, 254):
-        monkeypatch.setattr("crane.integration.steps._CHUNK", chunk)
+        monkeypatch.setattr("crane.simulation.integration.steps._CHUNK", chunk)
         shares = []
         parts = crane.simulate(forwarder, control, duration=0.253, progress=shares.append)
         assert off(parts, whole) < 1e-12
@@ -233,7 +236,7 @@ def test_durations_around_whole_chunks(springy, steps, count):
 def test_steps_that_machine_code_leaves_are_done_in_python(forwarder, path, monkeypatch):
     control = crane.PI(forwarder, path)
     whole = crane.simulate(forwarder, control, duration=0.1)
-    run = crane.integration.CompiledStepper.run
+    run = crane.simulation.integration.CompiledStepper.run
     left = []
 
     def hesitant(self, times, *rest):
@@ -242,7 +245,7 @@ def test_steps_that_machine_code_leaves_are_done_in_python(forwarder, path, monk
         left.append(len(few))
         return run(self, few, *rest)
 
-    monkeypatch.setattr(crane.integration.CompiledStepper, "run", hesitant)
+    monkeypatch.setattr(crane.simulation.integration.CompiledStepper, "run", hesitant)
     parts = crane.simulate(forwarder, control, duration=0.1)
     assert len(left) > 5
     assert off(parts, whole) < 1e-11
@@ -307,7 +310,7 @@ def test_a_step_that_fails_after_a_whole_chunk_is_told(forwarder, steps, monkeyp
     wanted = failing(steps, free, Push(0.0, 200.0, 0.0), duration=1.0, path="pinocchio")
     before = round(float(wanted.split()[3]) / 1e-3)  # "at t = 0.088 s: .."
     for chunk in (1, 2, 3, before - 1, before):
-        monkeypatch.setattr("crane.integration.steps._CHUNK", chunk)
+        monkeypatch.setattr("crane.simulation.integration.steps._CHUNK", chunk)
         found = failing(steps, free, Push(0.0, 200.0, 0.0), duration=1.0)
         assert found[:50] == wanted[:50]
 

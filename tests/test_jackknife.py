@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from crane.identification.estimators import huber, least_squares, weighted
-from crane.identification.jackknife import Jackknife
-from crane.identification.noise import Noise
+from crane.identification.estimation.estimators import huber, least_squares, weighted
+from crane.identification.estimation.jackknife import Jackknife
+from crane.identification.estimation.noise import Noise
 
 
 def test_leaving_out_in_closed_form_is_leaving_out():

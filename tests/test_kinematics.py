@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import crane
-from crane.errors import InputError, LimitError, UnreachableTipError
+from crane.common.errors import InputError, LimitError, UnreachableTipError
 
 STROKE = 0.030  # [m]
 

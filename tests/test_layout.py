@@ -5,13 +5,19 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "crane"
 
-# A module may import those before it. Within a room, modules may not form a circle either.
+# A room may import those before it. Within a room, modules may not form a circle either.
 ORDER = [
-    "errors", "samples", "units", "output", "npz", "timeseries", "codegen", "description",
-    "closure", "machine", "check", "formats", "dynamics", "kinematics", "workspaces", "hydraulics",
-    "paths", "control", "integration", "recording", "logs", "measured", "summary", "simulation",
-    "replays", "batch", "studies", "rig", "identification", "view", "live", "runs", "demo", "cli",
+    "common", "codegen", "hydraulics", "description", "formats", "closure", "machine",
+    "recordings", "dynamics", "motion", "control", "simulation", "identification", "studies",
+    "view", "cli",
 ]  # fmt: skip
+
+
+def module_of(path: Path) -> str:
+    """Dotted name, of a folder's `__init__.py` that of the folder."""
+    return ".".join(("crane", *path.relative_to(PACKAGE).with_suffix("").parts)).removesuffix(
+        ".__init__"
+    )
 
 
 def room(module: str) -> str:
@@ -31,7 +37,9 @@ def imports(path: Path):
         if id(node) in skipped:
             continue
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("crane."):
-            yield node.module
+            for name in node.names:  # a module of a folder, or a name of a module
+                inner = PACKAGE.joinpath(*node.module.split(".")[1:], f"{name.name}.py")
+                yield f"{node.module}.{name.name}" if inner.exists() else node.module
         elif isinstance(node, ast.Import):
             yield from (name.name for name in node.names if name.name.startswith("crane."))
 
@@ -40,28 +48,25 @@ def files():
     return [path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py"]
 
 
-def test_every_file_has_a_room():
-    rooms = {path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in files()}
-    assert rooms == set(ORDER)
+def test_every_file_is_in_a_room():
+    assert {path.relative_to(PACKAGE).parts[0] for path in files()} == set(ORDER)
 
 
 def test_imports_run_downwards():
     upwards = []
     for path in files():
-        here = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+        here = room(module_of(path))
         for module in imports(path):
             if room(module) != here and ORDER.index(room(module)) > ORDER.index(here):
-                upwards.append(f"{path.name} imports {module}")
+                upwards.append(f"{module_of(path)} imports {module}")
     assert not upwards
 
 
 def test_no_circles_within_a_room():
     graph = {}
     for path in files():
-        relative = path.relative_to(PACKAGE)
-        if len(relative.parts) == 2 and relative.name != "__init__.py":
-            name = f"crane.{relative.parts[0]}.{relative.stem}"
-            graph[name] = {m for m in imports(path) if m.count(".") == 2 and room(m) == room(name)}
+        name = module_of(path)
+        graph[name] = {m for m in imports(path) if room(m) == room(name) and m != name}
     while graph:
         free = [name for name, needs in graph.items() if not needs & graph.keys()]
         assert free, f"circle among {sorted(graph)}"
@@ -73,5 +78,18 @@ def test_no_module_hides_a_name_of_the_package():
     """Importing crane.x puts the module in the place of a function crane.x."""
     import crane
 
-    modules = {path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in files()}
-    assert not modules & set(crane.__all__)
+    assert not set(ORDER) & set(crane.__all__)
+
+
+def test_no_module_hides_a_name_of_its_folder():
+    """A folder hands on no name that one of its modules has."""
+    hidden = []
+    for path in PACKAGE.rglob("__init__.py"):
+        modules = {other.stem for other in path.parent.glob("*.py")}
+        modules |= {other.name for other in path.parent.iterdir() if other.is_dir()}
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom):
+                hidden += [
+                    f"{path.parent.name}: {n.name}" for n in node.names if n.name in modules
+                ]
+    assert not hidden

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from work import at_most
 
 import crane
-from crane.errors import CraneWarning, InputError, RecordingError
-from crane.live.playback import Playback
-from crane.live.session import Session, round_up
-from crane.live.words import numbers, warning
-from crane.recording import Recording
+from crane.common.errors import CraneWarning, InputError, RecordingError
+from crane.recordings.recording import Recording
+from crane.view.live.playback import Playback
+from crane.view.live.session import Session, round_up
+from crane.view.live.words import numbers, warning
 
 MAIN = "from crane.cli import main; main()"
 
@@ -215,9 +215,9 @@ def group_is_empty(group):
 def test_the_machine_is_in_view_and_above_the_panel_of_a_phone(patu, aspect):
     """Projected corners of all shapes: within the window, and of one upright in its upper part."""
     pytest.importorskip("viser")
-    from crane.live.serve import start, stop
-    from crane.live.stage import Stage, _corners
-    from crane.view.visuals import read_visuals
+    from crane.view.live.serve import start, stop
+    from crane.view.live.stage import Stage, _corners
+    from crane.view.page.visuals import read_visuals
 
     session = Session(patu)
     server = start("127.0.0.1", 0)
@@ -259,8 +259,8 @@ def test_a_slider_moves_the_picture_with_little_work(patu):
     pytest.importorskip("viser")
     from queue import SimpleQueue
 
-    from crane.live.page import Page
-    from crane.live.serve import start, stop
+    from crane.view.live.page import Page
+    from crane.view.live.serve import start, stop
 
     session = Session(patu)
     server = start("127.0.0.1", 0)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import crane
-from crane import timeseries
-from crane.errors import RecordingError
-from crane.logs import read_log
-from crane.recording import Recording
+from crane.common.errors import RecordingError
+from crane.recordings import timeseries
+from crane.recordings.logs import read_log
+from crane.recordings.recording import Recording
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
 COLUMNS = Path(__file__).parents[1] / "scripts" / "columns"

@@ -18,8 +18,8 @@ from oracles import (
 )
 
 import crane
+from crane.common.errors import InputError, LimitError, MechanismError
 from crane.description import examples
-from crane.errors import InputError, LimitError, MechanismError
 
 ELEVEN = {"q1", "q2", "q3", "q4", "X1", "q6", "q7", "q9", "q10", "X2", "q11"}
 
@@ -310,7 +310,7 @@ class TestDrivenBy:
             mini.driven_by(names)
 
 
-@pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+@pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 @pytest.mark.parametrize("name", ["talos_reduced", "ur5_robot", "hyq_no_sensors", "kinova"])
 def test_a_tree_is_what_pinocchio_makes_of_the_urdf(name):
     """Joints, frames and their order, placements to the last digit, inertias to rounding."""

@@ -10,10 +10,10 @@ import pytest
 from broken import MINI, copy_machine, swap
 
 import crane
-from crane.errors import CraneError, CraneWarning, RecordingError
-from crane.measured import read_measured
-from crane.recording import Recording
-from crane.runs import read_run
+from crane.cli.runs import read_run
+from crane.common.errors import CraneError, CraneWarning, RecordingError
+from crane.recordings.measured import read_measured
+from crane.recordings.recording import Recording
 
 AREA_A, AREA_B = 3.14e-4, 2.01e-4  # [m2] of both cylinders
 

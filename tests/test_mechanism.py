@@ -4,7 +4,7 @@ import pytest
 from broken import GROUND, MINI, ROCKER, assert_refused, case, copy_machine, swap
 
 import crane
-from crane.errors import CraneError
+from crane.common.errors import CraneError
 
 CHAIN_B1 = "urdf/mini_forwarder/chain_b1.urdf"
 CHAIN_C = "urdf/mini_forwarder/chain_c.urdf"
@@ -30,7 +30,7 @@ ROD_INERTIAL = """    <inertial>
     </inertial>
 """
 
-pytestmark = pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 
 # A four-bar linkage.
 MECHANISM = [

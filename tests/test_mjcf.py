@@ -12,8 +12,8 @@ from broken import DATA
 from linkages import WRITERS, assert_same, postures, rewritten
 
 import crane
-from crane.description.mjcf_left_out import touching
-from crane.errors import CraneError, CraneWarning
+from crane.common.errors import CraneError, CraneWarning
+from crane.formats.mjcf.left_out import touching
 
 TREE = """<mujoco model="tree">
   <compiler angle="degree" eulerseq="zyx"/>

@@ -7,9 +7,9 @@ import zipfile
 import numpy as np
 import pytest
 
-from crane import npz
-from crane.errors import RecordingError
-from crane.timeseries import read
+from crane.common.errors import RecordingError
+from crane.recordings import npz
+from crane.recordings.timeseries import read
 
 TIME = np.arange(5) / 100
 

@@ -5,11 +5,11 @@ import pytest
 
 import crane
 from crane.cli.shared import by_joint
-from crane.errors import CraneError, InputError, RecordingError, at, one_line
-from crane.samples import FARTHEST, LARGEST, SMALLEST, Brief, as_count, as_number, as_seed
+from crane.common.errors import CraneError, InputError, RecordingError, at, one_line
+from crane.common.samples import FARTHEST, LARGEST, SMALLEST, Brief, as_count, as_number, as_seed
+from crane.common.units import number, quantity, reading
+from crane.recordings.summary import subject, title
 from crane.studies.run import Job, variant
-from crane.summary import subject, title
-from crane.units import number, quantity, reading
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 import crane
-from crane.check import check
-from crane.errors import CraneWarning
+from crane.common.errors import CraneWarning
+from crane.machine.check import check
 
 ROBOTS = Path(__file__).parents[2] / "shared/data/third_party/parallel_robots"
 

@@ -2,8 +2,8 @@ import os
 
 import pytest
 
-from crane.errors import OutputError
-from crane.output import replacing
+from crane.common.errors import OutputError
+from crane.common.output import replacing
 
 
 def test_file_appears_whole_at_the_end(tmp_path):

@@ -12,11 +12,11 @@ import pytest
 from work import at_most
 
 import crane
-from crane.errors import CraneWarning, RecordingError
-from crane.recording import Recording
-from crane.view.page_channels import Grid, columns, groups
-from crane.view.page_summary import limits_hit, mechanical_work, run_summary
-from crane.view.visuals import read_visuals
+from crane.common.errors import CraneWarning, RecordingError
+from crane.recordings.recording import Recording
+from crane.view.page.channels import Grid, columns, groups
+from crane.view.page.summary import limits_hit, mechanical_work, run_summary
+from crane.view.page.visuals import read_visuals
 
 WEBGL = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 CORNERS = [[0.0, 0.0221, 0.0108], [0.4, 0.03, 0.0], [1.1, 0.0, 0.03], [-0.7, 0.002, 0.004]]

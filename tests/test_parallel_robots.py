@@ -7,7 +7,7 @@ import pytest
 from broken import DATA
 
 import crane
-from crane.errors import CraneError
+from crane.common.errors import CraneError
 
 
 def delta(folder, *changes):

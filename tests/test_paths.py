@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import brentq
 
 import crane
-from crane.errors import InputError, LimitError, UnreachableTipError
+from crane.common.errors import InputError, LimitError, UnreachableTipError
 
 MM = 1e-3
 

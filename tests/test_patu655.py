@@ -9,8 +9,8 @@ import pytest
 from oracles import COMPLEX_STEP, GRAVITY, angle, at_angle, circles, constraint_dynamics, turned
 
 import crane
-from crane.view import build_scene
-from crane.view.scene import link_poses
+from crane.view.page import build_scene
+from crane.view.page.scene import link_poses
 
 # pins in the frames of their bodies, (x, y) in the plane
 LIFT_PIN, LIFT_BASE = np.array([-0.09, 1.4261]), np.array([0.17, 0.386113])

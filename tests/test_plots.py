@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from crane.errors import OutputError
-from crane.recording import Recording
-from crane.view.plots import plot_recording, recording_figure
+from crane.common.errors import OutputError
+from crane.recordings.recording import Recording
+from crane.view.plots.recording import plot_recording, recording_figure
 
 SIGNATURES = {".png": b"\x89PNG\r\n", ".svg": b"<?xml", ".pdf": b"%PDF"}
 
@@ -181,7 +181,7 @@ def test_unknown_format_writes_nothing(tmp_path, recording, name):
 
 
 def test_no_global_state_of_pyplot():
-    code = "import sys, crane.view.plots; print('matplotlib.pyplot' in sys.modules)"
+    code = "import sys, crane.view.plots.recording; print('matplotlib.pyplot' in sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "False"
 

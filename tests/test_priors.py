@@ -5,9 +5,9 @@ import pytest
 from broken import DATA
 
 import crane
-from crane.errors import InputError
-from crane.identification.identify import Motion, identify
-from crane.identification.model import Model
+from crane.common.errors import InputError
+from crane.identification.mechanics.identify import Motion, identify
+from crane.identification.mechanics.model import Model
 
 TIME = np.arange(0, 8, 0.01)
 W = np.pi

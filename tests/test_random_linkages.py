@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import crane
-from crane.errors import MechanismError
+from crane.common.errors import MechanismError
 
 DRAWN = Counter()  # reasons of draws that were thrown away, and "kept"
 POSTURES = Counter()  # likewise, of postures of those that were kept

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import crane
-from crane.errors import ClosureError, CraneWarning
+from crane.common.errors import ClosureError, CraneWarning
 from crane.studies.measures import of_strokes
 
 BASE, ARMS = np.array([0.3, 1.0]), (2.5, 1.6, 1.1)  # joint of the first arm, lengths [m]

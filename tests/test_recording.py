@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crane.errors import OutputError, RecordingError
-from crane.recording import Recording
+from crane.common.errors import OutputError, RecordingError
+from crane.recordings.recording import Recording
 
 
 def make(**changes):

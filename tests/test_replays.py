@@ -5,11 +5,11 @@ import pytest
 from hydraulic_rig import COMPENSATED, rig
 
 import crane
-from crane import timeseries
+from crane.common.errors import CraneError, CraneWarning, RecordingError
 from crane.control import Signals
-from crane.errors import CraneError, CraneWarning, RecordingError
-from crane.replays import Channel, replay
-from crane.timeseries import Table
+from crane.recordings import timeseries
+from crane.recordings.timeseries import Table
+from crane.simulation.replays import Channel, replay
 
 
 @pytest.fixture

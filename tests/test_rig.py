@@ -5,11 +5,12 @@ import dataclasses
 import numpy as np
 import pinocchio as pin
 import pytest
+from rig import Converter, Rig, Sensors, Tolerances, converter, rig
 
 import crane
-from crane.description import Friction, changed, parameters, read
-from crane.errors import InputError, LimitError
-from crane.rig import Converter, Rig, Sensors, Tolerances, converter, rig
+from crane.common.errors import InputError, LimitError
+from crane.description import Friction, changed, parameters
+from crane.formats import read
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 

@@ -4,12 +4,12 @@ import re
 import numpy as np
 import pytest
 
-import crane.demo
-from crane.errors import OutputError
-from crane.output import file_name, staging
-from crane.recording import Recording
-from crane.runs import check_folder, check_free, read_run, write_run
-from crane.summary import subject, title
+import crane.cli.demo
+from crane.cli.runs import check_folder, check_free, read_run, write_run
+from crane.common.errors import OutputError
+from crane.common.output import file_name, staging
+from crane.recordings.recording import Recording
+from crane.recordings.summary import subject, title
 
 
 @pytest.fixture
@@ -162,10 +162,10 @@ def test_demo_that_stops_leaves_nothing(tmp_path, monkeypatch, error, recording)
         if folder.name == "return":  # the second task
             raise error
 
-    monkeypatch.setattr(crane.demo, "simulate", lambda *_, **__: recording)
-    monkeypatch.setattr(crane.demo, "write_views", stop)
+    monkeypatch.setattr(crane.cli.demo, "simulate", lambda *_, **__: recording)
+    monkeypatch.setattr(crane.cli.demo, "write_views", stop)
     with pytest.raises(BaseException, match="no room|^$"):
-        crane.demo.run_demo(tmp_path / "demo", lambda share: None)
+        crane.cli.demo.run_demo(tmp_path / "demo", lambda share: None)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from crane.errors import CraneWarning, InputError, RecordingError
-from crane.identification import checks, signals, smoother
-from crane.identification.checks import check, check_forces
-from crane.identification.signals import Motion, differentiate
+from crane.common.errors import CraneWarning, InputError, RecordingError
+from crane.identification.mechanics import checks
+from crane.identification.mechanics.checks import check, check_forces
+from crane.identification.signals import motion as signals
+from crane.identification.signals import smoother
+from crane.identification.signals.motion import Motion, differentiate
 
 JOINTS, UNITS = ("q1", "X1"), {"q1": "rad", "X1": "m"}
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import crane
-from crane.errors import CraneWarning, InputError, LimitError, SimulationError
+from crane.common.errors import CraneWarning, InputError, LimitError, SimulationError
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +149,7 @@ def test_progress_ends_at_one(forwarder):
     assert shares == sorted(shares) and shares[-1] == 1.0
 
 
-@pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+@pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 def test_a_step_that_is_too_long_is_told(forwarder):
     path = crane.task_path(forwarder, "return")
     with pytest.warns(CraneWarning, match="step of 0.005 s is too long"):
@@ -159,7 +159,7 @@ def test_a_step_that_is_too_long_is_told(forwarder):
         crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.5, step=5e-3)
 
 
-@pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+@pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 def test_a_machine_that_leaves_its_branch_ends_in_one_line(forwarder):
     free = forwarder.replace(friction={}, end_stops=())
     with pytest.raises(SimulationError, match=r"^at t = 0\.\d+ s: loop 'A._eye'") as caught:

@@ -13,11 +13,11 @@ from conftest import DATA
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 import crane
+from crane.common.errors import CraneWarning, InputError, LimitError, OutOfReachError, OutputError
 from crane.description import bundled
-from crane.errors import CraneWarning, InputError, LimitError, OutOfReachError, OutputError
-from crane.view.sketch import sketch_figure
-from crane.view.sketch_plane import find_plane
-from crane.view.sketch_sheet import symbol
+from crane.view.sketch.draw import sketch_figure
+from crane.view.sketch.plane import find_plane
+from crane.view.sketch.sheet import symbol
 
 PLANAR = ["four_bar.yaml", "slider_crank.yaml", "five_bar.urdf"]
 MAIN = "from crane.cli import main; main()"
@@ -149,7 +149,7 @@ def test_axes_are_equal_and_named_in_metres(machines):
 
 def test_cylinders_reach_from_pin_to_pin(mini):
     """Barrels begin at their pins, rods end at theirs, whatever the strokes."""
-    from crane.view.sketch_mechanism import project
+    from crane.view.sketch.mechanism import project
 
     for q_a in random_postures(mini, 10):
         q = mini.closure.solve(q_a)

@@ -6,11 +6,11 @@ import pytest
 from broken import DATA, LOOPED, copy_machine, swap
 
 import crane
-import crane.view.visuals
-from crane.check import check
-from crane.description.meshes import mesh_file
-from crane.errors import CraneWarning
+import crane.view.page.visuals
+from crane.common.errors import CraneWarning
 from crane.formats import write_urdf_plus
+from crane.formats.visuals.meshes import mesh_file
+from crane.machine.check import check
 
 COUPLER = '    <parent link="crank_arm"/>\n'
 LIMIT = '<limit lower="-1" upper="1" effort="10" velocity="5"/>'
@@ -118,4 +118,4 @@ def test_a_mesh_that_is_not_there_is_a_finding(name, tmp_path):
         (finding,) = check(path).findings
         assert "is not there, correct its path or install the package" in finding.what
         with pytest.warns(CraneWarning, match="mesh files? "):
-            crane.view.visuals.read_visuals(crane.load(path))
+            crane.view.page.visuals.read_visuals(crane.load(path))

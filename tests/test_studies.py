@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 import crane
-from crane.errors import ClosureError, InputError
-from crane.studies import measures, ranges
+from crane.cli.ranges import ranges
+from crane.common.errors import ClosureError, InputError
+from crane.studies import measures
 from crane.studies.measures import of_strokes
-from crane.view.study_plots import plot_study
+from crane.view.plots.study import plot_study
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 PIN = {"link3_G.x": np.linspace(0.08, 0.11, 4), "link3_G.y": [-0.01, 0.0]}

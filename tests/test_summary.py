@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from crane.recording import Recording
-from crane.summary import points, rms, summarize
+from crane.recordings.recording import Recording
+from crane.recordings.summary import points, rms, summarize
 
 
 def make(time, **channels):

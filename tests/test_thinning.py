@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from crane.view import thinning
+from crane.view.plots import thinning
 
 
 @pytest.mark.parametrize("count", [1, 7, 100, 101, 999, 4321])

@@ -7,7 +7,7 @@ import warnings
 import pytest
 
 import crane
-from crane.errors import CraneWarning
+from crane.common.errors import CraneWarning
 
 ARM = """<robot name="swinging">
   <link name="base"/>

@@ -5,7 +5,7 @@ from broken import GROUND, LOOPED, ROCKER, Broken, assert_refused, case, swap, w
 
 import crane
 
-pytestmark = pytest.mark.filterwarnings("ignore::crane.errors.CraneWarning")
+pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 
 # What is not XML, or not the XML of a robot.
 XML = [

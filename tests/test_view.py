@@ -12,14 +12,14 @@ import pinocchio as pin
 import pytest
 
 import crane
-from crane.description.visuals import Box, Cylinder, Mesh
-from crane.errors import CraneError, CraneWarning, InputError, OutputError, RecordingError
-from crane.recording import Recording
-from crane.view import build_scene, report
-from crane.view.page_arrays import quantised
-from crane.view.page_motion import decimate, frame_rows, motion, payload_place, tree
-from crane.view.scene import link_poses
-from crane.view.visuals import read_visuals, skeleton
+from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, RecordingError
+from crane.formats.visuals.visuals import Box, Cylinder, Mesh
+from crane.recordings.recording import Recording
+from crane.view.page import build_scene, report
+from crane.view.page.arrays import quantised
+from crane.view.page.motion import decimate, frame_rows, motion, payload_place, tree
+from crane.view.page.scene import link_poses
+from crane.view.page.visuals import read_visuals, skeleton
 
 CORNERS = [[0.0, 0.0221, 0.0108], [0.4, 0.03, 0.0], [1.1, 0.0, 0.03], [-0.7, 0.002, 0.004]]
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import crane
-from crane.check import check
-from crane.description import mesh_process, meshes
-from crane.description.visuals import PLAIN, Box, Cylinder, Mesh, Sphere, read_drawn
-from crane.description.xml import XmlFile
-from crane.errors import CraneWarning
-from crane.view import report
-from crane.view.visuals import read_visuals
+from crane.common.errors import CraneWarning
+from crane.formats.visuals import mesh_process, meshes
+from crane.formats.visuals.visuals import PLAIN, Box, Cylinder, Mesh, Sphere, read_drawn
+from crane.formats.xml import XmlFile
+from crane.machine.check import check
+from crane.view.page import report
+from crane.view.page.visuals import read_visuals
 
 ARM = """<robot name="arm">
   <link name="foot">

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 import crane
 from crane.cli.shared import app
-from crane.errors import InputError
-from crane.workspaces import workspace
-from crane.workspaces.patch import last_closed
+from crane.common.errors import InputError
+from crane.motion.workspaces import workspace
+from crane.motion.workspaces.patch import last_closed
 
 CRANK, COUPLER, ROCKER, GROUND = 0.2, 0.4, 0.3, 0.4  # of data/four_bar.yaml
 

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from crane.cli.shared import Change, Force, Lock, MachineName, app, load, status
-from crane.errors import InputError, known
+from crane.common.errors import InputError, known
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from crane.machine import Machine
-    from crane.recording import Recording
+    from crane.recordings.recording import Recording
 
 MODELS = ("orifices", "valve", "friction")
 
@@ -56,8 +56,8 @@ def circuit(
     """Find bulk modulus and orifices, the valve's curve, or the friction of one cylinder."""
     # its matrices are small: threads would only wait for each other
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from crane.output import staging
-    from crane.runs import check_folder, read_run
+    from crane.cli.runs import check_folder, read_run
+    from crane.common.output import staging
 
     if model not in MODELS:
         raise InputError(f"model '{model}' is unknown, {known(MODELS, model)}")
@@ -100,8 +100,8 @@ def _orifices(
     period: float | None,
     judge: "Recording | None",
 ) -> "tuple[str, Figure]":
-    from crane.identification.orifices import identify_orifices
-    from crane.view.hydraulic_figures import sides_figure
+    from crane.identification.hydraulics.orifices import identify_orifices
+    from crane.view.plots.hydraulics import sides_figure
 
     found = identify_orifices(machine, runs, joint, method, period=period)
     shown = {f"recording {i + 1}": both for i, both in enumerate(found.training)}
@@ -114,8 +114,8 @@ def _orifices(
 
 
 def _valve(machine: "Machine", run: "Recording", joint: str) -> "tuple[str, Figure]":
-    from crane.identification.valve import identify_valve
-    from crane.view.hydraulic_figures import valve_figure
+    from crane.identification.hydraulics.valve import identify_valve
+    from crane.view.plots.hydraulics import valve_figure
 
     curve = identify_valve(machine, run, joint)
     unit = machine.unit(joint)
@@ -123,8 +123,8 @@ def _valve(machine: "Machine", run: "Recording", joint: str) -> "tuple[str, Figu
 
 
 def _friction(machine: "Machine", run: "Recording", joint: str) -> "tuple[str, Figure]":
-    from crane.identification.cylinder_friction import cylinder_friction
-    from crane.view.hydraulic_figures import friction_figure
+    from crane.identification.hydraulics.cylinder_friction import cylinder_friction
+    from crane.view.plots.hydraulics import friction_figure
 
     found = cylinder_friction(machine, run, joint)
     unit = machine.unit(joint)

@@ -6,17 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crane.cli.shared import (
-    Force,
-    MachineName,
-    NoOpen,
-    Out,
-    OutFile,
-    app,
-    load,
-    progress_bar,
-)
-from crane.errors import InputError
+from crane.cli.shared import Force, MachineName, NoOpen, Out, OutFile, app, load, progress_bar
+from crane.common.errors import InputError
 
 if TYPE_CHECKING:
     from crane.machine import Machine
@@ -52,7 +43,7 @@ def info(
     """Show what a machine consists of."""
     if parameters:
         from crane.description import parameters as parameters_of
-        from crane.description import read
+        from crane.formats import read
 
         values = parameters_of(read(machine))
         width = max(map(len, values), default=0)
@@ -78,9 +69,9 @@ def view(
     force: Force = False,
 ) -> None:
     """Write a page that shows a machine, or a run with its forces and numbers, and open it."""
-    from crane.output import file_name
-    from crane.runs import PAGE, check_free, machine_of, read_run
-    from crane.view.page import open_in_browser, report
+    from crane.cli.runs import PAGE, check_free, machine_of, read_run
+    from crane.common.output import file_name
+    from crane.view.page.build import open_in_browser, report
 
     recording = other = None
     if _is_run(what):
@@ -113,8 +104,8 @@ def plot(
     force: Force = False,
 ) -> None:
     """Plot displacements, velocities, forces and tip path of a run (png, svg or pdf)."""
-    from crane.runs import FIGURE, check_free, read_run
-    from crane.view.plots import plot_recording
+    from crane.cli.runs import FIGURE, check_free, read_run
+    from crane.view.plots.recording import plot_recording
 
     recording = read_run(run, None if machine is None else load(machine))
     figure = out or (run if run.is_dir() else run.parent) / FIGURE
@@ -126,8 +117,8 @@ def plot(
 @app.command()
 def demo(out: Out = Path("demo-output"), force: Force = False) -> None:
     """Simulate the three published trajectories of the reduced-scale forwarder."""
-    from crane.demo import run_demo
-    from crane.runs import FIGURE, PAGE, check_folder
+    from crane.cli.demo import run_demo
+    from crane.cli.runs import FIGURE, PAGE, check_folder
 
     check_folder(out, force)
     with progress_bar("simulating") as progress:
@@ -144,8 +135,8 @@ def _is_run(what: str) -> bool:
 
 
 def _describe(machine: "Machine") -> Iterator[str]:
+    from crane.common.units import quantity
     from crane.dynamics import Dynamics
-    from crane.units import quantity
 
     closure = machine.closure
     structure = closure.structure

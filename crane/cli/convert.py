@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from crane.cli.shared import Change, Force, Lock, MachineName, _place, app, load
-from crane.errors import InputError, known
+from crane.common.errors import InputError, known
 
 _FORMATS = ("urdf+", "mjcf", "machine")
 _SUFFIXES = {".urdf": "urdf+", ".xml": "mjcf", ".mjcf": "mjcf"}
@@ -30,8 +30,8 @@ def convert(
     force: Force = False,
 ) -> None:
     """Write a machine as one URDF with loops, as MJCF, or as machine file with sub-chains."""
+    from crane.cli.runs import check_folder, check_free
     from crane.formats import write_machine, write_mjcf, write_urdf_plus
-    from crane.runs import check_folder, check_free
 
     kind = to or _SUFFIXES.get(out.suffix.lower(), "machine")
     if kind not in _FORMATS:
@@ -67,9 +67,9 @@ def import_log(
     force: Force = False,
 ) -> None:
     """Write the recording that is in the log of another program."""
-    from crane import timeseries
-    from crane.logs import read_log
-    from crane.runs import check_free
+    from crane.cli.runs import check_free
+    from crane.recordings import timeseries
+    from crane.recordings.logs import read_log
 
     if out.suffix.lower() != ".csv":
         raise InputError(f"{out}: a recording is written as .csv, name it so")

@@ -50,8 +50,8 @@ def study(
     force: Force = False,
 ) -> None:
     """Measure variants of a machine: any parameters over a grid or at random."""
-    from crane.runs import check_folder, write_study
-    from crane.studies import ranges
+    from crane.cli.ranges import ranges
+    from crane.cli.runs import check_folder, write_study
     from crane.studies import study as run
 
     check_folder(out, force)
@@ -90,10 +90,10 @@ def excite(
     """Find a periodic motion that tells most about a machine's parameters."""
     # its matrices are small: threads would only wait for each other
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from crane.identification.excitation import excite as run
-    from crane.output import staging
-    from crane.runs import check_folder
-    from crane.view.excitation_plots import plot_excitation
+    from crane.cli.runs import check_folder
+    from crane.common.output import staging
+    from crane.identification.excitation.excite import excite as run
+    from crane.view.plots.excitation import plot_excitation
 
     check_folder(out, force)
     loaded = load(machine)
@@ -143,10 +143,10 @@ def identify(
     force: Force = False,
 ) -> None:
     """Find a machine's parameters from a recording, and how well they predict."""
-    from crane.identification.identify import identify as run
-    from crane.identification.write import check_rewritable
-    from crane.runs import check_folder, read_run, write_identification
-    from crane.samples import as_number
+    from crane.cli.runs import check_folder, read_run, write_identification
+    from crane.common.samples import as_number
+    from crane.identification.mechanics.identify import identify as run
+    from crane.identification.mechanics.write import check_rewritable
 
     check_folder(out, force)
     loaded = load(machine, lock)
@@ -192,8 +192,8 @@ def payload(
     trust: Trust = False,
 ) -> None:
     """Estimate mass and centre of mass of what a machine carries from a recording."""
-    from crane.identification.payload import estimate_payload
-    from crane.runs import read_run
+    from crane.cli.runs import read_run
+    from crane.identification.mechanics.payload import estimate_payload
 
     loaded = load(machine, lock)
     with status(f"reading {recording.name}"):

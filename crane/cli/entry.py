@@ -9,19 +9,8 @@ from typing import Annotated
 import typer
 
 import crane
-from crane.cli import (  # noqa: F401  register their commands
-    check,
-    circuit,
-    commands,
-    convert,
-    design,
-    live,
-    pictures,
-    simulate,
-    workspace,
-)
 from crane.cli.shared import app, say
-from crane.errors import CraneError, CraneWarning, one_line
+from crane.common.errors import CraneError, CraneWarning, one_line
 
 _INTERRUPTED = 130
 

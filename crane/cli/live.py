@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from crane.cli.shared import Change, Lock, app, load
-from crane.errors import InputError
+from crane.common.errors import InputError
 
 
 @app.command()
@@ -32,10 +32,10 @@ def live(
     lock: Lock = None,
 ) -> None:
     """Move a machine with sliders in a browser, its loops closed at every move."""
-    from crane.live.playback import Playback
-    from crane.live.serve import serve
-    from crane.live.session import Session
-    from crane.runs import machine_of, read_run
+    from crane.cli.runs import machine_of, read_run
+    from crane.view.live.playback import Playback
+    from crane.view.live.serve import serve
+    from crane.view.live.session import Session
 
     recording = None
     if Path(what).is_dir() or Path(what).suffix.lower() in (".csv", ".npz"):

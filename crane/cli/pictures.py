@@ -5,21 +5,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crane.cli.shared import (
-    Change,
-    Force,
-    Lock,
-    MachineName,
-    OutFile,
-    app,
-    by_joint,
-    load,
-)
-from crane.errors import InputError, known
+from crane.cli.shared import Change, Force, Lock, MachineName, OutFile, app, by_joint, load
+from crane.common.errors import InputError, known
 
 if TYPE_CHECKING:
+    from crane.common.samples import Array
     from crane.machine import Machine
-    from crane.samples import Array
 
 
 @app.command()
@@ -43,9 +34,9 @@ def sketch(
     force: Force = False,
 ) -> None:
     """Draw the mechanism of a machine (png, svg or pdf)."""
-    from crane.output import file_name
-    from crane.runs import check_free
-    from crane.view.sketch import sketch as draw
+    from crane.cli.runs import check_free
+    from crane.common.output import file_name
+    from crane.view.sketch.draw import sketch as draw
 
     loaded = load(machine, lock, change)
     figure = out or Path(file_name(loaded.name) + "_sketch.png")

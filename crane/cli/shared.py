@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crane.errors import InputError, OutputError
+from crane.common.errors import InputError, OutputError
 
 if TYPE_CHECKING:
     from crane.machine import Machine
@@ -76,7 +76,7 @@ def by_joint(
     Raises:
         InputError: Something else is written, a joint twice, or a number that nothing has.
     """
-    from crane.samples import as_number
+    from crane.common.samples import as_number
 
     out: dict[str, float] = {}
     for word in words or ():

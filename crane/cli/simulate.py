@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from crane.cli.shared import Change, Force, Lock, MachineName, Out, app, load, progress_bar
-from crane.errors import InputError, known
+from crane.common.errors import InputError, known
 
 if TYPE_CHECKING:
     from crane.control import Command, Controller
@@ -41,7 +41,7 @@ def simulate(
     force: Force = False,
 ) -> None:
     """Simulate a task, measured inputs, or the motion from the home posture on its own."""
-    from crane.runs import check_folder, write_run
+    from crane.cli.runs import check_folder, write_run
     from crane.simulation import simulate as run
 
     check_folder(out, force)
@@ -73,7 +73,7 @@ def _control(
     machine: "Machine", task: str | None, name: str | None
 ) -> "Controller | Command | None":
     from crane.control import controller, joystick, usual
-    from crane.paths import task_path
+    from crane.motion.trajectories import task_path
 
     if task is None:
         if name is not None:
@@ -91,8 +91,8 @@ def _control(
 
 
 def _replay(machine: "Machine", inputs: Path, out: Path, step: float) -> None:
-    from crane.replays import replay
-    from crane.runs import write_comparison
+    from crane.cli.runs import write_comparison
+    from crane.simulation.replays import replay
 
     with progress_bar("simulating") as progress:
         recording, comparison = replay(machine, inputs, step, progress)

@@ -22,8 +22,8 @@ def workspace(
     force: Force = False,
 ) -> None:
     """Map what the tip reaches, which strokes close, and where they are singular."""
-    from crane.runs import check_folder, write_workspace
-    from crane.workspaces import workspace as explore
+    from crane.cli.runs import check_folder, write_workspace
+    from crane.motion.workspaces import workspace as explore
 
     check_folder(out, force)
     loaded = load(machine, lock, change)

@@ -15,7 +15,7 @@ import pinocchio as pin
 from crane.closure.choice import slides, units
 from crane.closure.closure import Closure
 from crane.closure.structure import Indices
-from crane.samples import Array, solve
+from crane.common.samples import Array, solve
 
 _CLOSED = 1e-9
 _SAME = 1e-3  # [rad], or share of the machine's size: postures that are not different

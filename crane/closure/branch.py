@@ -6,8 +6,8 @@ import numpy as np
 
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import Indices, Structure
-from crane.errors import BranchEdgeError, MechanismError, OutOfReachError, WrongBranchError
-from crane.samples import Array, solve
+from crane.common.errors import BranchEdgeError, MechanismError, OutOfReachError, WrongBranchError
+from crane.common.samples import Array, solve
 
 _TOLERANCE = 1e-12  # of a closed loop, per metre of machine
 _EDGE = 1e-6  # relative least singular value of a block where the passive joints get undetermined

@@ -19,7 +19,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from crane.samples import Array
+from crane.common.samples import Array
 
 Indices = NDArray[np.intp]
 

@@ -14,9 +14,9 @@ from crane.closure.compiled import Cursor, FastClosure
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import Structure, analyse
 from crane.codegen import TooLongError, carefully
+from crane.common.errors import BranchEdgeError, InputError
+from crane.common.samples import Array, as_samples, per_sample, solve
 from crane.description import Coupling, LoopSpec
-from crane.errors import BranchEdgeError, InputError
-from crane.samples import Array, as_samples, per_sample, solve
 
 _FEW, _FAR = 100, 0.1  # samples worth sorting: how many, how far apart as a share of the range
 _STEPS = 8  # from home to a target that is far from the one before it

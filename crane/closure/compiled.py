@@ -11,7 +11,7 @@ from crane.closure.structure import Indices, Structure
 from crane.closure.traced import Constants, Loops, Posture, folded, geometry_of
 from crane.codegen import Layout, Number, Program, Tape, largest, maximum
 from crane.codegen.scalar import dot
-from crane.samples import Array
+from crane.common.samples import Array
 
 _STEEP = 1e3  # an entry of gamma above this is looked at closely by `Branch`
 _NEAR = 1e-6  # residual of a guess that is as good as closed

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
+from crane.common.errors import MechanismError
+from crane.common.samples import Array
 from crane.description import LOOP_TYPES, Coupling, LoopSpec
-from crane.errors import MechanismError
-from crane.samples import Array
 
 
 def frame_id(model: pin.Model, link: str) -> int:

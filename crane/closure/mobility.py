@@ -13,7 +13,7 @@ from scipy.linalg import qr
 
 from crane.closure.choice import Indices, motions, scales
 from crane.closure.equations import LoopEquations
-from crane.samples import Array, solve
+from crane.common.samples import Array, solve
 
 _STEP = 0.02  # of a joint's scale
 _MOVED = 0.05  # share of a step that a finite motion keeps at least

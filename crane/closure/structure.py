@@ -11,8 +11,8 @@ from crane.closure.blocks import Block, block_triangular
 from crane.closure.choice import proposals, words
 from crane.closure.equations import LoopEquations
 from crane.closure.mobility import locked_up, surplus_open
-from crane.errors import MechanismError
-from crane.samples import Array
+from crane.common.errors import MechanismError
+from crane.common.samples import Array
 
 Indices = NDArray[np.intp]
 

@@ -23,7 +23,7 @@ from crane.codegen.scalar import (
     subtract,
     times,
 )  # fmt: skip
-from crane.samples import Array
+from crane.common.samples import Array
 
 Vector = list[Number]
 _ROUNDING = 1e-15  # of a rotation by a right angle

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from crane.codegen.layout import Layout, laid_out
-from crane.codegen.llvm import Code
+from crane.codegen.llvm.engine import Code
 from crane.codegen.representation import Formula, Routine
 from crane.codegen.scalar import Number, needed
 

@@ -6,10 +6,10 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from crane.codegen import Number
+from crane.common.samples import Array, as_sample
 from crane.dynamics.traced import Sweep
 from crane.machine import Machine
-from crane.paths import Path
-from crane.samples import Array, as_sample
+from crane.motion.trajectories import Path
 
 
 class Controller(Protocol):

@@ -5,15 +5,15 @@ from collections.abc import Hashable, Mapping, Sequence
 import numpy as np
 
 from crane.codegen import Number
+from crane.common.errors import InputError, known
+from crane.common.samples import Array, as_sample
 from crane.control.base import Traced
 from crane.control.valves import Command, circuit_of
 from crane.dynamics import Dynamics
-from crane.errors import InputError, known
 from crane.hydraulics import Circuit
 from crane.hydraulics.circuit import Instant
 from crane.machine import Machine
-from crane.paths import Path
-from crane.samples import Array, as_sample
+from crane.motion.trajectories import Path
 
 
 class ValveDrive:

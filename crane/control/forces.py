@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.codegen import Number
+from crane.common.errors import ClosureError, CraneWarning, InputError
+from crane.common.samples import Array, as_number, as_sample
 from crane.control.base import Traced
 from crane.description import PIGains
 from crane.dynamics import Dynamics
-from crane.errors import ClosureError, CraneWarning, InputError
 from crane.machine import Machine
-from crane.paths import Path
-from crane.samples import Array, as_number, as_sample
+from crane.motion.trajectories import Path
 
 
 class PI:

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable, Mapping
 
+from crane.common.errors import InputError, known
 from crane.control.base import Controller
 from crane.control.forces import PI, ComputedTorque
 from crane.control.tip import TipVelocity
 from crane.control.valves import Command, ValvePD
-from crane.errors import InputError, known
 from crane.machine import Machine
-from crane.paths import Path
+from crane.motion.trajectories import Path
 
 CONTROLLERS: Mapping[str, Callable[[Machine, Path], Controller | Command]] = {
     "pi": PI,

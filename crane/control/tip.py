@@ -5,12 +5,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.common.errors import InputError
+from crane.common.samples import Array, as_sample
 from crane.control.valves import Sampled, circuit_of
-from crane.errors import InputError
-from crane.kinematics import Kinematics
 from crane.machine import Machine
-from crane.paths import Path
-from crane.samples import Array, as_sample
+from crane.motion.kinematics import Kinematics
+from crane.motion.trajectories import Path
 
 _EASE = 1e-3  # opening over which the dead band is jumped
 _NEAR = 1e-3  # of a stroke: a joint so close to its limit goes no further

@@ -8,12 +8,12 @@ from numpy.typing import ArrayLike
 
 from crane.codegen import Number
 from crane.codegen.scalar import apply
-from crane.description import Hydraulics, PDGains
-from crane.description.magnitudes import meant
-from crane.errors import InputError, known
+from crane.common.errors import InputError, known
+from crane.common.magnitudes import meant
+from crane.common.samples import Array, as_number, as_sample
+from crane.hydraulics import Hydraulics, PDGains
 from crane.machine import Machine
-from crane.paths import Path
-from crane.samples import Array, as_number, as_sample
+from crane.motion.trajectories import Path
 
 _LONGEST = 4000.0  # of levers [s], what a simulation can have of milliseconds
 _JUMP = 0.01  # of the spool's stroke, over which the feedforward jumps the dead band

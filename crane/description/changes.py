@@ -10,15 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from crane.description.circuit_section import numbers_of
-from crane.description.hydraulics import Hydraulics
-from crane.description.magnitudes import doubt
+from crane.common.errors import CraneWarning, InputError, known
+from crane.common.magnitudes import doubt
+from crane.common.samples import FARTHEST, as_number
 from crane.description.sources import bundled
 from crane.description.spec import Chain, Coupling, Friction, MachineSpec
 from crane.description.tree import Joint, Limits, Link, Tree, limit
-from crane.description.urdf import read_urdf
-from crane.errors import CraneWarning, InputError, known
-from crane.samples import FARTHEST, as_number
+from crane.hydraulics.components import Hydraulics, number_names
 
 PAYLOAD = "payload.mass"
 _TURNS = ("roll", "pitch", "yaw")
@@ -85,7 +83,7 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
             found[f"control.{joint}.{field.name}"] = getattr(gains, field.name)
     if spec.hydraulics is not None:
         for head, part in _parts(spec.hydraulics).items():
-            found |= {f"{head}.{name}": getattr(part, name) for name in numbers_of(type(part))}
+            found |= {f"{head}.{name}": getattr(part, name) for name in number_names(type(part))}
     if spec.tip is not None:
         found[PAYLOAD] = 0.0
     return found
@@ -320,13 +318,11 @@ def _load(spec: MachineSpec, tree: Tree, mass: float) -> tuple[Tree, tuple[Chain
         frame = Link("payload", PAYLOAD), Joint("payload_fixed", "fixed", tip, "payload", PAYLOAD)
         point = pin.Inertia(mass, np.zeros(3), np.zeros((3, 3)))
         return loaded(tree.replacing(*frame), tip, point), spec.chains
-    load = read_urdf(spec.payload.urdf)
-    scale = mass / load.tree.mass
+    scale = mass / spec.payload.tree.mass
     parts = [
-        _scaled(part, scale) if isinstance(part, Link) else part
-        for part in (spec.payload.attached(load.root), *load.tree)
+        _scaled(part, scale) if isinstance(part, Link) else part for part in spec.payload.tree
     ]
-    return tree.replacing(*parts), (*spec.chains, spec.payload)
+    return tree.replacing(*parts), (*spec.chains, spec.payload.chain)
 
 
 def _scaled(link: Link, scale: float) -> Link:

@@ -11,10 +11,10 @@ from contextvars import ContextVar
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from crane.errors import CraneError
+from crane.common.errors import CraneError
 
 if TYPE_CHECKING:
-    from crane.description.xml import XmlFile
+    from crane.formats.xml import XmlFile
 
 MOST = 200  # findings in one run: who has more has one cause for most of them
 

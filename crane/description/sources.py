@@ -4,7 +4,7 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
-from crane.errors import DescriptionError, known
+from crane.common.errors import DescriptionError, known
 
 SUFFIXES = (".yaml", ".yml", ".urdf", ".xml", ".mjcf")
 

@@ -5,10 +5,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from crane.description.hydraulics import Hydraulics
+from crane.common.errors import InputError
+from crane.common.samples import as_number
 from crane.description.tree import Joint, Tree, Vector
-from crane.errors import InputError
-from crane.samples import as_number
+from crane.hydraulics.components import Hydraulics
 
 
 def _check(item: object, what: str, *positive: str) -> None:
@@ -255,6 +255,19 @@ class Task:
 
 
 @dataclass(frozen=True)
+class Load:
+    """What a machine may carry at its tip.
+
+    Attributes:
+        chain: Where it hangs, and its file.
+        tree: Its links and joints, and the joint that fixes it.
+    """
+
+    chain: Chain
+    tree: Tree
+
+
+@dataclass(frozen=True)
 class MachineSpec:
     """A machine as described by its file; see docs/machine_file.md for the keys."""
 
@@ -276,5 +289,5 @@ class MachineSpec:
     hydraulics: Hydraulics | None = None
     couplings: tuple[Coupling, ...] = ()
     where: Mapping[str, str] = field(default_factory=dict)  # section -> "file:line"
-    payload: Chain | None = None  # what payload.mass hangs on the tip; None: a point mass
+    payload: Load | None = None  # what payload.mass hangs on the tip; None: a point mass
     motors: tuple[str, ...] = ()  # joints that the format itself says motors drive

@@ -8,9 +8,9 @@ import numpy as np
 from crane.closure.compiled import FastClosure
 from crane.closure.traced import Constants, folded
 from crane.codegen import Number, Program, Tape, largest
+from crane.common.samples import Array
 from crane.dynamics.traced import Sweep
 from crane.machine import Machine
-from crane.samples import Array
 
 # What can be asked of a sweep, given a second argument x (n,): a_A for inverse and regressor,
 # tau_A for forward.

@@ -4,14 +4,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.codegen import TooLongError, carefully
+from crane.common.errors import InputError, known
+from crane.common.samples import Array, as_samples
 from crane.dynamics.compiled import Formula
 from crane.dynamics.elements import JointForces
 from crane.dynamics.formulation import carriers
 from crane.dynamics.traced import numbers_of
 from crane.dynamics.tree import TreeDynamics
-from crane.errors import InputError, known
 from crane.machine import Machine
-from crane.samples import Array, as_samples
 
 PATHS = ("compiled", "pinocchio")
 

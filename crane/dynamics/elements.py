@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from crane.common.samples import Array
 from crane.machine import Machine
-from crane.samples import Array
 
 _LAW = (
     "coulomb", "coulomb_offset", "viscous", "viscous_offset", "sharpness", "stiction", "stribeck",

@@ -1,6 +1,6 @@
 """What carries what: the exact dynamics, and the published one of chains on bases held still."""
 
-from crane.errors import InputError, known
+from crane.common.errors import InputError, known
 from crane.machine import Machine
 
 FORMULATIONS = ("exact", "decoupled")

@@ -19,9 +19,9 @@ from crane.codegen.scalar import (
     subtract,
     times,
 )  # fmt: skip
+from crane.common.samples import Array
 from crane.dynamics.elements import JointForces
 from crane.machine import Machine
-from crane.samples import Array
 
 BODY, JOINT = 10, 19  # numbers per body and per joint
 

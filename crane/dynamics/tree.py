@@ -7,9 +7,9 @@ import numpy as np
 import pinocchio as pin
 
 from crane.closure.structure import Indices
+from crane.common.samples import Array, solve
 from crane.dynamics.elements import JointForces
 from crane.machine import Machine
-from crane.samples import Array, solve
 
 
 class Motion(NamedTuple):

@@ -1,7 +1,8 @@
-"""Writing machines in other formats."""
+"""Files of machines, read and written: the machine file, URDF, MJCF, parallel robots, meshes."""
 
-from crane.formats.machine_file import write_machine
-from crane.formats.mjcf import write_mjcf
-from crane.formats.urdf_plus import write_urdf_plus
+from crane.formats.machine_file.read import read
+from crane.formats.machine_file.write import write_machine
+from crane.formats.mjcf.write import write_mjcf
+from crane.formats.urdf.write import write_urdf_plus
 
-__all__ = ["write_machine", "write_mjcf", "write_urdf_plus"]
+__all__ = ["read", "write_machine", "write_mjcf", "write_urdf_plus"]

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.codegen import Number, maximum
-from crane.description import Hydraulics
+from crane.common.samples import Array
+from crane.hydraulics.components import Hydraulics
 from crane.hydraulics.flow import clipped
 from crane.hydraulics.function import FIELDS, WIDTH, Chamber, Function, row_of
-from crane.samples import Array
 
 _PRESSURE, _OIL = 1.0, 5e-13  # accuracy that matters [Pa], [m3]
 # Integrals that balance: pumped = returned + stored + volume that the joints sweep, and

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from crane.codegen import Number, maximum
 from crane.codegen.scalar import apply, where_positive
-from crane.description import Counterbalance, Cylinder, Valve
+from crane.hydraulics.components import Counterbalance, Cylinder, Valve
 from crane.hydraulics.flow import clipped, in_series, root, through
 
 GAS_PRESSURE = 1.0e5  # at which volumes of entrapped gas are given [Pa]

@@ -8,10 +8,10 @@ import numpy as np
 from crane.closure import Closure
 from crane.closure.assemblies import Assembly, ambiguities
 from crane.closure.choice import slides
+from crane.common.errors import CraneWarning
+from crane.common.samples import Array
 from crane.description import MachineSpec
-from crane.description.urdf import is_urdf
-from crane.errors import CraneWarning
-from crane.samples import Array
+from crane.formats.urdf.read import is_urdf
 
 _QUICK, _THOROUGH = 6, 100  # starts of the search in one block: milliseconds, up to a second
 

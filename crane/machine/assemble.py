@@ -7,13 +7,13 @@ import numpy as np
 import pinocchio as pin
 
 from crane.closure import Closure, frame_id
+from crane.common.errors import DescriptionError, MechanismError, at
+from crane.common.samples import Array
 from crane.description import LoopSpec, MachineSpec, inertia_problem
 from crane.description.findings import kept, note
 from crane.description.rigid import inertia, se3
 from crane.description.tree import Joint, Link
-from crane.errors import DescriptionError, MechanismError, at
 from crane.machine.axes import wrong_axis
-from crane.samples import Array
 
 _MOST = 1000  # joints that move; closing takes the cube of it
 _SAME = 1e-12  # difference of two directions that is none, as Pinocchio has it

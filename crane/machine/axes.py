@@ -8,9 +8,9 @@ import pinocchio as pin
 
 from crane.closure.choice import slides
 from crane.closure.equations import LoopEquations, frame_id
+from crane.common.errors import CraneError, MechanismError
+from crane.common.samples import Array
 from crane.description import LoopSpec, MachineSpec
-from crane.errors import CraneError, MechanismError
-from crane.samples import Array
 
 _PARALLEL = 1e-6  # sine of an angle that counts as none
 _TURNING = ("revolute", "cylindrical", "planar")  # loops whose axis is normal to their plane

@@ -12,13 +12,14 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from crane.closure import Closure, frame_id
+from crane.common.errors import InputError, LimitError, known
+from crane.common.samples import Array, as_number, as_sample, as_samples
 from crane.description import (
     Chain,
     EndStop,
     ForceElement,
     Friction,
     GasSpring,
-    Hydraulics,
     PIGains,
     Task,
     bundled,
@@ -27,8 +28,7 @@ from crane.description import (
 )
 from crane.description.rigid import loaded
 from crane.description.tree import Tree
-from crane.errors import InputError, LimitError, known
-from crane.samples import Array, as_number, as_sample, as_samples
+from crane.hydraulics import Hydraulics
 
 _LIMIT_SLACK = 1e-9  # [m], [rad] beyond a limit that counts as on it
 

@@ -1,6 +1,11 @@
-"""Machines in time."""
+"""Machines in time: runs, batches of them, recordings replayed."""
 
+from crane.simulation.batch import Batch, simulate_batch
 from crane.simulation.recorded import imbalance
+from crane.simulation.replays import Comparison, replay
 from crane.simulation.run import Force, Progress, simulate, trajectory
 
-__all__ = ["Force", "Progress", "imbalance", "simulate", "trajectory"]
+__all__ = [
+    "Batch", "Comparison", "Force", "Progress", "imbalance", "replay", "simulate",
+    "simulate_batch", "trajectory",
+]  # fmt: skip

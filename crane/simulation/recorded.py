@@ -5,13 +5,13 @@ import warnings
 import numpy as np
 
 from crane.codegen import Parts
+from crane.common.errors import CraneWarning
+from crane.common.samples import Array
 from crane.control import Controller, Free, Signals, StiffController, ValveDrive
-from crane.errors import CraneWarning
 from crane.hydraulics.circuit import BALANCES
-from crane.kinematics import Kinematics
 from crane.machine import Machine
-from crane.recording import Recording
-from crane.samples import Array
+from crane.motion.kinematics import Kinematics
+from crane.recordings.recording import Recording
 
 _IMBALANCE = 5e-3  # share of the energy that went through
 

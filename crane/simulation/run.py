@@ -8,30 +8,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.codegen import Parts, TooLongError
-from crane.control import (
-    Command,
-    Controller,
-    Feedback,
-    Free,
-    Signals,
-    StiffController,
-    ValveDrive,
-)
+from crane.common.errors import ClosureError, CraneWarning, InputError, SimulationError, known
+from crane.common.samples import Array, as_number, as_sample
+from crane.control import Command, Controller, Feedback, Free, Signals, StiffController, ValveDrive
 from crane.dynamics import Dynamics
-from crane.errors import ClosureError, CraneWarning, InputError, SimulationError, known
-from crane.integration import (
-    ADAPTIVE,
-    AdaptiveSteps,
-    HaltedError,
-    Steps,
-    StiffSteps,
-    explained,
-    row_layout,
-)
 from crane.machine import Machine
-from crane.paths import Path, beyond_limits
-from crane.recording import Recording
-from crane.samples import Array, as_number, as_sample
+from crane.motion.trajectories import Path, beyond_limits
+from crane.recordings.recording import Recording
+from crane.simulation.integration.adaptive import ADAPTIVE, AdaptiveSteps
+from crane.simulation.integration.halt import HaltedError, explained
+from crane.simulation.integration.state import row_layout
+from crane.simulation.integration.steps import Steps
+from crane.simulation.integration.stiff import StiffSteps
 from crane.simulation.recorded import imbalance, recorded
 
 _MOST = 4_000_000  # steps of one recording
@@ -124,7 +112,7 @@ def trajectory(
     """What `simulate` computes, without channels; see there for arguments and errors.
 
     Returns:
-        Times (N,), and what `crane.integration.row_layout` names, (N, .) each.
+        Times (N,), and what `crane.simulation.integration.row_layout` names, (N, .) each.
     """
     machine = dynamics.machine
     control = _as_controller(controller, machine)

@@ -1,7 +1,6 @@
 """Model-based design studies: measures of a machine over its parameters."""
 
-from crane.studies.ranges import ranges
 from crane.studies.run import study
 from crane.studies.table import Study
 
-__all__ = ["Study", "ranges", "study"]
+__all__ = ["Study", "study"]

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
-from crane.errors import CraneWarning, InputError
+from crane.common.errors import CraneWarning, InputError
 
 _PATIENCE = 10.0  # [s] for the scheduler to answer
 

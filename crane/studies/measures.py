@@ -6,15 +6,15 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from crane.common.errors import ClosureError
+from crane.common.samples import Array
 from crane.dynamics import Dynamics
-from crane.errors import ClosureError
-from crane.kinematics import Kinematics
 from crane.machine import Machine
-from crane.paths import task_path
-from crane.recording import FORCE_UNITS
-from crane.samples import Array
-from crane.workspaces.extremes import farthest
-from crane.workspaces.section import upwards
+from crane.motion.kinematics import Kinematics
+from crane.motion.trajectories import task_path
+from crane.motion.workspaces.extremes import farthest
+from crane.motion.workspaces.section import upwards
+from crane.recordings.recording import FORCE_UNITS
 
 _RATE = 200  # samples per second of a task
 _CELLS = 1000  # postures of the grid over the strokes that move passive joints

@@ -14,11 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.description import parameters, read
+from crane.common.errors import CraneError, CraneWarning, InputError, at, known
+from crane.common.samples import Array, as_count, as_samples, as_seed
+from crane.description import parameters
 from crane.dynamics import Dynamics
-from crane.errors import CraneError, CraneWarning, InputError, at, known
+from crane.formats import read
 from crane.machine import Machine, load
-from crane.samples import Array, as_count, as_samples, as_seed
 from crane.studies.measures import (
     notes,
     of_strokes,

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.errors import InputError, known
-from crane.output import replacing
-from crane.samples import Array
+from crane.common.errors import InputError, known
+from crane.common.output import replacing
+from crane.common.samples import Array
 
 _MORE_IS_BETTER = ("reach", "range", "upper_")
 

@@ -6,9 +6,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from crane.output import replacing
-from crane.samples import Array
-from crane.view.plots import STYLE
+from crane.common.output import replacing
+from crane.common.samples import Array
+from crane.view.plots.recording import STYLE
 from forwarder.paper import JOINTS, SIGNALS, TASKS, published
 from forwarder.runs import Run
 

@@ -3,9 +3,9 @@
 from collections.abc import Iterable
 
 import numpy as np
+from rig import Rig
 
-from crane.rig import Rig
-from crane.samples import Array
+from crane.common.samples import Array
 from forwarder.paper import MISPRINTS, REVERSALS, SIGNALS, TASKS, published
 from forwarder.runs import FORMULATIONS, READINGS, Coarse, Run, inside, percentage_error
 
@@ -190,7 +190,7 @@ def rig_errors(runs: Runs, measured: dict[str, Run], rig: Rig, wins: dict[int, A
         [
             "## The simulations against a virtual rig, like Figures 8 to 10",
             "The experiment was never published as data. In its place stands a **virtual rig** "
-            f"(`crane.rig`, seed {rig.seed}): the exact model with masses, pins and friction drawn "
+            f"(`rig`, seed {rig.seed}): the exact model with masses, pins and friction drawn "
             "within tolerances, stiction, an encoder of 0.042 deg, potentiometers of 12 bits, "
             "PI control at 1 kHz on what these tell, and forces from currents by (8). Its "
             f"resistors err by {gains} (tau_1, F_A1, F_A2). It is no measurement and says nothing "

@@ -9,9 +9,9 @@ import numpy as np
 
 import crane
 from crane.codegen.scalar import apply
+from crane.common.errors import ClosureError
+from crane.common.samples import Array
 from crane.control import PI, Traced
-from crane.errors import ClosureError
-from crane.samples import Array
 from forwarder.paper import (
     CRUISE,
     DURATION,

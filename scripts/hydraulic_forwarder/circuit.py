@@ -8,14 +8,14 @@ import numpy as np
 from scipy.interpolate import PPoly
 
 import crane
+from crane.common.samples import Array
 from crane.control import Signals
-from crane.description.hydraulics import PDGains
-from crane.identification.cylinder_friction import CylinderFriction, cylinder_friction
-from crane.identification.cylinder_signals import cylinder_signals
-from crane.identification.orifices import METHODS, Orifices, identify_orifices
-from crane.identification.signals import differentiate, low_pass
-from crane.identification.valve import ValveCurve, identify_valve
-from crane.samples import Array
+from crane.hydraulics.components import PDGains
+from crane.identification.hydraulics.cylinder_friction import CylinderFriction, cylinder_friction
+from crane.identification.hydraulics.cylinder_signals import cylinder_signals
+from crane.identification.hydraulics.orifices import METHODS, Orifices, identify_orifices
+from crane.identification.hydraulics.valve import ValveCurve, identify_valve
+from crane.identification.signals.motion import differentiate, low_pass
 from hydraulic_forwarder.experiment import (
     COEFFICIENTS,
     CYLINDERS,

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 import crane
-from crane import timeseries
-from crane.description.hydraulics import PDGains
-from crane.identification.fourier import Fourier
-from crane.identification.signals import average_periods
-from crane.samples import Array
+from crane.common.samples import Array
+from crane.hydraulics.components import PDGains
+from crane.identification.excitation.fourier import Fourier
+from crane.identification.signals.motion import average_periods
+from crane.recordings import timeseries
 from hydraulic_forwarder.paper import ANGLES
 
 LOAD = 80.0  # [kg] at the tip: rotator and gripper of a crane of this size

@@ -7,13 +7,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from crane.identification.cylinder_friction import CylinderFriction
-from crane.identification.signals import Motion
-from crane.identification.valve import ValveCurve
-from crane.output import replacing
-from crane.samples import Array
-from crane.view.hydraulic_figures import draw_friction, draw_valve
-from crane.view.plots import DASHED, RECORDED, STYLE
+from crane.common.output import replacing
+from crane.common.samples import Array
+from crane.identification.hydraulics.cylinder_friction import CylinderFriction
+from crane.identification.hydraulics.valve import ValveCurve
+from crane.identification.signals.motion import Motion
+from crane.view.plots.hydraulics import draw_friction, draw_valve
+from crane.view.plots.recording import DASHED, RECORDED, STYLE
 from hydraulic_forwarder.mechanics import Judged
 
 LIGHT = {"color": "#c9c9c9", "linewidth": 0.6}

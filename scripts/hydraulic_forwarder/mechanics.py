@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 import crane
-from crane.identification.identify import identify
-from crane.identification.model import Inertial, Samples, Term, body_names, friction
-from crane.identification.result import Identification
-from crane.identification.signals import Motion, differentiate, low_pass
-from crane.samples import Array
+from crane.common.samples import Array
+from crane.identification.mechanics.identify import identify
+from crane.identification.mechanics.model import Inertial, Samples, Term, body_names, friction
+from crane.identification.mechanics.result import Identification
+from crane.identification.signals.motion import Motion, differentiate, low_pass
 from hydraulic_forwarder.experiment import CYLINDERS, STEP, Crane, averaged
 from hydraulic_forwarder.paper import ANGLES
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from crane.identification.orifices import NAMES
-from crane.identification.valve import ValveCurve
+from crane.identification.hydraulics.orifices import NAMES
+from crane.identification.hydraulics.valve import ValveCurve
 from hydraulic_forwarder.circuit import PASSES, TRUE
 from hydraulic_forwarder.experiment import LIFTS, OIL
 from hydraulic_forwarder.paper import LIFTING, STIFF

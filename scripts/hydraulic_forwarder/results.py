@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 
 import crane
-from crane.identification.cylinder_friction import CylinderFriction
-from crane.identification.orifice_rows import Sides
-from crane.identification.orifices import Orifices
-from crane.identification.result import Identification
-from crane.identification.signals import Motion
-from crane.identification.valve import ValveCurve
-from crane.samples import Array
+from crane.common.samples import Array
+from crane.identification.hydraulics.cylinder_friction import CylinderFriction
+from crane.identification.hydraulics.orifice_rows import Sides
+from crane.identification.hydraulics.orifices import Orifices
+from crane.identification.hydraulics.valve import ValveCurve
+from crane.identification.mechanics.result import Identification
+from crane.identification.signals.motion import Motion
 from hydraulic_forwarder import circuit, mechanics
 from hydraulic_forwarder.experiment import LIFTS, MOTIONS, averaged, crane_of, measured, perform
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from crane.identification.orifices import Orifices
+from crane.identification.hydraulics.orifices import Orifices
 from hydraulic_forwarder.circuit import TRUE
 
 KIND = {"paper": "paper's crane", "rigid": "with the spool", "orifices": "the machine"}

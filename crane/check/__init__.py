@@ -1,5 +1,0 @@
-"""Everything that is wrong or unusual about a description, at once."""
-
-from crane.check.report import Finding, Report, check
-
-__all__ = ["Finding", "Report", "check"]

@@ -1,0 +1,218 @@
+"""Folders of results: one run is a recording with its summary, figure and page."""
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from crane.common import output
+from crane.common.errors import (
+    CraneWarning,
+    DescriptionError,
+    InputError,
+    OutputError,
+    RecordingError,
+)
+from crane.common.output import staging
+from crane.description.sources import find
+from crane.machine import Machine, recalled
+from crane.recordings import timeseries
+from crane.recordings.measured import is_measured, read_measured
+from crane.recordings.recording import Recording
+from crane.recordings.summary import subject, summarize, title
+from crane.simulation.replays import Comparison
+from crane.studies.table import Study
+
+if TYPE_CHECKING:
+    from crane.identification.mechanics.result import Identification
+    from crane.motion.workspaces import Workspace
+
+RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
+COMPARISON = "comparison.md"
+
+
+def check_folder(folder: Path, force: bool) -> None:
+    """See that results may go to a folder, before they are computed.
+
+    Raises:
+        OutputError: It holds something already and `force` is off, it cannot be written, or a
+            file is in the way.
+    """
+    output.check_folder(folder)
+    if folder.is_dir() and not force:
+        try:
+            empty = not any(folder.iterdir())
+        except OSError as error:
+            reason = error.strerror or str(error)
+            raise OutputError(f"{folder}: cannot be read ({reason}), choose another") from None
+        if not empty:
+            raise OutputError(f"{folder}: is not empty, choose another folder or add --force")
+
+
+def check_free(file: Path, force: bool) -> None:
+    """See that a file may be written, before it is computed.
+
+    Raises:
+        OutputError: It exists and `force` is off, or it cannot be written.
+    """
+    output.check_file(file)
+    if file.exists() and not force:
+        raise OutputError(f"{file}: exists already, choose another name or add --force")
+
+
+def write_run(folder: Path, recording: Recording) -> str:
+    """Write a recording and its summary into a folder, created where there is none.
+
+    Figure and page of an earlier run in the same folder are removed: they show something else.
+
+    Returns:
+        The summary, Markdown.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    heading = title(subject(recording), recording.task)
+    text = f"# {heading}\n\n{summarize(recording).to_markdown()}"
+    with staging(folder) as part:
+        recording.to_csv(part / RECORDING)
+        (part / SUMMARY).write_text(text, encoding="utf-8")
+        for name in (FIGURE, PAGE):
+            (folder / name).unlink(missing_ok=True)
+    return text
+
+
+def write_comparison(folder: Path, recording: Recording, comparison: Comparison) -> str:
+    """Write a replay into a folder: its recording, and how it compares with what was measured.
+
+    Returns:
+        The comparison, Markdown.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.plots.comparison import plot_comparison
+
+    write_run(folder, recording)
+    heading = title(subject(recording), recording.task)
+    text = f"# {heading}\n\n{comparison.to_markdown()}"
+    with staging(folder) as part:
+        (part / COMPARISON).write_text(text, encoding="utf-8")
+        if comparison.channels:
+            plot_comparison(comparison, part / "comparison.png")
+    return text
+
+
+def write_views(folder: Path, machine: Machine, recording: Recording) -> None:
+    """Write figure and page of a recording into a folder."""
+    from crane.view.page.build import report
+    from crane.view.plots.recording import plot_recording
+
+    plot_recording(recording, folder / FIGURE)
+    report(machine, recording, folder / PAGE)
+
+
+def write_study(folder: Path, study: Study) -> None:
+    """Write table and picture of a study into a folder, created where there is none.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.plots.study import plot_study
+
+    with staging(folder) as part:
+        study.to_csv(part / "study.csv")
+        plot_study(study, part / "study.png")
+
+
+def write_workspace(folder: Path, space: "Workspace") -> str:
+    """Write tables, summary and picture of a workspace into a folder, created where there is none.
+
+    Returns:
+        The summary, Markdown.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.plots.workspace import plot_workspace
+
+    text = space.to_markdown()
+    with staging(folder) as part:
+        space.to_csv(part / "workspace.csv")
+        space.curves_to_csv(part / "curves.csv")
+        (part / "workspace.md").write_text(text, encoding="utf-8")
+        plot_workspace(space, part / "workspace.png")
+    return text
+
+
+def write_identification(
+    folder: Path, result: "Identification", recording: str = "", validation: str = ""
+) -> None:
+    """Write report and parameters into a folder, and the machine where all are known.
+
+    A machine about a prior that cannot be is left out with a warning.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+        InputError: A feasible estimate that is no machine.
+    """
+    from crane.identification.mechanics.write import write_machine, write_parameters
+    from crane.view.page.identification import write_report
+
+    with staging(folder) as part:
+        write_report(result, part / "report.html", recording, validation)
+        write_parameters(result, part / "parameters.csv")
+        if result.parameters is None:
+            return
+        try:
+            write_machine(result, part / "machine")
+        except InputError as error:
+            if result.feasible:
+                raise
+            text = f"no machine files are written: {error} (on the command line --feasible)"
+            warnings.warn(text, CraneWarning, stacklevel=2)
+
+
+def read_run(path: Path, machine: Machine | None = None) -> Recording:
+    """The recording of a run's folder or of a CSV or npz file.
+
+    Args:
+        path: Folder or file.
+        machine: What was recorded. Coordinates and forces that the file does not have are
+            computed with it, see `crane.recordings.measured`; where no machine is given, with the
+            one that the file names, if it has pressures or angles instead of forces.
+
+    Raises:
+        RecordingError: There is none, it is malformed, or it does not tell enough.
+        DescriptionError: The machine that the file names is not found.
+    """
+    if path.is_dir():
+        if not (path / RECORDING).is_file():
+            raise RecordingError(f"{path}: no {RECORDING} in this folder, give a run's folder")
+        path = path / RECORDING
+    if machine is not None:
+        return read_measured(machine, path)
+    table = timeseries.read(path)
+    named = table.notes.get("machine", "")
+    if named and is_measured(table):
+        return read_measured(machine_of(path, named), path)
+    return Recording.from_table(table, path)
+
+
+def machine_of(path: str | Path, named: str) -> Machine:
+    """The machine that a recording names.
+
+    Raises:
+        InputError: It names none.
+        DescriptionError: It is not found, or cannot be read.
+    """
+    if not named:
+        raise InputError(
+            f"{path}: does not name its machine, add --machine, or write '# machine: NAME' above "
+            "its header row"
+        )
+    try:
+        find(named.split(" --")[0])
+    except DescriptionError as error:
+        raise DescriptionError(
+            f"{path}: its machine is not found ({error}); add --machine to say where it is"
+        ) from None
+    return recalled(named)

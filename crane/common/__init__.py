@@ -1,0 +1,1 @@
+"""What every room uses: errors, samples, units and magnitudes, files written whole."""

@@ -1,0 +1,1 @@
+"""The machine file: chains of URDFs, loops, forces, tasks, hydraulics in one YAML."""

@@ -1,0 +1,200 @@
+"""The section `hydraulics` of a machine file."""
+
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import MISSING, fields
+from typing import Any, TypeVar
+
+from crane.common.errors import CraneWarning, InputError, known
+from crane.common.magnitudes import doubt
+from crane.description.findings import FollowUpError, kept, note
+from crane.formats.machine_file.section import Section
+from crane.formats.machine_file.tree_builder import TreeBuilder
+from crane.hydraulics.components import (
+    Counterbalance,
+    Cylinder,
+    Hydraulics,
+    Oil,
+    PartError,
+    PDGains,
+    Supply,
+    Valve,
+    check_relief,
+    check_tank,
+    number_names,
+)
+
+Made = TypeVar("Made")
+Part = TypeVar("Part", Oil, Supply, Counterbalance, Cylinder, Valve, PDGains)
+
+_TOGETHER = ("tank", "relief")  # looked at with other parts
+_KINDS = ("orifice", "compensated")
+
+
+def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) -> Hydraulics | None:
+    """The circuit of a machine file, None where it has none.
+
+    Raises:
+        DescriptionError: With file, line, and what is wrong.
+    """
+    section = top.section("hydraulics", "'hydraulics'")
+    if section is None:
+        return None
+    section.only("supply", "oil", "cylinders", "valves", "control")
+    supply = None
+    with kept():
+        supply_section = section.section("supply", "'supply'")
+        if supply_section is None:
+            raise section.fail(None, "'hydraulics' has no 'supply', give its pressure")
+        supply_section.only(*number_names(Supply))
+        supply = _part(supply_section, Supply)
+    oil = Oil()
+    with kept():
+        oil_section = section.section("oil", "'oil'")
+        if oil_section is not None:
+            oil_section.only(*number_names(Oil))
+            oil = _part(oil_section, Oil)
+    if supply is not None and supply_section is not None:
+        with kept():
+            _checked(supply_section, check_tank, supply, oil)
+            _warn_of_unit(supply_section, "tank", supply.tank)
+    named: dict[str, list[str]] = {"cylinder": [], "valve": [], "control": []}
+    cylinders: dict[str, Cylinder] = {}
+    holding = ("counterbalance_a", "counterbalance_b")
+    keys = (*number_names(Cylinder), *holding)
+    for joint, item in section.mappings("cylinders", "cylinder of", *keys):
+        named["cylinder"].append(joint)
+        with kept():
+            _check_joint(joint, item, active)
+            if lack := tree.unlimited(joint):
+                problem = f"joint '{joint}' {lack}, a cylinder needs the limits of its stroke"
+                note(item.fail(None, problem))
+            turning = _turns(tree, joint)
+            holds = _holding(item, holding)
+            cylinder = _part(item, Cylinder, turning, joint=joint, **holds)
+            cylinders[joint] = cylinder
+            if supply is not None:
+                _checked(item, check_relief, supply, cylinder)
+                _warn_of_unit(item, "relief", cylinder.relief)
+                _warn_of_relief(item, supply, cylinder)
+    valves: dict[str, Valve] = {}
+    given = (*number_names(Valve), "type", "flow", "meter_out")
+    for joint, item in section.mappings("valves", "valve of", *given):
+        named["valve"].append(joint)
+        with kept():
+            _check_joint(joint, item, active)
+            valves[joint] = _valve(item, joint)
+    for joint in (*named["cylinder"], *named["valve"]):
+        for what in ("cylinder", "valve"):
+            if joint not in named[what]:
+                note(section.fail(f"{what}s", f"'{joint}' has no {what}, add it"))
+    control: dict[str, PDGains] = {}
+    for joint, item in section.mappings("control", "control of", *number_names(PDGains)):
+        named["control"].append(joint)
+        with kept():
+            _check_joint(joint, item, active)
+            control[joint] = _part(item, PDGains)
+    if named["control"] and set(named["control"]) != set(named["cylinder"]):
+        listed = ", ".join(named["cylinder"])
+        note(section.fail("control", f"give gains of all of {listed}, or none"))
+    if not named["cylinder"]:
+        note(section.fail(None, "'hydraulics' drives nothing, give cylinders and valves"))
+    if supply is None or not cylinders.keys() == valves.keys() <= set(active):
+        raise FollowUpError("the circuit is not complete")
+    order = [joint for joint in active if joint in cylinders]
+    return Hydraulics(
+        supply,
+        oil,
+        {joint: cylinders[joint] for joint in order},
+        {joint: valves[joint] for joint in order},
+        {joint: control[joint] for joint in order if control},
+    )
+
+
+def _check_joint(joint: str, item: Section, active: tuple[str, ...]) -> None:
+    if joint not in active:
+        raise item.fail(None, f"'{joint}' is not an active joint, {known(active, joint)}")
+
+
+def _turns(tree: TreeBuilder, joint: str) -> bool:
+    return joint in tree.joints and tree.joints[joint].kind == "revolute"
+
+
+def _part(section: Section, kind: type[Part], turning: bool = False, **given: Any) -> Part:
+    """A part whose remaining numbers stand in a section."""
+    own = [x for x in fields(kind) if x.name in number_names(kind) and x.name not in given]
+    for entry in own:
+        least = -math.inf if entry.metadata.get("signed") else 0.0
+        if entry.default is MISSING:
+            given[entry.name] = section.number(entry.name, minimum=least)
+        else:
+            given[entry.name] = section.number(entry.name, float(entry.default), minimum=least)
+    part = _checked(section, kind, **given)
+    for entry in own:
+        if entry.name in section and entry.name not in _TOGETHER:
+            _warn_of_unit(section, entry.name, given[entry.name], turning)
+    return part
+
+
+def _checked(section: Section, make: Callable[..., Made], *items: object, **given: Any) -> Made:
+    """What is made of a section's numbers, or its error with file and line."""
+    try:
+        return make(*items, **given)
+    except PartError as error:
+        raise section.fail(error.key, str(error)) from None
+    except InputError as error:
+        raise section.fail(None, str(error)) from None
+
+
+def _warn_of_unit(section: Section, key: str, value: float, turning: bool = False) -> None:
+    """Warn of a number that can be, and hardly is in its SI unit."""
+    if text := doubt(key, value, turning):
+        what = f"{section.where(key)}: '{key}' of {section.title} {text}"
+        warnings.warn(what, CraneWarning, stacklevel=2)
+
+
+def _warn_of_relief(section: Section, supply: Supply, cylinder: Cylinder) -> None:
+    if 0 < cylinder.relief <= supply.pressure and not doubt("relief", cylinder.relief):
+        what = (
+            f"{section.where('relief')}: 'relief' of {section.title} is {cylinder.relief:g} Pa, "
+            f"not above the supply's {supply.pressure:g} Pa: what the pump gives flows off there "
+            "before it can press, give a higher one"
+        )
+        warnings.warn(what, CraneWarning, stacklevel=2)
+
+
+def _holding(item: Section, names: tuple[str, ...]) -> dict[str, Counterbalance]:
+    found = {}
+    for name in names:
+        section = item.section(name, f"'{name}'")
+        if section is not None:
+            section.only(*number_names(Counterbalance))
+            found[name] = _part(section, Counterbalance)
+    return found
+
+
+def _valve(item: Section, joint: str) -> Valve:
+    kind = item.text("type")
+    if kind not in _KINDS:
+        raise item.fail("type", f"valve type '{kind}' is unknown, {known(_KINDS, kind)}")
+    own = {"orifice": ("c1", "c2", "c3", "c4"), "compensated": ("flow", "margin", "meter_out")}
+    for other, names in own.items():
+        for name in names:
+            if other != kind and name in item:
+                raise item.fail(name, f"'{name}' is for valves of type '{other}', remove it")
+    if kind == "orifice":
+        return _part(item, Valve, joint=joint)
+    flow, margin = item.number("flow", minimum=0.0), item.number("margin", minimum=0.0)
+    for name, value, what in (
+        ("flow", flow, "the flow at full stroke"),
+        ("margin", margin, "the pressure drop that is kept"),
+    ):
+        if value == 0:
+            raise item.fail(name, f"'{name}' is 0, give {what}")
+    inlet = flow / math.sqrt(margin)
+    outlet = item.number("meter_out", inlet, minimum=0.0)
+    _warn_of_unit(item, "flow", flow)
+    if "meter_out" in item:
+        _warn_of_unit(item, "meter_out", outlet)
+    return _part(item, Valve, joint=joint, c1=inlet, c2=outlet, c3=outlet, c4=inlet)

@@ -1,0 +1,106 @@
+"""The sections of a machine file on forces along joints."""
+
+import warnings
+
+from crane.common.errors import CraneWarning
+from crane.description.findings import kept
+from crane.description.spec import EndStop, ForceElement, Friction, GasSpring
+from crane.formats.machine_file.section import Section
+from crane.formats.machine_file.tree_builder import TreeBuilder
+
+
+def read_friction(top: Section, tree: TreeBuilder) -> dict[str, Friction]:
+    """Friction by joint."""
+    found: dict[str, Friction] = {}
+    keys = (
+        "coulomb", "coulomb_offset", "viscous", "viscous_offset", "smoothing", "stiction",
+        "stribeck",
+    )  # fmt: skip
+    for joint, item in top.mappings("friction", "friction of", *keys):
+        with kept():
+            tree.check_joint(joint, item.where())
+            stribeck = item.number("stribeck", Friction.stribeck, minimum=0.0)
+            if stribeck == 0:
+                raise item.fail(
+                    "stribeck", f"'stribeck' of friction of '{joint}' is 0, give a velocity"
+                )
+            friction = Friction(
+                coulomb=item.number("coulomb", 0.0, minimum=0.0),
+                coulomb_offset=item.number("coulomb_offset", 0.0),
+                viscous=item.number("viscous", 0.0, minimum=0.0),
+                viscous_offset=item.number("viscous_offset", 0.0),
+                smoothing=item.number("smoothing", Friction.smoothing, minimum=0.0),
+                stiction=item.number("stiction", 0.0, minimum=0.0),
+                stribeck=stribeck,
+            )
+            for kind in ("coulomb", "viscous"):
+                mean, offset = getattr(friction, kind), getattr(friction, f"{kind}_offset")
+                if abs(offset) > mean and not item.is_bundled:
+                    warnings.warn(
+                        f"{item.where()}: friction of '{joint}' drives the joint in one "
+                        f"direction (|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), "
+                        "a constant force may hide in it",
+                        CraneWarning,
+                        stacklevel=2,
+                    )
+            found[joint] = friction
+    return found
+
+
+def read_forces(top: Section, tree: TreeBuilder) -> tuple[ForceElement, ...]:
+    """Springs, dampers and constant forces."""
+    forces = []
+    keys = ("joint", "stiffness", "rest", "damping", "force")
+    for item in top.sections("forces", "force element of", *keys):
+        with kept():
+            element = ForceElement(
+                tree.joint(item),
+                stiffness=item.number("stiffness", 0.0, minimum=0.0),
+                rest=item.number("rest", 0.0),
+                damping=item.number("damping", 0.0, minimum=0.0),
+                force=item.number("force", 0.0),
+            )
+            if not (element.stiffness or element.damping or element.force):
+                raise item.fail(
+                    None,
+                    f"the element on '{element.joint}' does nothing, give it stiffness, damping "
+                    "or force",
+                )
+            forces.append(element)
+    return tuple(forces)
+
+
+def read_gas_springs(top: Section, tree: TreeBuilder) -> tuple[GasSpring, ...]:
+    """Enclosed gas along joints."""
+    springs = []
+    keys = ("area", "pressure", "volume", "rest", "exponent")
+    for joint, item in top.mappings("gas_springs", "gas spring of", *keys):
+        with kept():
+            tree.check_joint(joint, item.where())
+            area = item.number("area")
+            volume = item.number("volume", minimum=0.0)
+            exponent = item.number("exponent", GasSpring.exponent, minimum=0.0)
+            for key, value in (("area", area), ("volume", volume), ("exponent", exponent)):
+                if value == 0:
+                    raise item.fail(key, f"'{key}' of gas spring of '{joint}' is 0, give one")
+            pressure, rest = item.number("pressure", minimum=0.0), item.number("rest", 0.0)
+            springs.append(GasSpring(joint, area, pressure, volume, rest, exponent))
+    return tuple(springs)
+
+
+def read_end_stops(top: Section, tree: TreeBuilder) -> tuple[EndStop, ...]:
+    """Stops at the limits of joints."""
+    stops = []
+    for joint, item in top.mappings("end_stops", "end stop of", "stiffness", "damping"):
+        with kept():
+            tree.check_joint(joint, item.where())
+            if lack := tree.unlimited(joint):
+                hint = "make it revolute" if lack == "is continuous" else "give it both"
+                raise item.fail(None, f"joint '{joint}' {lack}, a stop needs limits: {hint}")
+            stiffness = item.number("stiffness", minimum=0.0)
+            if stiffness == 0:
+                raise item.fail(
+                    "stiffness", f"the end stop of '{joint}' has no stiffness, give one"
+                )
+            stops.append(EndStop(joint, stiffness, item.number("damping", 0.0, minimum=0.0)))
+    return tuple(stops)

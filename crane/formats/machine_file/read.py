@@ -1,0 +1,305 @@
+"""Machine files and single URDFs, read and checked into a `MachineSpec`."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from crane.common.errors import DescriptionError, known
+from crane.description.findings import Anything, FollowUpError, kept, note
+from crane.description.sources import find
+from crane.description.spec import (
+    LOOP_TYPES,
+    Chain,
+    Coupling,
+    Friction,
+    Load,
+    LoopSpec,
+    MachineSpec,
+    PIGains,
+    Task,
+    unit_vector,
+)
+from crane.formats.machine_file.circuit import read_hydraulics
+from crane.formats.machine_file.forces import (
+    read_end_stops,
+    read_forces,
+    read_friction,
+    read_gas_springs,
+)
+from crane.formats.machine_file.open_loops import warn_of_open_loops
+from crane.formats.machine_file.section import Section
+from crane.formats.machine_file.tasks import read_tasks
+from crane.formats.machine_file.tree_builder import TreeBuilder
+from crane.formats.parallel_robots import is_parallel_robot, read_parallel_robot
+from crane.formats.urdf.read import is_urdf, read_urdf
+
+Part = TypeVar("Part")
+
+_KEYS = (
+    "name", "source", "chains", "loops", "active", "home", "friction", "forces",
+    "gas_springs", "end_stops", "couplings",
+    "tip", "payload", "tasks", "control", "hydraulics",
+)  # fmt: skip
+
+
+def read(name: str | Path) -> MachineSpec:
+    """Read a machine by bundled name or path, in the format that the file has.
+
+    Raises:
+        DescriptionError: With file, line, what is wrong, and the names that exist.
+    """
+    path = find(name)
+    spec = _read(path)
+    warn_of_open_loops(spec)
+    return spec
+
+
+def _read(path: Path) -> MachineSpec:
+    suffix = path.suffix.lower()
+    if suffix == ".urdf" or (suffix in (".xml", ".mjcf") and is_urdf(path)):
+        return _read_single(path)
+    if suffix in (".xml", ".mjcf"):
+        from crane.formats.mjcf.read import read_mjcf  # Pinocchio is in it
+
+        return read_mjcf(path)
+    return read_parallel_robot(path) if is_parallel_robot(path) else _read_machine(path)
+
+
+def _read_single(path: Path) -> MachineSpec:
+    urdf = read_urdf(path)
+    chain = Chain(path.stem, path, None, path.name, urdf.moving)
+    tree = TreeBuilder()
+    tree.add(chain, urdf)
+    if not tree.joints:
+        note(DescriptionError(f"{path.name}: no joint moves in this file, add one"))
+    for loop in urdf.loops:
+        with kept():
+            tree.check_loop(loop)
+    where = _places(urdf.loops, urdf.couplings)
+    where |= {f"home {joint}": place for joint, place in urdf.home_lines.items()}
+    active = urdf.independent
+    if urdf.loops and not active:
+        active, where["active"] = (), urdf.loops[0].where
+    return MachineSpec(
+        name=urdf.name,
+        source=path.name,
+        path=path,
+        chains=(chain,),
+        tree=tree.tree,
+        loops=urdf.loops,
+        active=active,
+        home=urdf.home,
+        friction=urdf.friction,
+        tip=tree.only_leaf() if urdf.tip is None else urdf.tip,
+        couplings=urdf.couplings,
+        where=where,
+    )
+
+
+def _read_machine(path: Path) -> MachineSpec:
+    top = Section.read(path, _KEYS)
+    name, source = top.text("name"), top.text("source", "")
+    chains, tree, friction, couplings = _chains(top, path)
+    loops = _loops(top, tree)
+    couplings += _couplings(top, tree)
+    active: tuple[str, ...] = Anything()
+    with kept():
+        active = top.names("active") if "active" in top else ()
+    for joint in active:
+        with kept():
+            tree.check_joint(joint, top.where("active"))
+    if not all(joint in tree.joints for joint in active):
+        active = Anything()
+    where = {key: top.where(key) for key in top} | _places(loops, couplings)
+    home = {}
+    section = None
+    with kept():
+        section = top.section("home", "'home'")
+    for joint in section or ():
+        assert section is not None
+        with kept():
+            tree.check_joint(joint, section.where(joint))
+            home[joint] = section.number(joint)
+            where[f"home {joint}"] = section.where(joint)
+    friction |= _part(read_friction, {}, top, tree)
+    forces = _part(read_forces, (), top, tree)
+    gas_springs = _part(read_gas_springs, (), top, tree)
+    end_stops = _part(read_end_stops, (), top, tree)
+    tip = top.text("tip", None)
+    with kept(harmless=True):
+        if tip is not None:
+            tree.check_link(tip, top.where("tip"), "the tip frame")
+            if not tree.moves(tip):
+                raise top.fail("tip", f"the tip frame '{tip}' does not move, choose another")
+    payload = _part(_payload, None, top, tree, tip)
+    # a machine whose active joints are not named is not driven either: `load` proposes some
+    hydraulics = None
+    tasks: dict[str, Task] = {}
+    control: dict[str, PIGains] = {}
+    if active:
+        valves: tuple[str, ...] = Anything() if "hydraulics" in top else ()
+        with kept(harmless=True):
+            hydraulics = read_hydraulics(top, tree, active)
+            if hydraulics is not None and not isinstance(active, Anything):
+                valves = hydraulics.joints
+        tasks = _part(read_tasks, tasks, top, active, tip, valves)
+        control = _part(_control, control, top, active)
+    return MachineSpec(
+        name, source, path, chains, tree.tree, loops, active, home, friction, forces,
+        gas_springs, end_stops, tip, tasks, control, hydraulics, couplings, where, payload,
+    )  # fmt: skip
+
+
+def _part(read: Callable[..., Part], nothing: Any, *arguments: object) -> Part:
+    """A part that the machine can be assembled without, `nothing` where it is refused."""
+    with kept(harmless=True):
+        return read(*arguments)
+    return nothing
+
+
+def _chains(
+    top: Section, path: Path
+) -> tuple[tuple[Chain, ...], TreeBuilder, dict[str, Friction], tuple[Coupling, ...]]:
+    chains: list[Chain] = []
+    tree = TreeBuilder()
+    friction: dict[str, Friction] = {}
+    couplings: tuple[Coupling, ...] = ()
+    for item in top.sections("chains", "chain", "name", "urdf", "parent"):
+        tree.complete &= top.complete
+        so_far = tree.complete
+        tree.complete = False
+        with kept():
+            name, parent = item.text("name"), item.text("parent", None)
+            file = item.file("urdf")
+            if any(chain.name == name for chain in chains):
+                note(item.fail("name", f"two chains are named '{name}', rename one"))
+            elif (chains or not so_far) and parent is None:
+                problem = f"chain '{name}' has no 'parent', name the frame it hangs from"
+                note(item.fail(None, problem))
+            elif not chains and so_far and parent is not None:
+                problem = f"chain '{name}' is first and stands on the world, remove its 'parent'"
+                note(item.fail("parent", problem))
+                parent = None
+            urdf = read_urdf(file)
+            chain = Chain(name, file, parent, item.where("parent"), urdf.moving)
+            for loop in urdf.loops[:1]:
+                problem = f"a sub-chain has no <loop>, write it under 'loops' of {path.name}"
+                note(DescriptionError(f"{loop.where}: {problem}"))
+            tree.complete = so_far
+            tree.add(chain, urdf)
+            chains.append(chain)
+            friction |= urdf.friction
+            couplings += urdf.couplings
+    tree.complete &= top.complete
+    if not chains and tree.complete:
+        note(top.fail("chains", "there are no chains, add one under 'chains:'"))
+        tree.complete = False
+    if not tree.joints and tree.complete:
+        note(top.fail("chains", "no joint of these chains moves, add one"))
+    return tuple(chains), tree, friction, couplings
+
+
+def _loops(top: Section, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
+    loops: dict[str, LoopSpec] = {}
+    for item in top.sections("loops", "loop", "name", "type", "predecessor", "successor", "axis"):
+        with kept():
+            loop = _loop(item, tree)
+            if loop.name in loops:
+                raise item.fail("name", f"two loops are named '{loop.name}', rename one")
+            loops[loop.name] = loop
+    return tuple(loops.values())
+
+
+def _loop(section: Section, tree: TreeBuilder) -> LoopSpec:
+    name, kind = section.text("name"), section.text("type")
+    what = f"loop '{name}'" if name else "a loop"
+    if kind and kind not in LOOP_TYPES:
+        problem = f"{what} has the unknown type '{kind}', {known(LOOP_TYPES, kind)}"
+        note(section.fail("type", problem))
+    ends = []
+    for end in ("predecessor", "successor"):
+        frame = section.text(end)
+        if frame and frame not in tree.links and tree.complete:
+            problem = f"{what} has the unknown {end} '{frame}', {known(tree.links, frame)}"
+            note(section.fail(end, problem))
+        ends.append(frame)
+    axis = None
+    with kept():
+        axis = unit_vector(section.numbers("axis", (0.0, 0.0, 1.0)))
+        if axis is None:
+            problem = f"the axis of {what} is no direction"
+            raise section.fail("axis", f"{problem}, give three numbers, not all zero")
+    if axis is None or kind not in LOOP_TYPES or not all(end in tree.links for end in ends):
+        raise FollowUpError(f"{what} is not complete")
+    loop = LoopSpec(name, kind, ends[0], ends[1], axis, section.where())
+    tree.check_loop(loop)
+    return loop
+
+
+def _places(loops: tuple[LoopSpec, ...], couplings: tuple[Coupling, ...]) -> dict[str, str]:
+    """Where loops and couplings were written, as errors about them look it up."""
+    places = {f"loop {loop.name}": loop.where for loop in loops}
+    return places | {f"loop {coupling.name}": coupling.where for coupling in couplings}
+
+
+def _couplings(top: Section, tree: TreeBuilder) -> tuple[Coupling, ...]:
+    found: dict[str, Coupling] = {}
+    for item in top.sections("couplings", "coupling", "name", "joints", "offset"):
+        with kept():
+            name, joints = item.text("name"), item.section("joints", "'joints'")
+            if name in found:
+                raise item.fail("name", f"two couplings are named '{name}', rename one")
+            if joints is None or len(list(joints)) < 2:
+                problem = f"coupling '{name}' joins less than two joints, add some"
+                raise item.fail("joints", problem)
+            factors = {}
+            for joint in joints:
+                with kept():
+                    tree.check_joint(joint, joints.where(joint))
+                    factors[joint] = joints.number(joint)
+                    if factors[joint] == 0:
+                        problem = f"the factor of '{joint}' is 0, leave it out"
+                        raise joints.fail(joint, problem)
+            found[name] = Coupling(name, factors, item.number("offset", 0.0), item.where())
+    return tuple(found.values())
+
+
+def _payload(top: Section, tree: TreeBuilder, tip: str | None) -> Load | None:
+    """The load that payload.mass hangs on the tip, a chain without moving joints."""
+    section = top.section("payload", "'payload'")
+    if section is None:
+        return None
+    section.only("urdf")
+    if tip is None:
+        raise section.fail(None, "a payload hangs on the tip, name its frame under 'tip:'")
+    urdf = read_urdf(section.file("urdf"))
+    for joint in urdf.tree.moving:
+        problem = f"joint '{joint.name}' moves, a payload is rigid: make it fixed"
+        note(DescriptionError(f"{joint.where}: {problem}"))
+    for loop in urdf.loops:
+        note(DescriptionError(f"{loop.where}: a payload has no <loop>, remove it"))
+    if not urdf.tree.mass:
+        raise section.fail(
+            "urdf", f"no link of {urdf.file.name} has a mass, give one an <inertial>"
+        )
+    chain = Chain("payload", urdf.file, tip, section.where("urdf"), ())
+    mount = chain.attached(urdf.root)
+    for _ in tree.free([mount, *urdf.tree]):
+        pass  # notes names that are taken
+    return Load(chain, urdf.tree.replacing(mount))
+
+
+def _control(top: Section, active: tuple[str, ...]) -> dict[str, PIGains]:
+    gains, named = {}, []
+    for joint, item in top.mappings("control", "control of", "kp", "ki"):
+        named.append(joint)
+        with kept():
+            if joint not in active:
+                raise item.fail(None, f"'{joint}' is not an active joint, {known(active, joint)}")
+        with kept():
+            kp, ki = (item.number(key, minimum=0.0) for key in ("kp", "ki"))
+            gains[joint] = PIGains(kp, ki)
+    missing = [joint for joint in active if named and joint not in named]
+    if missing:
+        raise top.fail("control", f"no gains for {', '.join(missing)}, give kp and ki of each")
+    return gains

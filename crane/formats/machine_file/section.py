@@ -1,0 +1,349 @@
+"""Strict reading of YAML: every key known, every value of its kind, every error with its line."""
+
+import math
+from collections.abc import Iterable, Iterator
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, overload
+
+import yaml
+
+from crane.common.errors import DescriptionError, known
+from crane.description.findings import kept, note
+from crane.description.sources import bundled
+
+
+class _Map(dict[str, Any]):
+    """A mapping that remembers the line of each key."""
+
+    def __init__(self, line: int):
+        super().__init__()
+        self.line = line
+        self.lines: dict[str, int] = {}
+
+
+class _Loader(yaml.SafeLoader):
+    """SafeLoader with lines, and without silently taking the last of equal keys."""
+
+    def construct_object(self, node: yaml.Node, deep: bool = False) -> Any:
+        """A value; what cannot be one (a 13th month, 0x without digits) is an error of YAML."""
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, KeyError, AttributeError, TypeError, OverflowError):
+            problem = f"'{node.value}' is no value of its kind, quote it if it is text"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
+
+
+def _construct_map(loader: _Loader, node: yaml.MappingNode) -> _Map:
+    data = _Map(node.start_mark.line + 1)
+    for key_node, value_node in node.value:
+        line = key_node.start_mark.line + 1
+        where = f"{Path(loader.name).name}:{line}"
+        if key_node.tag == "tag:yaml.org,2002:merge":
+            note(DescriptionError(f"{where}: '<<' is not supported, write the keys out"))
+            continue
+        key = loader.construct_object(key_node, deep=True)
+        if not isinstance(key, str):
+            number = isinstance(key, int) and not isinstance(key, bool)
+            hint = ", and decimals with a point" if number else ""
+            problem = f"key {_shown(key)} is not a name, write names in quotes{hint}"
+            note(DescriptionError(f"{where}: {problem}"))
+            continue
+        if key in data:
+            first = data.lines[key]
+            problem = f"key '{key}' is there twice (first in line {first}), keep one"
+            note(DescriptionError(f"{where}: {problem}"))
+            continue
+        data[key] = loader.construct_object(value_node, deep=True)
+        data.lines[key] = line
+    return data
+
+
+_Loader.add_constructor("tag:yaml.org,2002:map", _construct_map)
+
+_MISSING: Any = object()
+_LARGEST = 2_000_000  # bytes of a file; the reader takes a minute for ten million
+
+
+def _shown(value: Any) -> str:
+    """A value in an error: short, whatever it is."""
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, list | tuple | set):
+        return "a list"
+    if isinstance(value, bool):
+        return f"{value} (in YAML, yes, no, on and off mean true and false)"
+    text = repr(value) if isinstance(value, str) else str(value)
+    return text if len(text) < 60 else f"{text[:60]}..."
+
+
+class Section:
+    """A mapping of a machine file.
+
+    Args:
+        data: The mapping.
+        title: What it is, for errors ("loop 'A1_eye'").
+        file: The file it stands in.
+        line: Its line, if not the mapping's own.
+
+    Attributes:
+        title: See above.
+        complete: Whether no item of its lists had to be left out.
+    """
+
+    def __init__(self, data: _Map, title: str, file: Path, line: int | None = None):
+        self._data, self.title, self._file = data, title, file
+        self.complete = True
+        self._line = data.line if line is None else line
+
+    @classmethod
+    def read(cls, file: Path, keys: Iterable[str]) -> "Section":
+        """The top level of a YAML file.
+
+        Raises:
+            DescriptionError: The file is missing, not YAML, or not a mapping of these keys.
+        """
+        try:
+            if file.stat().st_size > _LARGEST:
+                size = f"{file.stat().st_size / 1e6:.3g} MB, more than {_LARGEST / 1e6:g}"
+                raise DescriptionError(f"{file.name}: {size}, which takes too long, shorten it")
+            with file.open(encoding="utf-8") as stream:
+                data = yaml.load(stream, _Loader)  # noqa: S506 (a SafeLoader)
+        except UnicodeDecodeError:
+            raise DescriptionError(f"{file.name}: not UTF-8, save it as UTF-8 text") from None
+        except OSError as error:
+            raise DescriptionError(
+                f"{file}: cannot be read ({error.strerror}), check the path"
+            ) from None
+        except yaml.reader.ReaderError as error:
+            what = f"it holds the control character number {error.character}"
+            raise DescriptionError(f"{file.name}: not YAML, {what}, remove it") from None
+        except yaml.YAMLError as error:
+            mark = getattr(error, "problem_mark", None)
+            line = f":{mark.line + 1}" if mark else ""
+            problem = getattr(error, "problem", None) or "broken"
+            raise DescriptionError(f"{file.name}{line}: not YAML, {problem}, mend it") from None
+        except RecursionError:
+            raise DescriptionError(f"{file.name}: nested too deep, simplify it") from None
+        if data is None:
+            raise DescriptionError(f"{file.name}: the file is empty, write a machine in it")
+        if not isinstance(data, _Map):
+            raise DescriptionError(f"{file.name}: not a machine file, write keys such as 'name:'")
+        section = cls(data, "the machine file", file)
+        section.only(*keys)
+        return section
+
+    @property
+    def is_bundled(self) -> bool:
+        """Whether it is of a machine that comes with the package, whose file says what is odd."""
+        return self._file in bundled().values()
+
+    def only(self, *keys: str) -> None:
+        """Raise for any other key.
+
+        Raises:
+            DescriptionError: There is an unknown key; the nearest known one is named. Where
+                findings are collected, what stands there is read as if it had that name.
+        """
+        for key in [key for key in self._data if key not in keys]:
+            near = get_close_matches(key, keys, 1, 0.75)
+            near = near or [known for known in keys if known.lower() == key.lower()]
+            meant = bool(near) and near[0] not in self._data
+            problem = f"unknown key '{key}' in {self.title}, {known(keys, key)}"
+            note(self.fail(key, problem), harmless=True)
+            if meant:
+                self._data[near[0]] = self._data[key]
+                self._data.lines[near[0]] = self._data.lines[key]
+
+    def where(self, key: str | None = None) -> str:
+        """File and line of the section or of one of its keys."""
+        line = self._data.lines.get(key, self._line) if key else self._line
+        return f"{self._file.name}:{line}"
+
+    def fail(self, key: str | None, what: str) -> DescriptionError:
+        """An error that points at a key."""
+        return DescriptionError(f"{self.where(key)}: {what}")
+
+    def _take(self, key: str, default: Any) -> Any:
+        value = self._data.get(key, default)
+        if value is _MISSING:
+            raise self.fail(None, f"{self.title} has no '{key}', add it")
+        if value is None and default is not None:
+            raise self.fail(key, f"'{key}' of {self.title} is empty, give its value")
+        return value
+
+    @overload
+    def text(self, key: str, default: str = ...) -> str: ...
+    @overload
+    def text(self, key: str, default: None) -> str | None: ...
+    def text(self, key: str, default: str | None = _MISSING) -> str | None:
+        """A non-empty string; empty where it has been noted as wrong."""
+        try:
+            return self._text(key, default)
+        except DescriptionError as error:
+            note(error)
+            return ""
+
+    def _text(self, key: str, default: str | None) -> str | None:
+        value = self._take(key, default)
+        if value is default:
+            return value
+        if not isinstance(value, str) or not value.strip():
+            raise self.fail(
+                key, f"'{key}' of {self.title} is {_shown(value)}, give text (or quote it)"
+            )
+        if not "".join(value.split()).isprintable():
+            raise self.fail(key, f"'{key}' of {self.title} holds control characters, remove them")
+        return value
+
+    def number(self, key: str, default: float = _MISSING, minimum: float = -math.inf) -> float:
+        """A finite number, at least `minimum`; NaN where it has been noted as wrong."""
+        try:
+            number = self._number(key, self._take(key, default))
+            if number < minimum:
+                raise self.fail(
+                    key, f"'{key}' of {self.title} is {number:g}, give at least {minimum:g}"
+                )
+            return number
+        except DescriptionError as error:
+            note(error)
+            return math.nan
+
+    def _number(self, key: str, value: Any) -> float:
+        hint = "give a number"
+        # PyYAML reads 2e5 as text
+        if isinstance(value, int | float | str) and not isinstance(value, bool):
+            try:
+                number = float(value)
+            except (ValueError, OverflowError):
+                number = math.nan
+                if isinstance(value, str) and "," in value:
+                    hint = "give a number with a decimal point"
+            if math.isfinite(number):
+                return number
+            if isinstance(value, float):
+                hint = "give a finite number"
+        raise self.fail(key, f"'{key}' of {self.title} is {_shown(value)}, {hint}")
+
+    def numbers(self, key: str, default: Any = _MISSING) -> tuple[float, ...]:
+        """A list of finite numbers."""
+        value = self._take(key, default)
+        if not isinstance(value, list | tuple) or not value:
+            shown = "empty" if value == [] else _shown(value)
+            raise self.fail(key, f"'{key}' of {self.title} is {shown}, give a list such as [0, 1]")
+        return tuple(self._number(key, item) for item in value)
+
+    def names(self, key: str) -> tuple[str, ...]:
+        """A list of different names."""
+        value = self._take(key, _MISSING)
+        if not isinstance(value, list):
+            raise self.fail(
+                key, f"'{key}' of {self.title} is {_shown(value)}, give a list such as [q1, q2]"
+            )
+        for item in value:
+            if not isinstance(item, str):
+                raise self.fail(
+                    key, f"'{key}' lists {_shown(item)}, which is not a name, quote it"
+                )
+            if value.count(item) > 1:
+                raise self.fail(key, f"'{key}' lists '{item}' twice, list it once")
+        return tuple(value)
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        """A list of texts, the same ones perhaps several times."""
+        value = self._take(key, _MISSING)
+        if not isinstance(value, list):
+            raise self.fail(
+                key, f"'{key}' of {self.title} is {_shown(value)}, give a list such as [a, b]"
+            )
+        for item in value:
+            if not isinstance(item, str) or not item.isprintable():
+                raise self.fail(key, f"'{key}' lists {_shown(item)}, which is no text, quote it")
+        return tuple(value)
+
+    def pairs(self, key: str) -> list[tuple[str, str]]:
+        """A list of pairs of names."""
+        value = self._take(key, _MISSING)
+        if not isinstance(value, list):
+            raise self.fail(
+                key, f"'{key}' of {self.title} is {_shown(value)}, give a list of pairs [[a, b]]"
+            )
+        for item in value:
+            if not (isinstance(item, list) and len(item) == 2):
+                raise self.fail(key, f"'{key}' lists {_shown(item)}, write pairs as [a, b]")
+            for name in item:
+                if not isinstance(name, str) or not name.isprintable():
+                    raise self.fail(
+                        key, f"'{key}' lists {_shown(name)}, which is not a name, quote it"
+                    )
+        return [(one, two) for one, two in value]
+
+    def file(self, key: str) -> Path:
+        """A file, named by its path from the folder of the machine file."""
+        text = self.text(key)
+        path = self._file.parent / text
+        try:
+            if path.is_dir():
+                raise self.fail(key, f"'{text}' of {self.title} is a folder, give a file")
+            found = path.is_file()
+        except OSError:  # a name longer than any file's
+            found = False
+        if not found:
+            raise self.fail(
+                key, f"{self.title}: there is no file '{text}', give its path from this folder"
+            )
+        return path.resolve()
+
+    def section(self, key: str, title: str) -> "Section | None":
+        """A mapping, or None where the key is absent."""
+        value = self._take(key, None)
+        if value is None:
+            return None
+        if not isinstance(value, _Map):
+            raise self.fail(key, f"{title} is {_shown(value)}, give a mapping 'name: value'")
+        return Section(value, title, self._file, self._data.lines[key])
+
+    def mappings(self, key: str, title: str, *keys: str) -> "Iterator[tuple[str, Section]]":
+        """Names and mappings of a mapping of mappings with these keys."""
+        outer = None
+        with kept():
+            outer = self.section(key, f"'{key}'")
+        for name in outer._data if outer is not None else ():
+            assert outer is not None
+            inner = None
+            with kept():
+                inner = outer.section(name, f"{title} '{name}'")
+                if inner is None or not inner._data:
+                    inner = None
+                    raise outer.fail(
+                        name, f"{title} '{name}' is empty, its keys are {', '.join(keys)}"
+                    )
+            if inner is not None:
+                inner.only(*keys)
+                yield name, inner
+
+    def sections(self, key: str, title: str, *keys: str) -> "Iterator[Section]":
+        """The mappings of a list, with these keys; none where the list is absent."""
+        value = self._take(key, None)
+        if value is None:
+            return
+        if not isinstance(value, list):
+            problem = f"'{key}' is {_shown(value)}, give a list, its items with '- '"
+            note(self.fail(key, problem))
+            self.complete = False
+            return
+        for item in value:
+            if not isinstance(item, _Map):
+                problem = f"'{key}' lists {_shown(item)}, write each item as {{key: value}}"
+                note(self.fail(key, problem))
+                self.complete = False
+                continue
+            name = item.get("name", item.get("joint"))
+            section = Section(
+                item, f"{title} '{name}'" if isinstance(name, str) else f"a {title}", self._file
+            )
+            section.only(*keys)
+            yield section
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._data)

@@ -1,0 +1,1 @@
+"""URDF, with loops as elements of its own."""

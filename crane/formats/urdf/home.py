@@ -1,0 +1,65 @@
+"""Home posture and tip in a URDF, for which URDF+ has no place: elements of SRDF."""
+
+from collections.abc import Container, Mapping
+
+from lxml import etree
+
+from crane.common.errors import DescriptionError, known
+from crane.description.findings import kept
+from crane.formats.xml import XmlFile
+
+_HOME, _TIP = "home", "tip"
+
+
+def read_home(xml: XmlFile, joints: Container[str]) -> tuple[dict[str, float], dict[str, str]]:
+    """Coordinates of `<group_state name="home">`, and where each was written.
+
+    Args:
+        xml: The file.
+        joints: Names of its moving joints.
+
+    Raises:
+        DescriptionError: A joint is unknown, does not move, is there twice or has no number.
+    """
+    home: dict[str, float] = {}
+    where: dict[str, str] = {}
+    for state in xml.root.iterfind("group_state"):
+        if state.get("name", "").strip() != _HOME:
+            continue
+        for joint in state.iterfind("joint"):
+            with kept():
+                name, value = _coordinate(xml, joint, joints)
+                if name in home:
+                    raise xml.fail(joint, f"home of '{name}' is there twice, keep one")
+                home[name], where[name] = value, xml.where(joint)
+    return home, where
+
+
+def read_tip(xml: XmlFile, links: Mapping[str, etree._Element]) -> str | None:
+    """The link of `<end_effector name="tip" parent_link="LINK"/>`, None where there is none.
+
+    Args:
+        xml: The file.
+        links: Its `<link>` elements by name.
+
+    Raises:
+        DescriptionError: The link is unknown.
+    """
+    for element in xml.root.iterfind("end_effector"):
+        if element.get("name", "").strip() == _TIP:
+            link: str = element.get("parent_link", "").strip()
+            if link not in links:
+                raise xml.fail(
+                    element, f"the tip is the unknown link '{link}', {known(links, link)}"
+                )
+            return link
+    return None
+
+
+def _coordinate(xml: XmlFile, joint: etree._Element, joints: Container[str]) -> tuple[str, float]:
+    name = joint.get("name", "").strip()
+    if name not in joints:
+        what = f"home names the joint '{name}', which is unknown or does not move, correct it"
+        error: DescriptionError = xml.fail(joint, what)
+        raise error
+    return name, xml.number(joint, "value", f"home of '{name}'")

@@ -1,0 +1,125 @@
+"""A process that reads mesh files: whatever is in them can end this process, and nothing else.
+
+Run by crane.formats.visuals.meshes with the paths of files as JSON on its input. Per file it
+writes a line of JSON, {"parts": [{"vertices": V, "faces": F, "colour": [r, g, b, a] or null},
+...]} or {"wrong": "what"}, then the numbers of each part: V 3 float64, F 3 int64. Time and memory
+are limited, because readers of a dozen formats believe the sizes that a damaged file declares.
+
+It imports nothing of the package, which takes longer than most meshes.
+"""
+
+import json
+import logging
+import os
+import sys
+import warnings
+from typing import Any, BinaryIO
+
+MEMORY, SECONDS = 2 << 30, 20  # [bytes], [s] of computing per file
+TRIANGLES = 4_000_000  # in all files; a page with as many has 300 MB
+_FORMATS = ("stl", "obj", "dae", "glb", "gltf", "ply", "off")
+
+
+def main() -> None:
+    """Read what is asked for."""
+    out = os.fdopen(os.dup(1), "wb")
+    silence = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silence, 1)  # the output is ours alone
+    os.dup2(silence, 2)
+    warnings.simplefilter("ignore")
+    logging.disable()
+    files = json.load(sys.stdin)
+    try:
+        import trimesh  # noqa: F401  before time is counted
+    except ImportError as error:
+        for _ in files:
+            _send(out, {"wrong": str(error)}, [])
+        return
+    left = TRIANGLES
+    for file in files:
+        _limit()
+        try:
+            parts, arrays = _read(file, left)
+            left -= sum(part["faces"] for part in parts)
+            head: dict[str, Any] = {"parts": parts}
+        except MemoryError:
+            head, arrays = {"wrong": f"reading it takes more than {MEMORY >> 30} GB"}, []
+        except Exception as error:  # whatever a reader raises for what is none of its format
+            words = " ".join(str(error).split()) or type(error).__name__
+            head, arrays = {"wrong": words[:80]}, []
+        _send(out, head, arrays)
+
+
+def _limit() -> None:
+    """Time for one more file, and memory, where the system can limit them."""
+    try:
+        import resource
+    except ImportError:
+        return
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    hard = resource.getrlimit(resource.RLIMIT_CPU)[1]
+    soon = int(used.ru_utime + used.ru_stime) + SECONDS
+    resource.setrlimit(resource.RLIMIT_CPU, (soon if hard < 0 else min(soon, hard), hard))
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY if hard < 0 else min(MEMORY, hard), hard))
+
+
+def _send(out: BinaryIO, head: dict[str, Any], arrays: list[Any]) -> None:
+    out.write(json.dumps(head).encode() + b"\n")
+    for array in arrays:
+        out.write(array.tobytes())
+    out.flush()
+
+
+def _read(file: str, most: int) -> tuple[list[dict[str, Any]], list[Any]]:
+    """Triangles of a file, in the frame of its scene, if there are not too many."""
+    import numpy as np
+    import trimesh
+
+    kind = file.rpartition(".")[2].lower()
+    if kind not in _FORMATS:
+        raise ValueError(f"no mesh ends in .{kind}, known: {', '.join(_FORMATS)}")
+    # unmerged vertices keep the edges of the drawing sharp
+    scene = trimesh.load_scene(file, process=False)
+    parts: list[dict[str, Any]] = []
+    arrays: list[Any] = []
+    count = 0
+    for node in scene.graph.nodes_geometry:
+        placement, name = scene.graph[node]
+        part = scene.geometry[name]
+        if not isinstance(part, trimesh.Trimesh) or not len(part.faces):
+            continue
+        count += len(part.faces)
+        if count > most:
+            raise ValueError(f"with it there are more than {TRIANGLES} triangles to draw")
+        vertices = trimesh.transform_points(np.asarray(part.vertices, np.float64), placement)
+        faces = np.asarray(part.faces, np.int64)
+        if not (vertices.ndim == faces.ndim == 2 and vertices.shape[1] == faces.shape[1] == 3):
+            raise ValueError("no triangles in space")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise ValueError("a triangle of vertices that are not there")
+        if not np.isfinite(vertices).all():
+            raise ValueError("coordinates that are not finite")
+        parts.append({"vertices": len(vertices), "faces": len(faces), "colour": _colour(part)})
+        arrays += [vertices, faces]
+    if not parts:
+        raise ValueError("no triangles in it")
+    return parts, arrays
+
+
+def _colour(part: Any) -> list[float] | None:
+    """Its own colour, if it has one that can be read."""
+    try:
+        if not part.visual.defined:
+            return None
+        painted = getattr(part.visual, "material", part.visual)
+        colour = [min(max(float(value) / 255, 0.0), 1.0) for value in painted.main_color]
+    except MemoryError:
+        raise
+    except Exception:  # a texture that is damaged, a colour that is none
+        return None
+    return colour if len(colour) == 4 and all(x == x for x in colour) else None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,225 @@
+"""Strict reading of XML: nothing is expanded or fetched, every error has its line."""
+
+import math
+from collections.abc import Mapping
+from difflib import get_close_matches
+from pathlib import Path
+
+from lxml import etree
+
+from crane.common.errors import DescriptionError, known
+from crane.description.findings import note
+from crane.description.spec import unit_vector
+from crane.description.tree import Placement, Vector
+
+_X = (1.0, 0.0, 0.0)
+_SEVERAL = {"link", "joint", "loop", "visual", "collision"}  # elements that there may be more of
+
+
+class XmlFile:
+    """An XML file.
+
+    Args:
+        file: The file.
+
+    Attributes:
+        file: The file.
+        root: Its root element, without comments.
+        nameless: Kinds of elements of which one has no name of its own.
+
+    Raises:
+        DescriptionError: The file cannot be read, is not XML, or has a document type.
+    """
+
+    def __init__(self, file: Path):
+        self.file = file
+        self.nameless: set[str] = set()
+        try:
+            data = file.read_bytes()
+        except OSError as error:
+            raise DescriptionError(
+                f"{file}: cannot be read ({error.strerror}), check the path"
+            ) from None
+        if not data.strip():
+            raise DescriptionError(f"{file.name}: the file is empty, write a <robot> in it")
+        if (at := data.find(b"<!DOCTYPE")) >= 0:  # entities may grow without bounds, or fetch
+            line = data.count(b"\n", 0, at) + 1
+            raise DescriptionError(f"{file.name}:{line}: <!DOCTYPE> is not supported, remove it")
+        if b"encoding" not in data[:200] and not data.startswith((b"\xff\xfe", b"\xfe\xff")):
+            try:
+                data.decode("utf-8")
+            except UnicodeDecodeError as error:
+                line = data.count(b"\n", 0, error.start) + 1
+                raise DescriptionError(
+                    f"{file.name}:{line}: not UTF-8, save it as UTF-8 or declare its encoding"
+                ) from None
+        parser = etree.XMLParser(
+            resolve_entities=False, no_network=True, remove_comments=True, remove_pis=True
+        )
+        try:
+            self.root = etree.fromstring(data, parser)
+        except etree.XMLSyntaxError as error:
+            text = (error.msg or "broken").splitlines()[0].split(", line")[0].rstrip(" !")
+            raise DescriptionError(
+                f"{file.name}:{error.lineno or 1}: not XML, {text}, mend it"
+            ) from None
+
+    def where(self, element: etree._Element) -> str:
+        """File and line of an element."""
+        return f"{self.file.name}:{element.sourceline}"
+
+    def fail(self, element: etree._Element, what: str) -> DescriptionError:
+        """An error that points at an element."""
+        return DescriptionError(f"{self.where(element)}: {what}")
+
+    def check(
+        self,
+        element: etree._Element,
+        children: Mapping[str, set[str]],
+        attributes: Mapping[str, set[str]],
+        exact: set[str],
+    ) -> None:
+        """Raise for tags and attributes that are slips of known ones, or in a wrong place.
+
+        Foreign ones (sensors, settings of simulators) are common and ignored, apart from
+        attributes of the elements `exact`. Where findings are collected, slips are mended, so
+        that what stands there is read, too.
+
+        Args:
+            element: Where to begin.
+            children: Tags that an element may contain.
+            attributes: Attributes that an element may have.
+            exact: Elements that have no others.
+
+        Raises:
+            DescriptionError: There is a slip.
+        """
+        allowed = attributes.get(element.tag, set())
+        for key in element.keys() if allowed else ():
+            if key in allowed:
+                continue
+            near = get_close_matches(key.lower(), allowed, 1, 0.75)
+            meant = bool(near) and element.get(near[0]) is None
+            if element.tag in exact or meant:
+                hint = known(allowed, key.lower())
+                problem = f'unknown {key}="..." in <{element.tag}>, {hint}'
+                note(self.fail(element, problem), harmless=meant)
+            if meant:
+                element.set(near[0], element.attrib.pop(key))
+        tags = children.get(element.tag, set())
+        for child in element:
+            if not isinstance(child.tag, str):  # an entity, not expanded
+                continue
+            near = [] if child.tag in tags else get_close_matches(child.tag.lower(), tags, 1, 0.75)
+            if near:
+                hint = known(tags, child.tag.lower())
+                meant = near[0] in _SEVERAL or element.find(near[0]) is None
+                problem = f"unknown <{child.tag}> in <{element.tag}>, {hint}"
+                note(self.fail(child, problem), harmless=meant)
+                if meant:
+                    child.tag = near[0]
+            elif child.tag not in tags and any(child.tag in x for x in children.values() if tags):
+                note(self.fail(child, f"<{child.tag}> has no place in <{element.tag}>, move it"))
+            if child.tag in tags:
+                self.check(child, children, attributes, exact)
+
+    def only(self, element: etree._Element, tag: str, what: str) -> etree._Element | None:
+        """The child with a tag, if there is one.
+
+        Raises:
+            DescriptionError: There are several.
+        """
+        found = element.findall(tag)
+        if len(found) > 1:
+            note(self.fail(found[1], f"{what} has {len(found)} <{tag}>, keep one"))
+        return found[0] if found else None
+
+    def number(
+        self, element: etree._Element, name: str, what: str, default: float | None = None
+    ) -> float:
+        """A finite number.
+
+        Args:
+            element: The element.
+            name: Its attribute.
+            what: What it describes, for errors.
+            default: Value of a missing attribute; None if it must not be missing.
+
+        Raises:
+            DescriptionError: Missing, not a number or not finite. Where findings are collected,
+                it is noted, and the number is NaN.
+        """
+        return self.vector(element, name, what, 1, None if default is None else (default,))[0]
+
+    def vector(
+        self,
+        element: etree._Element,
+        name: str,
+        what: str,
+        length: int,
+        default: tuple[float, ...] | None = None,
+    ) -> tuple[float, ...]:
+        """Finite numbers, as `number`."""
+        try:
+            return self._vector(element, name, what, length, default)
+        except DescriptionError as error:
+            note(error)
+            return (math.nan,) * length
+
+    def _vector(
+        self,
+        element: etree._Element,
+        name: str,
+        what: str,
+        length: int,
+        default: tuple[float, ...] | None,
+    ) -> tuple[float, ...]:
+        text = element.get(name)
+        if text is None:
+            if default is None:
+                raise self.fail(element, f'{what} has no {name}, add {name}="..."')
+            return default
+        given = f'{name}="{text if len(text) < 60 else text[:60] + "..."}" of {what}'
+        words = text.split()
+        try:
+            values = tuple(float(word) for word in words)
+        except ValueError:
+            hint = "write digits"
+            if "," in text:
+                hint = "write a decimal point"
+            if "${" in text:
+                hint = "expand the file with xacro"
+            raise self.fail(element, f"{given} is not a number, {hint}") from None
+        if len(values) != length:
+            raise self.fail(element, f"{given} has {len(values)} numbers, give {length}")
+        if not all(math.isfinite(value) for value in values):
+            raise self.fail(element, f"{given} is not finite, give a number")
+        return values
+
+    def direction(self, element: etree._Element, what: str, default: tuple[float, ...]) -> Vector:
+        """Unit vector of the child `<axis xyz="..."/>`.
+
+        Raises:
+            DescriptionError: It is zero or malformed.
+        """
+        axis = self.only(element, "axis", what)
+        xyz = default if axis is None else self.vector(axis, "xyz", f"the axis of {what}", 3)
+        if (unit := unit_vector(xyz)) is None:
+            note(self.fail(axis, f"the axis of {what} is zero, give a direction"))
+            return _X
+        return unit
+
+    def placement(self, element: etree._Element, what: str) -> Placement:
+        """Numbers xyz [m] and rpy [rad] of the child `<origin/>`, zeros without one.
+
+        Raises:
+            DescriptionError: They are malformed.
+        """
+        origin = self.only(element, "origin", what)
+        zero = (0.0, 0.0, 0.0)
+        if origin is None:
+            return zero, zero
+        (x, y, z), (roll, pitch, yaw) = (
+            self.vector(origin, key, f"the origin of {what}", 3, zero) for key in ("xyz", "rpy")
+        )
+        return (x, y, z), (roll, pitch, yaw)

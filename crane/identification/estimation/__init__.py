@@ -1,0 +1,1 @@
+"""Linear least squares: rows, estimators, noise, and how sure they are."""

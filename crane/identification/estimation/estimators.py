@@ -1,0 +1,476 @@
+"""Parameters theta of y = W theta + noise, and how well they are known.
+
+Rows come from joints (`groups`) at instants (`samples`); rows may be missing. The noise of a
+joint may be correlated in time, and with that of the other joints at the same instant. The
+regressor is read in blocks of rows, see `rows.Regressor`, and may be larger than the memory.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.common.errors import InputError
+from crane.common.samples import Array, Brief
+from crane.identification.estimation.jackknife import Jackknife
+from crane.identification.estimation.noise import Noise, between
+from crane.identification.estimation.regressor import Regressor, Stored, factors, triangular
+
+Prior = tuple[Array, Array]
+"""Means (p,) and standard deviations (p,) of the parameters; infinite where nothing is known."""
+
+_TURN = 1.345  # robust standard deviations: 95 % efficiency on normal noise (Huber 1964)
+_MAD = 1.482602218505602  # standard deviation over median absolute deviation of normal noise
+_CONVERGED = 1e-6  # standard deviations
+_ROUNDING = 1e-10  # of the forces
+_ROUNDS = 100
+_WAITING = 4096  # instants without rows that are passed at once
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Estimate(Brief):
+    """Estimated parameters.
+
+    Attributes:
+        values: (p,).
+        covariance: (p, p), with the correlations of the noise.
+        residuals: y - W values (m,).
+        noise: Standard deviation of the noise of each group (g,).
+        effective: Number of independent rows that tell the mean of a group's noise as well as
+            its N correlated rows, N variance / spectral density at zero (g,).
+        freedom: Degrees of freedom behind the standard deviations, see `Jackknife`.
+        condition: Condition number of W.
+        scaled_condition: The same with columns of length one.
+    """
+
+    values: Array
+    covariance: Array
+    residuals: Array
+    noise: Array
+    effective: Array
+    freedom: float
+    condition: float
+    scaled_condition: float
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (p,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def interval(self, level: float = 0.95) -> Array:
+        """Lower and upper ends (p, 2) of what covers the truth with this probability.
+
+        values -+ t std with Student's t for `freedom`.
+        """
+        from scipy.stats import t
+
+        half = t.ppf(0.5 + 0.5 * level, self.freedom) * self.std
+        return np.column_stack([self.values - half, self.values + half])
+
+
+def least_squares(
+    W: Array | Regressor,
+    y: Array,
+    groups: np.ndarray | None = None,
+    samples: np.ndarray | None = None,
+    prior: Prior | None = None,
+) -> Estimate:
+    """Ordinary least squares: min |y - W theta|^2 (/ noise^2 + |(theta - mean) / std|^2).
+
+    The noise against which a prior counts is one number for all rows, taken from the residuals.
+
+    Args:
+        W: Regressor (m, p), as an array or in blocks.
+        y: Forces (m,).
+        groups: Joint of each row (m,), 0, 1, ...; they differ in what their noise is like.
+        samples: Number of the instant of each row (m,), increasing within a group.
+        prior: See `Prior`.
+
+    Raises:
+        InputError: Shapes, too few rows, or columns that depend on each other.
+    """
+    rows = _Rows(W, None, y, groups, samples, prior)
+    return rows.estimate(rows.common)
+
+
+def weighted(
+    W: Array | Regressor,
+    y: Array,
+    groups: np.ndarray,
+    samples: np.ndarray | None = None,
+    prior: Prior | None = None,
+) -> Estimate:
+    """Least squares with the rows of each joint divided by its noise, until both agree.
+
+    Arguments and errors as for `least_squares`.
+    """
+    rows = _Rows(W, None, y, groups, samples, prior)
+    return rows.estimate(rows.scales)
+
+
+def huber(
+    W: Array | Regressor,
+    y: Array,
+    groups: np.ndarray | None = None,
+    samples: np.ndarray | None = None,
+    prior: Prior | None = None,
+) -> Estimate:
+    """Huber's M-estimate by iteratively reweighted least squares.
+
+    Beyond k = 1.345 robust standard deviations sigma (1.4826 median |e|, of each joint) a row
+    counts by its sign alone: weight min(1, k sigma / |e|) / sigma^2. The covariance is that of
+    sum_i w_i psi(e_i), psi clipping at k sigma, over the information sum_i w_i psi'(e_i) w_i^T of
+    the unclipped rows: where noise depends on the motion, their share does so too.
+
+    Arguments and errors as for `least_squares`.
+    """
+    return _Rows(W, None, y, groups, samples, prior).robust()
+
+
+def instrumental(
+    W: Array,
+    y: Array,
+    Z: Array,
+    groups: np.ndarray | None = None,
+    samples: np.ndarray | None = None,
+    prior: Prior | None = None,
+) -> Estimate:
+    """Instrumental variables: theta from Z^T D (y - W theta) = 0, D = 1 / noise^2 of each joint.
+
+    Noise of the measured motion in W biases least squares, and does not bias this as long as
+    the instruments have none of it: Z (m, p) is the regressor of a simulated or commanded
+    motion. With a prior, its rows belong to both. Other arguments and errors as for
+    `least_squares`.
+
+    Source: Janot, Vandanjon, Gautier 2014, IEEE Trans. Control Systems Technology 22(1).
+    """
+    rows = _Rows(W, Z, y, groups, samples, prior)
+    return rows.estimate(rows.scales)
+
+
+def judged(
+    W: Array | Regressor,
+    y: Array,
+    groups: np.ndarray,
+    samples: np.ndarray | None,
+    values: Array,
+    noise: Array,
+    pull: Array,
+) -> Estimate:
+    """How well parameters are known that are the minimum of something else than least squares.
+
+    Args:
+        W: Regressor (m, p), as an array or in blocks.
+        y: Forces (m,).
+        groups: Joint of each row (m,).
+        samples: Number of the instant of each row (m,).
+        values: Minimum (p,) of |(y - W theta) / noise|^2 + c(theta).
+        noise: Of each group (g,).
+        pull: L (k, p), L^T L half of the second derivative of c there.
+
+    Returns:
+        Theirs, with the covariance of `weighted` for a prior whose rows are L.
+    """
+    rows = _Rows(W, None, y, groups, samples, None, pull)
+    return rows.judge(values, rows.residuals(values), noise, math.inf)
+
+
+def essential(estimate: Estimate, level: float = 0.05) -> np.ndarray:
+    """Parameters without which the model would be significantly worse.
+
+    The one with the largest relative standard deviation is set to zero, the others follow by
+    their covariances, and so on, as long as an F-test of all that are set to zero against the
+    full estimate does not reject at `level`:
+
+        F = theta_d^T C_dd^-1 theta_d / d.
+
+    For least squares with independent noise that is (RSS_reduced - RSS) / (d sigma^2), and the
+    others come out as if estimated anew; for correlated noise it stays valid.
+
+    Returns:
+        Indices of the kept parameters, increasing.
+
+    Source: Pham, Gautier 1991, essential parameters of robots, IEEE CDC.
+    """
+    from scipy.stats import f
+
+    kept, dropped = list(range(len(estimate.values))), list[int]()
+    values, covariance = estimate.values, estimate.covariance
+    while len(kept) > 1:
+        std = np.sqrt(np.diag(covariance))
+        worst = int(np.argmax(std / np.maximum(np.abs(values), np.finfo(float).tiny)))
+        trial = [*dropped, kept[worst]]
+        theta = estimate.values[trial]
+        C = estimate.covariance[np.ix_(trial, trial)]
+        F = theta @ np.linalg.solve(C, theta) / len(trial)
+        if f.sf(F, len(trial), estimate.freedom) < level:
+            break
+        gain = covariance[:, worst] / covariance[worst, worst]
+        rest = np.arange(len(kept)) != worst
+        values = (values - gain * values[worst])[rest]
+        covariance = (covariance - np.outer(gain, covariance[worst]))[np.ix_(rest, rest)]
+        dropped.append(kept.pop(worst))
+    return np.array(kept)
+
+
+class _Rows:
+    """Equations and how to solve them: one engine for all estimators.
+
+    With weights D = diag(1 / s^2) and prior rows L, such as diag(1 / std), appended to W, Z and
+    y, the estimate solves Q^T W' theta = Q^T y', where Q R = Z' are the appended and weighted Z.
+    Of the regressor, only the triangular factors of each group's rows are held: as long as all
+    rows of a group weigh the same, they tell everything but the single residuals.
+    """
+
+    def __init__(
+        self,
+        W: Array | Regressor,
+        Z: Array | None,
+        y: Array,
+        groups: np.ndarray | None,
+        samples: np.ndarray | None,
+        prior: Prior | None,
+        pull: Array | None = None,
+    ):
+        count, size = np.shape(W) if isinstance(W, np.ndarray) else W.shape
+        groups = np.zeros(count, int) if groups is None else np.asarray(groups)
+        samples = np.arange(count) if samples is None else np.asarray(samples)
+        shapes = {"y": np.shape(y), "groups": groups.shape, "samples": samples.shape}
+        for name, shape in shapes.items():
+            if shape != (count,):
+                raise InputError(f"{name} has the shape {shape}, give ({count},)")
+        if Z is not None and np.shape(Z) != (count, size):
+            raise InputError(f"instruments have the shape {np.shape(Z)}, give {(count, size)}")
+        self._order: np.ndarray | None = None  # in which the rows come, by time
+        if isinstance(W, np.ndarray):
+            if (np.diff(samples) < 0).any():
+                self._order = np.argsort(samples, kind="stable")
+                W, y = W[self._order], y[self._order]
+                groups, samples = groups[self._order], samples[self._order]
+                Z = None if Z is None else Z[self._order]
+            W = Stored(W, samples)
+        self.W, self.y, self.samples = W, y, samples
+        self.Z = W if Z is None else Stored(Z, samples)
+        self.members = [np.flatnonzero(groups == g) for g in range(int(groups.max()) + 1)]
+        self.groups = groups
+        for g, rows in enumerate(self.members):
+            if len(rows) < 2 or (np.diff(samples[rows]) <= 0).any():
+                raise InputError(f"samples of group {g} do not increase, sort its rows by time")
+        self.mean = np.zeros(size)
+        self.pull = np.zeros((0, size)) if pull is None else pull
+        if prior is not None:
+            mean, std = (np.asarray(x, dtype=np.float64) for x in prior)
+            if mean.shape != (size,) or std.shape != (size,):
+                raise InputError(
+                    f"the prior has means of the shape {mean.shape} and deviations of the shape "
+                    f"{std.shape}, give ({size},) each, one per column of the regressor"
+                )
+            if not (std > 0).all():
+                raise InputError(f"the prior has the deviation {std.min():g}, give one above 0")
+            self.mean, self.pull = mean, np.diag(1 / std)
+        if count + np.count_nonzero(self.pull) <= size:
+            raise InputError(f"{count} rows for {size} parameters are too few, record longer")
+        self.plain = (
+            W.factors(y, groups) if Z is None else factors(W, y, groups, Z=self.Z)
+        )  # of unweighted rows (g, k, k)
+        if not np.isfinite(self.plain).all():
+            self._refuse_not_finite()
+        # of what counts as noise, so that equations that hold to rounding settle
+        self.smallest = _ROUNDING * max(_rms(y), np.finfo(float).tiny)
+
+    def _refuse_not_finite(self) -> None:
+        order = np.arange(len(self.y)) if self._order is None else self._order
+        for name, matrix in (("regressor", self.W), ("instruments", self.Z)):
+            bad = [order[rows][~np.isfinite(W).all(axis=1)] for rows, W in matrix.blocks()]
+            if (at := np.concatenate(bad)).size:
+                raise InputError(f"{name} not finite in row {at.min()}, leave such rows out")
+        at = order[~np.isfinite(self.y)]
+        raise InputError(f"forces not finite in row {at.min()}, leave such rows out")
+
+    def common(self, theta: Array) -> Array:
+        """One standard deviation for all rows, at each group (g,)."""
+        left = np.linalg.norm(self._left(theta)) / math.sqrt(len(self.y))
+        return np.full(len(self.members), max(float(left), self.smallest))
+
+    def scales(self, theta: Array) -> Array:
+        """Standard deviation of each group (g,)."""
+        counts = np.array([len(rows) for rows in self.members])
+        return np.maximum(self._left(theta) / np.sqrt(counts), self.smallest)
+
+    def _left(self, theta: Array) -> Array:
+        """|y - W theta| of each group (g,), from the triangular factors."""
+        size = len(self.mean)
+        return np.linalg.norm(
+            self.plain[:, :, -1] - self.plain[:, :, -1 - size : -1] @ theta, axis=1
+        )
+
+    def _robust_scales(self, e: Array) -> Array:
+        """The same from medians of residuals (m,)."""
+        found = [_MAD * float(np.median(np.abs(e[rows]))) for rows in self.members]
+        return np.maximum(found, self.smallest)
+
+    def residuals(self, theta: Array) -> Array:
+        """Residuals y - W theta (m,)."""
+        e = np.array(self.y, dtype=np.float64)
+        for rows, W in self.W.blocks():
+            e[rows] -= W @ theta
+        return e
+
+    def estimate(self, scales) -> Estimate:  # type: ignore[no-untyped-def]
+        """Solve with the scales of the groups that the residuals ask for, until both agree."""
+        theta, s = np.zeros(len(self.mean)), scales(np.zeros(len(self.mean)))
+        for round_ in range(_ROUNDS):
+            before = theta
+            theta, _, A = self._solve(self.plain, s)
+            if round_ and np.abs(A @ (theta - before)).max() < _CONVERGED:
+                break
+            s = scales(theta)
+        return self.judge(theta, self.residuals(theta), s, math.inf)
+
+    def robust(self) -> Estimate:
+        """The same with rows of large residuals counting less, see `huber`."""
+        e, R = self.y, self.plain
+        s, theta = self._robust_scales(e), np.zeros(len(self.mean))
+        for round_ in range(_ROUNDS):
+            before = theta
+            theta, _, A = self._solve(R, s)
+            e = self.residuals(theta)
+            if round_ and np.abs(A @ (theta - before)).max() < _CONVERGED:
+                break
+            s = self._robust_scales(e)
+            clip = _TURN * s[self.groups]
+            shares = np.minimum(1, clip / np.maximum(np.abs(e), self.smallest))
+            R = factors(self.W, self.y, self.groups, np.sqrt(shares))
+        return self.judge(theta, e, s, _TURN)
+
+    def _solve(self, plain: Array, s: Array) -> tuple[Array, Array, Array]:
+        """theta, R (p, p) of the weighted instruments with the prior's rows, and Q^T W.
+
+        Args:
+            plain: Triangular factors of [W y], or of [Z W y], of the groups (g, k, k).
+            s: Standard deviations of the groups (g,).
+        """
+        size = len(self.mean)
+        copies = [self.pull] * ((plain.shape[2] - 1) // size)
+        prior = np.column_stack([*copies, self.pull @ self.mean])
+        whole = triangular(np.vstack([*(plain / s[:, None, None]), prior]))
+        R, A, right = whole[:size, :size], whole[:size, -1 - size : -1], whole[:size, -1]
+        length = np.linalg.norm(R, axis=0)
+        length[length == 0] = 1.0
+        values = np.linalg.svd(A / length, compute_uv=False)
+        if values[-1] < np.finfo(float).eps * len(A) * values[0]:
+            raise InputError(
+                f"the {A.shape[1]} columns of the regressor depend on each other (condition "
+                f"{values[0] / max(values[-1], 1e-300):.1g}), take base parameters, or a prior "
+                "with finite deviations of those that do"
+            )
+        return np.asarray(np.linalg.solve(A, right), dtype=np.float64), R, A
+
+    def judge(self, theta: Array, e: Array, s: Array, turn: float) -> Estimate:
+        """Covariance of theta: A^-1 (sum of Q^T noise) A^-T with the noise's correlations.
+
+        The noise of joint i is modelled as autoregressive, a_i(z) e_i = u_i, with covariances
+        S_ij of the innovations u between joints at one instant; its covariance matrix over time
+        is then a_i^-1 S_ij a_j^-T, and Q^T (...) Q comes from filtering Q by a_i^-1 backwards
+        in time. Rows that are missing are zero in Q.
+
+        Where parameters take many of the degrees of freedom at low frequencies, where motions
+        are, the residuals there are smaller than the noise, and noise may be more than a steady
+        spectrum. So the standard deviations are those of the `Jackknife` where these are larger;
+        the correlations between parameters stay. R and A are of the rows that are not clipped,
+        with which alone the estimate moves, Q of all.
+        """
+        every = s[self.groups]
+        clipped = np.clip(e, -turn * every, turn * every)
+        counted = np.abs(e) <= turn * every
+        count, inflated = len(e), math.sqrt(len(e) / max(len(e) - len(theta), 1))
+        noise = inflated * np.array([_rms(clipped[rows]) for rows in self.members])
+        clipped /= every
+        del every
+        noises = [Noise.of(clipped[rows], self.samples[rows]) for rows in self.members]
+        rows = self.plain if counted.all() else factors(self.W, self.y, self.groups, counted)
+        _, R, A = self._solve(rows, s)
+        left_out = Jackknife(self.samples, noises, len(theta))
+        middle = self._coloured(R, s, noises, left_out, clipped, counted)
+        del clipped, counted
+        prior = np.linalg.solve(R.T, self.pull.T)
+        inverse = np.linalg.inv(A)
+        covariance, moved = (
+            inverse @ (x + prior @ prior.T) @ inverse.T
+            for x in (0.5 * (middle + middle.T), left_out.covariance())
+        )
+        larger = np.sqrt(np.maximum(np.diag(moved) / np.diag(covariance), 1.0))
+        plain, scaled = conditions(np.vstack(list(self.plain[:, :, -1 - len(theta) : -1])))
+        if self._order is not None:
+            e, ordered = np.empty(count), e
+            e[self._order] = ordered
+        return Estimate(
+            values=theta,
+            covariance=covariance * np.outer(larger, larger),
+            residuals=e,
+            noise=noise,
+            effective=np.array([noise.effective for noise in noises]),
+            freedom=left_out.freedom,
+            condition=plain,
+            scaled_condition=scaled,
+        )
+
+    def _coloured(
+        self,
+        R: Array,
+        s: Array,
+        noises: list[Noise],
+        left_out: Jackknife,
+        e: Array,
+        counted: np.ndarray,
+    ) -> Array:
+        """Q^T (covariance of the noise) Q (p, p), Q = Z / s R^-1, from the last row on.
+
+        The rows are handed to a jackknife on the way, with their weighted residuals e (m,) and
+        whether the estimate moves with them.
+        """
+        from scipy.linalg import solve_triangular
+
+        S, size = between(noises), len(R)
+        carried = [noise.at_rest(size) for noise in noises]
+        middle = np.zeros((size, size))
+
+        def pass_on(count: int, at: np.ndarray, groups: np.ndarray, Q: Array) -> None:
+            """So many instants, the last of which is 0, the one before it 1; Q (p, rows)."""
+            filtered = []
+            for i, noise in enumerate(noises):
+                dense = np.zeros((size, count))
+                dense[:, at[groups == i]] = Q[:, groups == i]
+                out, carried[i] = noise.pass_on(dense, carried[i])
+                filtered.append(out)
+            for i, one in enumerate(filtered):
+                middle[:] += one @ sum(S[i, j] * other.T for j, other in enumerate(filtered))
+
+        def wait(count: int) -> None:
+            nothing = np.zeros(0, dtype=np.intp)
+            for start in range(0, count, _WAITING):
+                pass_on(min(_WAITING, count - start), nothing, nothing, np.zeros((size, 0)))
+
+        last = int(self.samples[-1]) + 1
+        for rows, block in self.Z.blocks(backwards=True):
+            at, groups = self.samples[rows], self.groups[rows]
+            Q = solve_triangular(R, (block / s[groups, None]).T, trans="T")
+            left_out.add(self.samples[rows], Q, e[rows], counted[rows])
+            wait(last - 1 - int(at[-1]))
+            pass_on(int(at[-1] - at[0]) + 1, at[-1] - at, groups, Q)
+            last = int(at[0])
+        wait(max(noise.memory for noise in noises))
+        return middle
+
+
+def _rms(e: Array) -> float:
+    return math.sqrt(np.mean(np.square(e)))
+
+
+def conditions(W: Array) -> tuple[float, float]:
+    """Condition numbers of W, or of its triangular factor, and with columns of length one."""
+    return _condition(W), _condition(W / np.maximum(np.linalg.norm(W, axis=0), 1e-300))
+
+
+def _condition(W: Array) -> float:
+    return float(np.linalg.cond(np.linalg.qr(W, mode="r")))

@@ -1,0 +1,112 @@
+"""What a reference may use of a machine."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.common.errors import InputError, known
+from crane.common.samples import Array, as_number
+from crane.identification.mechanics.base import strokes
+from crane.identification.mechanics.model import Samples
+from crane.machine import Machine
+
+QUANTITIES = ("stroke", "velocity", "acceleration", "force")
+_GEAR = 5.0  # times as fast as at home, passive joints near the edge of the assembly branch
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What a reference may use of a machine, infinite where there is no limit.
+
+    Attributes:
+        middle: (n,) of the strokes [m], [rad].
+        half: (n,) of the strokes' lengths.
+        velocity: (n,).
+        acceleration: (n,).
+        force: (n,) [N], [N m].
+    """
+
+    middle: Array
+    half: Array
+    velocity: Array
+    acceleration: Array
+    force: Array
+
+    @property
+    def all(self) -> Array:
+        """(4, n) by `QUANTITIES`, of strokes their half lengths."""
+        return np.stack([self.half, self.velocity, self.acceleration, self.force])
+
+    def shares(self, q_a: Array, v_a: Array, a_a: Array, tau: Array) -> Array:
+        """What of the limits a motion uses, 1 at a limit, (..., 4, n) as in `QUANTITIES`."""
+        return np.abs(np.stack([q_a - self.middle, v_a, a_a, tau], axis=-2)) / self.all
+
+
+def limits(
+    machine: Machine, acceleration: Mapping[str, float] | None = None, margin: float = 0.05
+) -> Limits:
+    """Limits of the active joints, strokes, velocities and forces as in the URDF.
+
+    A joint without end keeps within 1 rad (1 m) of home. Accelerations need no limit of their
+    own: one below velocity V with harmonics up to K w is below K w V (Bernstein).
+
+    Args:
+        machine: The machine.
+        acceleration: Further limits by active joint [m/s2], [rad/s2].
+        margin: Share of every limit that is left unused, at both ends of a stroke.
+
+    Raises:
+        InputError: Unknown joints, limits that let nothing move.
+    """
+    if not 0 <= as_number(margin, "the margin", "") < 1:
+        raise InputError(f"the margin is {margin:g}, give a share from 0 to below 1")
+    columns = machine.closure.active
+    lower, upper = strokes(machine)
+    found = Limits(
+        (lower + upper) / 2,
+        (upper - lower) / 2 * (1 - margin),
+        machine.model.velocityLimit[columns] * (1 - margin),
+        by_joint(machine, acceleration, "acceleration", np.full(len(columns), np.inf))
+        * (1 - margin),
+        machine.model.effortLimit[columns] * (1 - margin),
+    )
+    for what, values in zip(QUANTITIES, found.all, strict=True):
+        for joint, value in zip(machine.active, values, strict=True):
+            if not value > 0:
+                raise InputError(f"the {what} limit of '{joint}' is 0, give one above")
+    return found
+
+
+def by_joint(
+    machine: Machine, given: Mapping[str, float] | None, what: str, default: Array
+) -> Array:
+    """Positive numbers (n,) by active joint.
+
+    Raises:
+        InputError: An unknown joint, or a number that is not positive.
+    """
+    out = default.copy()
+    for joint, value in (given or {}).items():
+        if joint not in machine.active:
+            raise InputError(
+                f"{what} of '{joint}', which is not active, {known(machine.active, joint)}"
+            )
+        out[machine.active.index(joint)] = as_number(value, f"{what} of '{joint}'", "", above=0)
+    return out
+
+
+def gear(machine: Machine, at: Samples) -> Array:
+    """How near the edge of the branch postures are, (N,), 1 where it is near.
+
+    Passive joints move there without end for a small way of the active ones, which would tell
+    everything and cannot be driven: |gamma_P diag(span)| / (5 |...| at home).
+    """
+    lower, upper = strokes(machine)
+    rows, span = machine.closure.passive, upper - lower
+
+    def size(gamma: Array) -> Array:
+        return np.asarray(np.linalg.norm(gamma[..., rows, :] * span, axis=(-2, -1)))
+
+    home = float(size(machine.closure.gamma(machine.home)))
+    return size(at.gamma) / (_GEAR * home) if home else np.zeros(len(at.q))

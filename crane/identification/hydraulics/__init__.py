@@ -1,0 +1,1 @@
+"""Orifices, valves, and the friction of cylinders."""

@@ -1,0 +1,314 @@
+"""Friction of a cylinder from its pressures at constant speed.
+
+The hydraulic force of equation (20) of the electro-hydraulic forwarder paper, less the load's, is
+friction:
+
+    F - load = (coulomb + stiction e^-(v / stribeck)^2) sign(v) + coulomb_offset + viscous v,
+
+with sign(v) as tanh(v / smoothing), as `crane.description.Friction`.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.common.errors import InputError, RecordingError, known
+from crane.common.samples import Array, Brief
+from crane.description import Friction
+from crane.dynamics import Dynamics
+from crane.identification.estimation import estimators
+from crane.identification.estimation.estimators import Estimate
+from crane.identification.hydraulics.cylinder_signals import column
+from crane.identification.mechanics.identify import motion_of
+from crane.identification.signals.steady import steady
+from crane.machine import Machine
+from crane.recordings.recording import Recording
+
+NAMES = ("coulomb", "coulomb_offset", "viscous", "stiction", "stribeck")
+
+_SLIDING = 3.0  # smoothing velocities, above which the sign of the speed is told
+_STEADY = 0.05  # of the speed, by which it may change
+_MOST = 4000  # samples
+_STILL = 0.01  # of the fastest speed
+_SEARCHED = 40  # stribeck velocities tried before the fit
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CylinderFriction(Brief):
+    """Friction of one joint.
+
+    Attributes:
+        joint: Its name.
+        values: (3,) coulomb, coulomb_offset, viscous; or (5,) with stiction and stribeck.
+        covariance: (3, 3) or (5, 5).
+        freedom: Degrees of freedom behind it.
+        smoothing: Of the sign [m/s] or [rad/s], which is given, not estimated.
+        speed: Steady samples (M,) [m/s] or [rad/s].
+        force: Measured friction there (M,) [N] or [N m].
+        noise: Standard deviation of the force about the fit.
+        note: Why stiction was left out, "" where it was not.
+    """
+
+    joint: str
+    values: Array
+    covariance: Array
+    freedom: float
+    smoothing: float
+    speed: Array
+    force: Array
+    noise: float
+    note: str = ""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the values."""
+        return NAMES[: len(self.values)]
+
+    @property
+    def std(self) -> Array:
+        """Standard errors."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def interval(self, level: float = 0.95) -> Array:
+        """Ends (p, 2) of what covers the truth with this probability."""
+        from scipy.stats import t
+
+        half = t.ppf(0.5 + 0.5 * level, self.freedom) * self.std
+        return np.column_stack([self.values - half, self.values + half])
+
+    @property
+    def friction(self) -> Friction:
+        """For `Machine.replace`; what came out negative and cannot be is 0."""
+        found = dict(zip(self.names, map(float, self.values), strict=True))
+        for name in ("coulomb", "viscous", "stiction"):
+            found[name] = max(found.get(name, 0.0), 0.0)
+        return Friction(smoothing=self.smoothing, **found)
+
+    def predict(self, speed: Array) -> Array:
+        """Friction at speeds (N,)."""
+        return _law(self.values, speed, self.smoothing)
+
+    def to_text(self, unit: str = "m") -> str:
+        """A table of the parameters."""
+        force = "N" if unit == "m" else "N m"
+        units = (force, force, f"{force} s/{unit}", force, f"{unit}/s")
+        lines = [
+            f"friction of {self.joint}: {len(self.speed)} steady samples, "
+            f"{self.noise:.3g} {force} about the fit",
+            f"{'':<16}{'value':>12}{'std':>10}   95 % interval",
+        ]
+        rows = zip(self.names, self.values, self.std, self.interval(), units, strict=False)
+        for name, value, std, (low, high), text in rows:
+            lines.append(f"{name:<16}{value:>12.5g}{std:>10.2g}   {low:.5g} to {high:.5g} {text}")
+        return "\n".join([*lines, *([self.note] if self.note else [])]) + "\n"
+
+
+def cylinder_friction(
+    machine: Machine,
+    recording: Recording,
+    joint: str,
+    settle: float = 0.3,
+    stribeck: bool | None = None,
+) -> CylinderFriction:
+    """Friction of one joint, its load from the machine's masses.
+
+    The load is tau_A of `Dynamics.inverse` without friction at the smoothed motion. Samples count
+    where the speed was steady for `settle` seconds and the joint slides. Stiction and its velocity
+    are estimated if the speeds reach below that velocity and the stiction is told apart from
+    zero; otherwise they are 0 and the result's note says so.
+
+    Args:
+        machine: Its masses count as known; friction of this joint is not used but for its
+            smoothing, that of the other joints belongs to their own forces.
+        recording: Of all its active joints, tau of this one by (20).
+        joint: An active joint.
+        settle: [s].
+        stribeck: False never estimates stiction, True insists; None decides.
+
+    Raises:
+        InputError: The joint is not active.
+        RecordingError: What is recorded cannot serve, or does not tell the parameters.
+    """
+    if joint not in machine.active:
+        raise InputError(f"'{joint}' is not an active joint, {known(machine.active, joint)}")
+    index = machine.active.index(joint)
+    motion = motion_of(machine, recording)
+    load = Dynamics(machine).inverse(motion.q, motion.v, motion.a)[:, index]
+    given = machine.friction.get(joint, Friction())
+    v = motion.v[:, index]
+    at = np.flatnonzero(
+        steady(motion.time, settle, v, share=_STEADY, relative=True)
+        & (np.abs(v) > _SLIDING * given.smoothing)
+    )
+    speed, force = v[at], (motion.tau[:, index] - load)[at]
+    for sense, word in ((1, "extends"), (-1, "retracts")):
+        sizes = np.abs(speed[sense * speed > 0])
+        if len(sizes) < 2 or sizes.max() < 1.5 * sizes.min():
+            raise RecordingError(
+                f"'{joint}' never {word} steadily at two speeds above "
+                f"{_SLIDING * given.smoothing:g} {machine.unit(joint)}/s, record constant speeds "
+                "both ways"
+            )
+    every = max(1, len(at) // _MOST)
+    at, speed, force = at[::every], speed[::every], force[::every]
+    result, note = _plain(at, speed, force, given.smoothing), ""
+    if stribeck is not False:
+        curved, note = _curved(at, speed, force, given.smoothing)
+        if note and stribeck:
+            raise RecordingError(f"stiction of '{joint}' cannot be told: {note}")
+        if not note:
+            result = curved
+    values, estimate = result
+    return CylinderFriction(
+        joint=joint,
+        values=values,
+        covariance=estimate.covariance,
+        freedom=estimate.freedom,
+        smoothing=given.smoothing,
+        speed=speed,
+        force=force,
+        noise=float(estimate.noise[0]),
+        note=note and f"Coulomb and viscous friction only: {note}",
+    )
+
+
+Fit = tuple[Array, Estimate]
+
+
+def _law(values: Array, v: Array, smoothing: float) -> Array:
+    sign = np.tanh(v / smoothing) if smoothing else np.sign(v)
+    out = values[0] * sign + values[1] + values[2] * v
+    if len(values) == 5:
+        out = out + values[3] * np.exp(-((v / values[4]) ** 2)) * sign
+    return np.asarray(out)
+
+
+def _columns(v: Array, smoothing: float, stribeck: float | None = None) -> Array:
+    """Of what the law is linear in (M, 3) or (M, 4)."""
+    sign = np.tanh(v / smoothing) if smoothing else np.sign(v)
+    columns = [sign, np.ones_like(v), v]
+    if stribeck is not None:
+        columns.append(np.exp(-((v / stribeck) ** 2)) * sign)
+    return np.column_stack(columns)
+
+
+def _plain(at: np.ndarray, v: Array, force: Array, smoothing: float) -> Fit:
+    estimate = estimators.least_squares(_columns(v, smoothing), force, samples=at)
+    return estimate.values, estimate
+
+
+def _curved(at: np.ndarray, v: Array, force: Array, smoothing: float) -> tuple[Fit, str]:
+    """With stiction, and why it is not told ("" if it is)."""
+    from scipy.optimize import minimize_scalar
+
+    sizes = np.abs(v)
+    slowest, fastest = float(sizes.min()), float(sizes.max())
+
+    def cost(log_stribeck: float) -> float:
+        W = _columns(v, smoothing, float(np.exp(log_stribeck)))
+        rest = force - W @ np.linalg.lstsq(W, force, rcond=None)[0]
+        return float(rest @ rest)
+
+    # for every stribeck velocity the rest is linear
+    grid = np.linspace(np.log(0.3 * slowest), np.log(fastest), _SEARCHED)
+    best = int(np.argmin([cost(x) for x in grid]))
+    ends = grid[max(best - 1, 0)], grid[min(best + 1, _SEARCHED - 1)]
+    found = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 1e-10})
+    width = float(np.exp(found.x))
+    W = _columns(v, smoothing, width)
+    linear = np.linalg.lstsq(W, force, rcond=None)[0]
+    values = np.append(linear, width)
+    slope = linear[3] * W[:, 3] * 2 * v**2 / width**3
+    plain = _plain(at, v, force, smoothing)
+    low = f"speeds from {slowest:.2g} to {fastest:.2g}"
+    if best == 0 or width < slowest:
+        return plain, f"{low} hold none below the Stribeck velocity, record slower ones"
+    if best == _SEARCHED - 1 or width > 0.5 * fastest:
+        return plain, f"{low} do not exceed the Stribeck velocity twofold, record faster ones"
+    J = np.column_stack([W, slope])
+    if np.linalg.cond(J / np.maximum(np.linalg.norm(J, axis=0), 1e-300)) > 1e8:
+        return plain, f"{low} show no stiction"
+    estimate = estimators.least_squares(
+        J, force - _law(values, v, smoothing) + J @ values, samples=at
+    )
+    if not linear[3] > 3 * estimate.std[3]:
+        return plain, f"{low} show no stiction"
+    return (values, dataclasses.replace(estimate, values=values)), ""
+
+
+@dataclass(frozen=True, eq=False)
+class DirectionDifference:
+    """Friction and load without a model, for strokes and speeds that occur both ways.
+
+    Attributes:
+        stroke: Middle of each bin (K,) [m] or [rad].
+        speed: Mean size of the speed (K,).
+        friction: (F_extending - F_retracting) / 2, (K,) [N] or [N m].
+        load: (F_extending + F_retracting) / 2, without the part of friction that does not change
+            its sign in it (K,).
+    """
+
+    stroke: Array
+    speed: Array
+    friction: Array
+    load: Array
+
+
+def direction_difference(
+    recording: Recording, joint: str, strokes: int = 10, settle: float = 0.3, match: float = 0.1
+) -> DirectionDifference:
+    """Half the difference of the force between both directions at the same stroke and speed.
+
+    No masses are needed. The other joints have to be at the same coordinates both ways. In
+    each bin of the stroke, force over stroke is a straight line for each direction and speed, read
+    at the middle of what both share, so that a load that changes along the stroke does not count.
+
+    Args:
+        recording: tau of the joint by (20).
+        joint: Its name.
+        strokes: Number of equal bins of the stroke.
+        settle: [s] of constant speed.
+        match: Relative difference of speeds that count as the same.
+
+    Raises:
+        RecordingError: Nothing occurs both ways.
+    """
+    i = column(recording, joint)
+    x, v, force = recording.q[:, i], recording.v[:, i], recording.tau[:, i]
+    kept = steady(recording.time, settle, v, share=_STEADY, relative=True) & (
+        np.abs(v) > _STILL * np.abs(v).max()
+    )
+    edges = np.linspace(x.min(), x.max(), strokes + 1)
+    rows = []
+    for low, high in zip(edges[:-1], edges[1:], strict=True):
+        inside = kept & (x >= low) & (x <= high)
+        for level in _levels(np.abs(v[inside]), match):
+            same = inside & (np.abs(np.abs(v) - level) <= match * level)
+            ways = [np.flatnonzero(same & (sense * v > 0)) for sense in (1, -1)]
+            if min(map(len, ways)) < 3:
+                continue
+            start, end = (max(x[w].min() for w in ways), min(x[w].max() for w in ways))
+            if end <= start:
+                continue
+            middle = 0.5 * (start + end)
+            up, down = (float(np.polyfit(x[w] - middle, force[w], 1)[-1]) for w in ways)
+            speed = float(np.mean([np.abs(v[w]).mean() for w in ways]))
+            rows.append((middle, speed, 0.5 * (up - down), 0.5 * (up + down)))
+    if not rows:
+        raise RecordingError(
+            f"'{joint}' has no stroke that it passes both ways at one steady speed, record it "
+            "extending and retracting at the same speeds"
+        )
+    return DirectionDifference(*np.array(rows).T)
+
+
+def _levels(sizes: Array, match: float) -> list[float]:
+    """Speeds that stand for groups of equal ones."""
+    out: list[float] = []
+    rest = np.sort(sizes)
+    while len(rest):
+        group = rest[rest <= rest[0] * (1 + match)]
+        out.append(float(np.median(group)))
+        rest = rest[len(group) :]
+    return out

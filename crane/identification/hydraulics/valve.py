@@ -1,0 +1,233 @@
+"""Neutral signal, dead band and flow gain of a compensated valve from steady speeds.
+
+Pressure compensation makes the flow a function of the signal U [V] alone. With e = U - neutral
+towards extending (turned where `full` is below `neutral`), steady speed v and half a dead band w,
+
+    v = s_up max(e - w, 0) - s_down max(-e - w, 0),
+
+and with the nominal signal range S = |full - neutral| that is v A = gain (|u| - u0) / (1 - u0),
+u = e / S, u0 = w / S, gain = s A (S - w): A is the inlet's area, chamber A to extend and B to
+retract.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.common.errors import RecordingError
+from crane.common.samples import Array, Brief
+from crane.identification.estimation import estimators
+from crane.identification.hydraulics.cylinder_signals import channel, parts, speed
+from crane.identification.signals.steady import steady
+from crane.machine import Machine
+from crane.recordings.recording import Recording
+
+NAMES = ("edge up", "edge down", "slope up", "slope down")
+_UNITS = ("V", "V", "{0}/s/V", "{0}/s/V")
+_STILL = 0.01  # of the fastest speed, at which a signal moves nothing
+_FEWEST_LEVELS = 0.05  # of the signal's range, by which levels of one direction must differ
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ValveCurve(Brief):
+    """Steady speed over signal.
+
+    Attributes:
+        joint: The cylinder's.
+        values: (4,) signals where extending and retracting begin [V], and how the speed in that
+            direction grows with the signal [m/s/V] or [rad/s/V], both positive.
+        covariance: (4, 4).
+        freedom: Degrees of freedom behind it.
+        span: Nominal |full - neutral| [V] with its sign: negative where a lower signal extends.
+        areas: Of the inlets (2,), extending and retracting [m2].
+        signal: Steady samples used (M,) [V].
+        speed: Their speeds (M,).
+        noise: Standard deviation of the speeds about the curve.
+    """
+
+    joint: str
+    values: Array
+    covariance: Array
+    freedom: float
+    span: float
+    areas: tuple[float, float]
+    signal: Array
+    speed: Array
+    noise: float
+
+    def derived(self) -> tuple[tuple[str, ...], Array, Array]:
+        """What a machine file takes: names, values (5,) and Jacobian (5, 4) of them.
+
+        neutral [V], dead_band as share u0 and, as half width, in volts, flow of u = 1 extending
+        and retracting [m3/s].
+        """
+        up, down, s_up, s_down = self.values
+        turn, size = np.sign(self.span), abs(self.span)
+        half = 0.5 * turn * (up - down)
+        d_half = 0.5 * turn * np.array([1.0, -1, 0, 0])
+        rows = [np.array([0.5, 0.5, 0, 0]), d_half / size, d_half]
+        for area, slope, at in ((self.areas[0], s_up, 2), (self.areas[1], s_down, 3)):
+            row = -area * slope * d_half
+            row[at] += area * (size - half)
+            rows.append(row)
+        flows = [a * s * (size - half) for a, s in zip(self.areas, (s_up, s_down), strict=True)]
+        values = np.array([0.5 * (up + down), half / size, half, *flows])
+        return (
+            ("neutral", "dead_band", "half width", "flow up", "flow down"),
+            values,
+            np.array(rows),
+        )
+
+    @property
+    def neutral(self) -> float:
+        """Signal in the middle of the dead band [V]."""
+        return float(self.derived()[1][0])
+
+    @property
+    def dead_band(self) -> float:
+        """Share u0 of the nominal stroke."""
+        return float(self.derived()[1][1])
+
+    @property
+    def flows(self) -> tuple[float, float]:
+        """Flow of u = 1, extending and retracting [m3/s]."""
+        return float(self.derived()[1][3]), float(self.derived()[1][4])
+
+    def table(self, level: float = 0.95) -> dict[str, tuple[float, float, float]]:
+        """By name value, and both ends of what covers the truth with this probability."""
+        from scipy.stats import t
+
+        factor = t.ppf(0.5 + 0.5 * level, self.freedom)
+        names, values, J = self.derived()
+        std = np.sqrt(np.diag(self.covariance)), np.sqrt(np.diag(J @ self.covariance @ J.T))
+        rows = zip(
+            (*NAMES, *names),
+            np.concatenate([self.values, values]),
+            factor * np.concatenate(std),
+            strict=True,
+        )
+        return {name: (float(v), float(v - h), float(v + h)) for name, v, h in rows}
+
+    def predict(self, signal: Array) -> Array:
+        """Steady speeds of signals (N,) [V]."""
+        return _curve(self.values, signal, np.sign(self.span))
+
+    def to_text(self, unit: str = "m") -> str:
+        """A table of all of them."""
+        units = [text.format(unit) for text in _UNITS] + ["V", "", "V", "m3/s", "m3/s"]
+        lines = [
+            f"valve of {self.joint}: {len(self.signal)} steady samples",
+            f"{'':<12}{'value':>12}   95 % interval",
+        ]
+        for (name, (value, low, high)), text in zip(self.table().items(), units, strict=True):
+            lines.append(f"{name:<12}{value:>12.5g}   {low:.5g} to {high:.5g} {text}".rstrip())
+        return "\n".join(lines) + "\n"
+
+
+def identify_valve(
+    machine: Machine, recording: Recording, joint: str, settle: float = 0.5
+) -> ValveCurve:
+    """Dead band and gains of one valve from slow ramps or a staircase of its signal.
+
+    Samples count whose signal and speed hardly changed over the last `settle` seconds. With
+    pressures recorded, those that move are left out where the compensator has no margin (supply
+    less inlet below the valve's margin), or where the inlet is sucked empty (below half of the
+    tank's pressure) since the load runs ahead. The spool's lag moves the edges by lag times rate
+    of a ramp; up and down together cancel that.
+
+    Args:
+        machine: With hydraulics; of its valve `neutral`, `full` and `margin` are used, the first
+            two for direction and range only.
+        recording: With the joint and `voltage_<joint>`; pressures as in `cylinder_signals`.
+            A noisy velocity is replaced by a smoother's of the coordinate.
+        joint: The cylinder's.
+        settle: [s], several times the spool's and the load's answer.
+
+    Raises:
+        InputError: The joint has no cylinder.
+        RecordingError: A column is missing, nothing is steady, or one direction is not recorded
+            at two signals.
+    """
+    cylinder, valve = parts(machine, joint)
+    signal = channel(recording, f"voltage_{joint}", "V")
+    v = speed(recording, joint)
+    kept = steady(recording.time, settle, signal, v)
+    fastest = float(np.abs(v).max())
+    names = (f"pressure_{joint}_a", f"pressure_{joint}_b", "pressure_supply")
+    if valve.margin and all(name in recording.channels for name in names):
+        p_a, p_b, supply = (channel(recording, name, "Pa") for name in names)
+        inlet = np.where(v > 0, p_a, p_b)
+        tank = machine.hydraulics.supply.tank if machine.hydraulics else 0.0
+        served = (supply - inlet >= valve.margin) & (inlet > 0.5 * tank)
+        kept &= served | (np.abs(v) < _STILL * fastest)
+    span = valve.full - valve.neutral
+    turn = float(np.sign(span))
+    for sense, word in ((1, "extending"), (-1, "retracting")):
+        moving = kept & (sense * v > _STILL * fastest)
+        if np.count_nonzero(moving) < 2 or np.ptp(signal[moving]) < _FEWEST_LEVELS * np.ptp(
+            signal
+        ):
+            raise RecordingError(
+                f"'{joint}' has no steady {word} at two signals with margin at its valve, record "
+                f"a slow ramp or steps of more than {settle:g} s of 'voltage_{joint}' that way"
+            )
+    at = np.flatnonzero(kept)
+    # so many samples as tell anything anew
+    at = at[:: max(1, len(at) // 4000)]
+    U, speeds = signal[at], v[at]
+    values = _fit(U, speeds, turn, fastest)
+    J = _jacobian(values, U, turn)
+    told = estimators.least_squares(J, speeds - _curve(values, U, turn) + J @ values, samples=at)
+    return ValveCurve(
+        joint=joint,
+        values=values,
+        covariance=told.covariance,
+        freedom=told.freedom,
+        span=span,
+        areas=(cylinder.area_a, cylinder.area_b),
+        signal=U,
+        speed=speeds,
+        noise=float(told.noise[0]),
+    )
+
+
+def _curve(values: Array, U: Array, turn: float) -> Array:
+    up, down, s_up, s_down = values
+    rising, falling = np.maximum(turn * (U - up), 0), np.maximum(turn * (down - U), 0)
+    return np.asarray(s_up * rising - s_down * falling)
+
+
+def _jacobian(values: Array, U: Array, turn: float) -> Array:
+    """Of `_curve` (M, 4)."""
+    up, down, s_up, s_down = values
+    rising, falling = np.maximum(turn * (U - up), 0), np.maximum(turn * (down - U), 0)
+    return np.column_stack(
+        [-turn * s_up * (rising > 0), -turn * s_down * (falling > 0), rising, -falling]
+    )
+
+
+def _fit(U: Array, v: Array, turn: float, fastest: float) -> Array:
+    """Least squares in edges and slopes, from straight lines through each direction."""
+    from scipy.optimize import least_squares
+
+    start = np.empty(4)
+    for i, sense in enumerate((1, -1)):
+        moving = sense * v > 0.1 * fastest
+        if np.ptp(U[moving]) == 0:
+            moving = sense * v > _STILL * fastest
+        slope, offset = np.polyfit(U[moving], v[moving], 1)
+        start[i], start[2 + i] = -offset / slope, abs(slope)
+    volts, rate = float(np.ptp(U)), float(np.abs(start[2:]).max())
+
+    def residuals(x: Array) -> Array:
+        return _curve(x, U, turn) - v
+
+    def jacobian(x: Array) -> Array:
+        return _jacobian(x, U, turn)
+
+    scale = [volts, volts, rate, rate]
+    fine = 1e-14
+    found = least_squares(
+        residuals, start, jac=jacobian, x_scale=scale, xtol=fine, ftol=fine, gtol=fine
+    )
+    return np.asarray(found.x)

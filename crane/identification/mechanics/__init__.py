@@ -1,0 +1,1 @@
+"""Inertial and friction parameters, and payloads."""

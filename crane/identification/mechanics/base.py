@@ -1,0 +1,192 @@
+"""Base parameters: what of a machine's parameters can be told from its drives' forces."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from crane.closure.structure import Indices
+from crane.common.errors import ClosureError, InputError
+from crane.common.samples import Array, Brief
+from crane.identification.mechanics.model import Model, Samples
+from crane.machine import Machine
+
+_RANK = 1e-8  # of a column's norm, what of it must be new
+_ALIKE = 1e12  # condition number of columns of length one that depend on each other
+_NOTHING = 1e-10  # of the largest norm, below which a column is zero
+_SPAN = 1.0  # [m], [rad] of joints without limits
+# Preferred as base parameters, first: what is told from one axis before what needs many.
+_ORDER = {
+    "Izz": 0,
+    "mx": 1,
+    "my": 1,
+    "mz": 2,
+    "Ixx": 3,
+    "Ixy": 3,
+    "Ixz": 3,
+    "Iyz": 3,
+    "Iyy": 4,
+    "m": 5,
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Base(Brief):
+    """The smallest set of parameters with the same effect: W beta = W[:, independent] K beta.
+
+    Attributes:
+        names: (p,) of all parameters.
+        independent: (r,) columns of W that carry the base parameters.
+        grouping: K (r, p): base parameters are K beta; identity in the independent columns.
+        unobservable: Names of parameters without any effect.
+    """
+
+    names: tuple[str, ...]
+    independent: Indices
+    grouping: Array
+    unobservable: tuple[str, ...]
+
+    @property
+    def rank(self) -> int:
+        """Number of base parameters."""
+        return len(self.independent)
+
+    def narrowed(self, rows: Array) -> "Base":
+        """What of the base parameters a motion tells, rows (m, r) of their columns."""
+        names, tolerance = [self.names[i] for i in self.independent], _RANK
+        told = group(names, rows)
+        # many columns, each of them new by a little, may together hold nothing new
+        while _dependent(rows[:, told.independent]) and tolerance < 1e-2:
+            tolerance *= 10
+            told = group(names, rows, tolerance=tolerance)
+        if told.rank == self.rank:
+            return self
+        independent = self.independent[told.independent]
+        return Base(self.names, independent, told.grouping @ self.grouping, self.unobservable)
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Each base parameter in words, such as "link7.mx + 0.22 payload.m"."""
+        out = []
+        for row, first in zip(self.grouping, self.independent, strict=True):
+            others = []
+            for i, (share, name) in enumerate(zip(row, self.names, strict=True)):
+                if share != 0 and i != first:
+                    factor = "" if abs(abs(share) - 1) < 1e-9 else f"{abs(share):.6g} "
+                    others.append(f"{'-' if share < 0 else '+'} {factor}{name}")
+            out.append(" ".join([self.names[first], *others]))
+        return tuple(out)
+
+    def values(self, parameters: Array) -> Array:
+        """Base parameters (r,) of parameters (p,)."""
+        return self.grouping @ parameters
+
+
+def random_samples(model: Model, count: int, seed: int = 0) -> Samples:
+    """Closed postures all over the strokes, with random velocities and accelerations.
+
+    Raises:
+        InputError: The loops close nowhere within the limits.
+    """
+    machine, rng = model.machine, np.random.default_rng(seed)
+    lower, upper = strokes(machine)
+    q_a: list[Array] = []
+    for _ in range(20 * count):
+        trial = rng.uniform(lower, upper)
+        try:
+            machine.closure.solve(trial)
+        except ClosureError:
+            continue
+        q_a.append(trial)
+        if len(q_a) == count:
+            break
+    if len(q_a) < count:
+        raise InputError(
+            f"the loops of '{machine.name}' close in {len(q_a)} of {20 * count} random postures "
+            "within its limits, narrow the limits"
+        )
+    # joints that move little per coordinate are moved faster, so that all columns are alike
+    span = upper - lower
+    v_a, a_a = (size * span * rng.normal(size=(count, len(lower))) for size in (1.0, 3.0))
+    return model.samples(np.array(q_a), v_a, a_a)
+
+
+def strokes(machine: Machine) -> tuple[Array, Array]:
+    """Limits of the active joints; those without are taken around home."""
+    home = machine.home[machine.closure.active]
+    span = machine.upper - machine.lower
+    endless = ~np.isfinite(span)
+    return (
+        np.where(endless, home - _SPAN, machine.lower),
+        np.where(endless, home + _SPAN, machine.upper),
+    )
+
+
+def base_parameters(model: Model, samples: Samples | None = None, seed: int = 0) -> Base:
+    """Base parameters of a model, numerically (Gautier, 1991).
+
+    The columns of W over random closed postures are taken one by one, those of Izz, mx, my and
+    of the last bodies first; one that is a combination of those before it joins their groups.
+
+    Args:
+        model: The model.
+        samples: A motion, if what it can tell is asked for; all of the strokes if not given.
+        seed: Of the random postures.
+
+    Raises:
+        InputError: The loops close nowhere within the limits.
+    """
+    p, n = len(model.names), len(model.machine.active)
+    if samples is None:
+        samples = random_samples(model, max(60, 4 * p // n), seed)
+    rows = model.regressor(samples).reshape(-1, p)
+    return group(model.names, rows, lambda column: _preference(model, column))
+
+
+def group(
+    names: Sequence[str],
+    rows: Array,
+    preference: Callable[[int], Any] = lambda column: column,
+    tolerance: float = _RANK,
+) -> Base:
+    """Base parameters of a regressor (m, p), columns of small preference first.
+
+    A column counts if what is new of it exceeds the tolerance of its norm.
+    """
+    norms = np.linalg.norm(rows, axis=0)
+    zero = norms <= _NOTHING * norms.max(initial=0.0)
+    scaled = rows / np.where(zero, 1.0, norms)
+    chosen: list[int] = []
+    directions = np.empty((len(rows), 0))
+    for i in sorted(np.flatnonzero(~zero).tolist(), key=preference):
+        rest = scaled[:, i]
+        for _ in range(2):  # twice is enough (Kahan, Parlett)
+            rest = rest - directions @ (directions.T @ rest)
+        length = np.linalg.norm(rest)
+        if length > tolerance:
+            chosen.append(i)
+            directions = np.column_stack([directions, rest / length])
+    independent = np.array(sorted(chosen), dtype=np.intp)
+    q, r = np.linalg.qr(scaled[:, independent])
+    share = np.linalg.solve(r, q.T @ scaled)
+    share[np.abs(share) < 1e-9] = 0.0
+    grouping = share * np.where(zero, 0.0, norms) / norms[independent][:, None]
+    grouping[:, independent] = np.eye(len(independent))
+    gone = tuple(name for name, nothing in zip(names, zero, strict=True) if nothing)
+    return Base(tuple(names), independent, grouping, gone)
+
+
+def _dependent(columns: Array) -> bool:
+    if columns.shape[1] < 2:
+        return False
+    return float(np.linalg.cond(columns / np.linalg.norm(columns, axis=0))) > _ALIKE
+
+
+def _preference(model: Model, column: int) -> tuple[int, int, int]:
+    """Bodies before other parameters of the same effect, distal ones first."""
+    bodies = 10 * len(model.bodies)
+    if column >= bodies:
+        return (1, 0, column)
+    kind = model.names[column].rpartition(".")[2]
+    return (0, _ORDER[kind], -column)

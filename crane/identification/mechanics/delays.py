@@ -1,0 +1,137 @@
+"""By how much recorded forces come after the motion that they belong to."""
+
+import numpy as np
+
+from crane.common.samples import Array
+from crane.identification.mechanics.base import Base
+from crane.identification.mechanics.model import Model
+from crane.identification.signals.motion import Motion, low_pass, moving
+
+_FAST = 10.0  # times the frequency of the motion: cutoff of what is compared
+_MOTION = 0.995  # of the power of the coordinates is below that frequency
+_RATE = 20.0  # samples per cutoff's period where the regressor is computed
+_THINNED = 5  # of these, one is a row
+_MOST = 30_000  # samples that are looked at
+_SLOW = 0.05  # of a joint's largest velocity, below which friction is not the model's
+_BLOCKS, _FEWEST = 20, 5  # whose scatter tells the standard errors
+_PERIODS = 2.0  # of the motion in a block
+_ROUNDS = 10
+_TINY = 1e-300
+_STRIDE = 0.25  # periods of the cutoff by which one round shifts at most
+_SMALL = 1e-9  # singular values, relative, that count as zero
+
+
+def delays(model: Model, base: Base, motion: Motion, slow: Array) -> tuple[Array, Array, int]:
+    """Delays of the forces (n,) [s], their standard errors, and the blocks of time behind them.
+
+    A force that comes late by d is tau(t) = m(t - d), to first order m - d m'. Each joint's
+    -m' is a column beside those of the model, so what parameters can take of a delay (the weight
+    that rises with the stroke is like viscous friction) is no sign of it:
+
+        tau = W beta - sum_j d_j m_j' + noise,
+
+    solved for beta and d, forces shifted back by d, until d settles. Both sides are low-passed
+    at ten times the motion's frequency; rows near standstill and as far as the filter reaches from
+    it are left out. Standard errors are those of blocks of two periods that count as independent;
+    where a recording has fewer than five of them, or a joint too few rows, nothing is told: nan.
+
+    Friction that has to be overcome before a joint moves makes forces come early by some
+    milliseconds; nothing makes them late but a clock, a filter, or a sensor.
+
+    Args:
+        model: See there.
+        base: Its base parameters.
+        motion: Recorded.
+        slow: Velocities (n,) below which rows are left out, if above a share of the largest.
+    """
+    from scipy.ndimage import binary_dilation
+
+    n = motion.tau.shape[1]
+    unknown = np.full(n, np.nan), np.full(n, np.nan), 0
+    step = float(motion.time[1] - motion.time[0])
+    frequency = motion_frequency(motion.q, step)
+    cutoff = min(_FAST * frequency, 0.2 / step)
+    every = max(1, int(1 / (_RATE * cutoff * step)))
+    chosen = slice(0, every * _MOST, every)
+    time = motion.time[chosen]
+    reach = int(np.ceil(1 / (cutoff * step * every)))
+    blocks = min(_BLOCKS, int(frequency * (time[-1] - time[0]) / _PERIODS))
+    if blocks < _FEWEST or len(time) < 10 * reach:
+        return unknown
+    at = model.samples(motion.q[chosen], motion.v[chosen], motion.a[chosen])
+    W = model.regressor(at)[:, :, base.independent]
+    for i in range(n):
+        W[:, i] = low_pass(time, W[:, i], cutoff)
+    known = low_pass(time, model.known(at), cutoff)
+    force = low_pass(motion.time, motion.tau, cutoff)[chosen]
+    stuck = ~moving(motion.v, np.maximum(slow, _SLOW * np.abs(motion.v).max(axis=0)))[chosen]
+    kept = ~binary_dilation(stuck, np.ones((2 * reach + 1, 1), dtype=bool))
+    kept[:reach] = kept[-reach:] = False
+    rows = np.zeros_like(kept)
+    rows[::_THINNED] = kept[::_THINNED]
+    if rows.sum() < 4 * (W.shape[2] + n):
+        return unknown
+    shifts, std = _settled(time, W, known, force, rows, _STRIDE / cutoff, blocks)
+    return shifts, std, blocks
+
+
+def _settled(
+    time: Array, W: Array, known: Array, force: Array, rows: np.ndarray, stride: float, blocks: int
+) -> tuple[Array, Array]:
+    """Delays and standard errors (n,) from the rows (N, n) of force = W beta + known."""
+    from scipy.interpolate import CubicSpline
+
+    n = force.shape[1]
+    joint, instant = np.nonzero(rows.T)
+    count = np.bincount(joint, minlength=n)
+    told = count > 4 * blocks
+    A, shifts = W[instant, joint], np.zeros(n)
+    splines = [CubicSpline(time, column) for column in force.T]
+    least = _SMALL * force.std(axis=0) + _TINY
+    noise = force.std(axis=0) + _TINY
+    for _ in range(_ROUNDS):
+        shifted = np.stack([f(time + d) for f, d in zip(splines, shifts, strict=True)], axis=1)
+        U, values, V = _decomposed(A / noise[joint][:, None])
+        y = (shifted - known)[instant, joint] / noise[joint]
+        along = U.T @ y
+        rate = np.gradient(W @ (V.T @ (along / values)) + known, time, axis=0)
+        X = np.zeros((len(y), n))
+        X[np.arange(len(y)), joint] = -rate[instant, joint] / noise[joint]
+        X = X[:, told] - U @ (U.T @ X[:, told])
+        found = np.linalg.lstsq(X, y - U @ along, rcond=None)[0]
+        e = y - U @ along - X @ found
+        shifts[told] += np.clip(found, -stride, stride)
+        spread = np.sqrt(np.bincount(joint, e**2, minlength=n) / np.maximum(count, 1))
+        noise = np.maximum(noise * spread, least)
+    block = instant * blocks // len(time)
+    score = np.stack([np.bincount(block, x * e, minlength=blocks) for x in X.T], axis=1)
+    inverse = np.linalg.pinv(X.T @ X)
+    covariance = inverse @ (score.T @ score) @ inverse * blocks / (blocks - 1)
+    std = np.full(n, np.nan)
+    std[told] = np.sqrt(np.diag(covariance))
+    unsettled = told.copy()
+    unsettled[told] = np.abs(found) > std[told]
+    shifts[~told | unsettled] = std[unsettled] = np.nan
+    return shifts, std
+
+
+def _decomposed(A: Array) -> tuple[Array, Array, Array]:
+    """Singular values that count, of a matrix with columns of length one, and their vectors."""
+    length = np.linalg.norm(A, axis=0)
+    length[length == 0] = 1.0
+    U, values, V = np.linalg.svd(A / length, full_matrices=False)
+    kept = values > _SMALL * values[0]
+    return U[:, kept], values[kept], V[kept] / length
+
+
+def motion_frequency(q: Array, step: float) -> float:
+    """Below which 99.5 % of the power of coordinates (N, n) is, of the fastest joint [Hz]."""
+    from scipy.signal import periodogram
+
+    frequency, power = periodogram(q - q.mean(axis=0), 1 / step, axis=0, window="hann")
+    share = np.cumsum(power, axis=0)
+    return max(
+        float(frequency[max(1, np.searchsorted(column, _MOTION * column[-1]))])
+        for column in share.T
+        if column[-1] > 0
+    )

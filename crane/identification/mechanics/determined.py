@@ -1,0 +1,92 @@
+"""Which parameters a recording determines, and in which directions it does not."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from crane.common.samples import Array
+from crane.identification.mechanics.base import Base
+from crane.identification.mechanics.feasible import body_size
+from crane.identification.mechanics.model import Model
+from crane.identification.signals.motion import Motion
+from crane.machine import Machine
+
+_LEAST = 0.25  # share in a direction that is named
+_MOST = 4  # parameters that are named of a direction
+_STROKE = 0.5  # of its stroke, that a joint should move over
+
+
+def magnitudes(model: Model, base: Base, factors: Array) -> Array:
+    """How large base parameters (r,) can be on such a machine.
+
+    sqrt(sum_j (K_ij s_j)^2) of the group K_i, with s_j of a body its described mass m, m l and
+    m l^2, l the root of the mean square distance of its mass from its joint (bodies without mass
+    count as the mean of the others); and s_j of friction and the like what would alone make as
+    much force as a drive's whole force in this recording.
+
+    Args:
+        model: The model.
+        base: What of its base parameters the recording tells.
+        factors: Triangular factors (g, r + 1, r + 1) of [W y] of each drive's rows.
+    """
+    count = 10 * len(model.bodies)
+    out = np.zeros(len(model.names))
+    bodies = [model.nominal[i : i + 10] for i in range(0, count, 10)]
+    sizes = [body_size(body) if body[0] > 0 else (0.0, 0.0) for body in bodies]
+    heavy = [size for size in sizes if min(size) > 0] or [(1.0, 1.0)]
+    usual = tuple(np.mean(heavy, axis=0).tolist())
+    for i, size in enumerate(sizes):
+        mass, length = size if min(size) > 0 else usual
+        out[10 * i : 10 * i + 10] = mass * np.array([1.0, *[length] * 3, *[length**2] * 6])
+    force = np.linalg.norm(factors[:, :, -1], axis=1)
+    alone = np.linalg.norm(factors[:, :, :-1] @ base.grouping[:, count:], axis=1)
+    there = alone > 1e-9 * alone.max(axis=0, initial=0.0)
+    share = np.divide(force[:, None], alone, out=np.full_like(alone, np.inf), where=there)
+    whole = share.min(axis=0, initial=np.inf)
+    out[count:] = np.where(np.isfinite(whole), whole, 0.0)
+    return np.sqrt(base.grouping**2 @ out**2)
+
+
+def weak_directions(
+    names: Sequence[str], covariance: Array, magnitude: Array
+) -> list[tuple[float, str]]:
+    """Directions whose standard deviation exceeds what is possible, the weakest first.
+
+    Eigenvectors of the covariance of theta_i / magnitude_i; for equal noise, those are the
+    singular directions of the regressor with columns scaled by the magnitudes.
+
+    Returns:
+        Standard deviation in units of the magnitudes, and the direction in words, such as
+        "0.71 boom.mx + 0.70 stick.mx".
+    """
+    unit = np.maximum(magnitude, np.finfo(float).tiny)
+    scaled = covariance / unit / unit[:, None]
+    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    found = []
+    for value, vector in sorted(zip(values, vectors.T, strict=True), key=lambda pair: -pair[0]):
+        if value <= 1:
+            break
+        most = np.argsort(-np.abs(vector))[:_MOST]
+        sign = np.sign(vector[most[0]])
+        words = ""
+        for i in most:
+            share = float(sign * vector[i])
+            if words and abs(share) < _LEAST:
+                break
+            words += f" {'-' if share < 0 else '+'} {abs(share):.2f} {names[i]}"
+        found.append((float(np.sqrt(value)), words.removeprefix(" + ")))
+    return found
+
+
+def advice(machine: Machine, motion: Motion) -> str:
+    """What to move more, to tell what was not told."""
+    span = machine.upper - machine.lower
+    shares = np.ptp(motion.q, axis=0) / np.where(np.isfinite(span), span, np.inf)
+    little = [
+        f"{joint} ({100 * share:.0f} % of its stroke so far)"
+        for joint, share, size in zip(machine.active, shares.tolist(), span.tolist(), strict=True)
+        if np.isfinite(size) and share < _STROKE
+    ]
+    if little:
+        return f"record one that moves {', '.join(little)} further"
+    return "record one that excites it (crane excite)"

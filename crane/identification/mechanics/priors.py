@@ -1,0 +1,94 @@
+"""What is wrong with a prior, in terms of the parameters that it is about."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.linalg import qr
+
+from crane.common.errors import InputError
+from crane.common.samples import Array, as_sample
+from crane.identification.estimation.estimators import Prior
+from crane.identification.mechanics.base import Base
+from crane.identification.mechanics.model import Model
+
+_DEPENDENT = 1e-10  # relative size of a pivot below which columns say the same
+_LISTED = 8
+
+
+def checked(model: Model, base: Base, prior: Any, feasible: bool) -> Prior:
+    """Means (p,) and standard deviations (p,) of all parameters of a model.
+
+    Args:
+        model: The model.
+        base: Its base parameters.
+        prior: What was given.
+        feasible: Whether its bodies have to be able to exist.
+
+    Raises:
+        InputError: It is no pair of numbers for each parameter, or a deviation is not above zero.
+    """
+    count = len(model.names)
+    if not isinstance(prior, Sequence | np.ndarray) or len(prior) != 2:
+        raise InputError(
+            f"the prior is no pair, give means ({count},) and standard deviations ({count},) of "
+            "the model's parameters, or one relative standard deviation of its bodies"
+        )
+    given = [np.shape(part) for part in prior]
+    if given[0] == given[1] == (len(base.independent),) != (count,):
+        raise InputError(
+            f"the prior is about the {given[0][0]} base parameters, give means and standard "
+            f"deviations of all {count} parameters of the model (Model(machine).names), infinite "
+            "ones for those it says nothing of"
+        )
+    mean = as_sample(prior[0], count, "the prior's means", model.names)
+    std = np.asarray(prior[1], dtype=np.float64)
+    as_sample(np.where(np.isposinf(std), 1.0, std), count, "the prior's deviations", model.names)
+    if not (std > 0).all():
+        i = int(std.argmin())
+        raise InputError(
+            f"the prior's deviation of '{model.names[i]}' is {std[i]:g}, give one above 0, "
+            "infinite where it says nothing"
+        )
+    for i, body in enumerate(model.bodies if feasible else ()):
+        if not mean[10 * i] > 0:
+            raise InputError(
+                f"the prior's mean of '{body}' has the mass {mean[10 * i]:g} kg, give it a "
+                "positive one"
+            )
+    return mean, std
+
+
+def check_told(names: Sequence[str], W: Array, prior: Prior) -> None:
+    """Raise for parameters that neither a prior nor a motion tells apart.
+
+    Args:
+        names: Of all parameters (p,).
+        W: Regressor (m, p).
+        prior: Means and standard deviations (p,).
+
+    Raises:
+        InputError: There are some; a prior of bodies says nothing of friction, say.
+    """
+    free = np.flatnonzero(np.isinf(prior[1]))
+    if not len(free):
+        return
+    columns = W[:, free]
+    length = np.linalg.norm(columns, axis=0)
+    columns = columns / np.where(length > 0, length, 1.0)
+    triangle, pivots = qr(columns, mode="r", pivoting=True)
+    pivot = np.abs(np.diag(triangle))
+    rank = int((pivot > _DEPENDENT * max(pivot[0], 1e-300)).sum())
+    if rank == len(free):
+        return
+    # the null space, in which those that depend on each other have shares
+    square = triangle[:rank, :rank]
+    rest = np.linalg.solve(square, triangle[:rank, rank:]) if rank else np.zeros((0, len(free)))
+    shares = np.concatenate([np.abs(rest).max(axis=1), np.ones(len(free) - rank)])
+    stuck = sorted(free[pivots[shares > 1e-6]])
+    listed = ", ".join(names[i] for i in stuck[:_LISTED]) + ", ..." * (len(stuck) > _LISTED)
+    raise InputError(
+        f"the prior says nothing of {listed}, and this motion does not tell them apart: move the "
+        "joints both ways and at several speeds, give prior=(means, deviations) with finite ones "
+        "for them, or leave the prior out, which tells of them together"
+    )

@@ -1,0 +1,253 @@
+"""What an identification found, and how well it predicts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.common.samples import Array, Brief
+from crane.identification.estimation.estimators import Estimate
+from crane.identification.mechanics.base import Base
+from crane.identification.mechanics.determined import weak_directions
+from crane.identification.mechanics.model import Model
+from crane.machine import Machine
+
+_IMPOSSIBLE = 10.0  # times its magnitude, what a parameter cannot be
+_SHOWN = 3  # directions that a table names
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Brief):
+    """Measured and modelled forces of one recording, both through the same filter.
+
+    Attributes:
+        time: (M,) [s].
+        measured: (M, n) [N], [N m].
+        modelled: (M, n).
+        moving: (M, n) which rows count: those away from zero velocity.
+        joints: Names (n,).
+    """
+
+    time: Array
+    measured: Array
+    modelled: Array
+    moving: np.ndarray
+    joints: tuple[str, ...]
+
+    @property
+    def residuals(self) -> Array:
+        """(M, n) measured less modelled."""
+        return self.measured - self.modelled
+
+    def _rms(self, values: Array) -> Array:
+        count = np.maximum(self.moving.sum(axis=0), 1)
+        return np.sqrt((np.where(self.moving, values, 0.0) ** 2).sum(axis=0) / count)
+
+    @property
+    def rmse(self) -> Array:
+        """(n,) root mean square of the residuals [N], [N m]."""
+        return self._rms(self.residuals)
+
+    @property
+    def relative(self) -> Array:
+        """(n,) the same over the root mean square of the measured force."""
+        size = self._rms(self.measured)
+        return np.divide(self.rmse, size, out=np.full_like(size, np.nan), where=size > 0)
+
+    @property
+    def percentage_error(self) -> Array:
+        """(n,) equation (9) of the reduced-scale forwarder paper [%]: 100 relative^2."""
+        return 100 * self.relative**2
+
+    @property
+    def stacked(self) -> float:
+        """Norm of all residuals over that of all measured forces."""
+        kept = self.moving
+        return float(np.linalg.norm(self.residuals[kept]) / np.linalg.norm(self.measured[kept]))
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """Parameters of a machine from a recording.
+
+    Attributes:
+        model: What was identified.
+        base: Base parameters that the recording tells.
+        values: (r,) their values.
+        covariance: (r, r).
+        parameters: (p,) values of all parameters, where a prior or feasibility asked for them;
+            else None: forces determine the base parameters only.
+        estimate: Of the estimator, with noise and condition numbers; of all parameters where
+            those are known.
+        method: Name of the estimator.
+        feasible: Whether every body of `parameters` can exist.
+        training: On the recording it was identified from.
+        magnitude: (r,) how large they can be on such a machine, see `determined.magnitudes`.
+        advice: What motion would tell what this one does not.
+        validation: On another one, if there was one.
+    """
+
+    model: Model
+    base: Base
+    values: Array
+    covariance: Array
+    parameters: Array | None
+    estimate: Estimate
+    method: str
+    feasible: bool
+    training: Comparison
+    magnitude: Array
+    advice: str
+    validation: Comparison | None = None
+
+    def __repr__(self) -> str:
+        """What was identified, how, and how well it predicts."""
+        kind = "feasible, " if self.feasible else ""
+        judged = "" if self.validation is None else f", validation {self.validation.stacked:.3%}"
+        return (
+            f"Identification of '{self.machine.name}': {len(self.values)} base parameters, "
+            f"{kind}{self.method}, error {self.training.stacked:.3%}{judged}"
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(r,) first parameter of each group."""
+        return tuple(self.base.names[i] for i in self.base.independent)
+
+    @property
+    def std(self) -> Array:
+        """(r,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def interval(self, level: float = 0.95) -> Array:
+        """(r, 2) ends of what covers the truth with this probability."""
+        from scipy.stats import t
+
+        half = t.ppf(0.5 + 0.5 * level, self.estimate.freedom) * self.std
+        return np.column_stack([self.values - half, self.values + half])
+
+    @cached_property
+    def marks(self) -> tuple[str, ...]:
+        """(r,) what is wrong with each: "not determined", "impossible", or "".
+
+        Not determined is what has a standard deviation above its magnitude: the recording tells
+        less than the description of the machine does. Impossible is what is beyond ten times its
+        magnitude by more than two standard deviations.
+        """
+        beyond = np.abs(self.values) - 2 * self.std > _IMPOSSIBLE * self.magnitude
+        return tuple(
+            "not determined" if vague else "impossible" if far else ""
+            for vague, far in zip(self.std > self.magnitude, beyond, strict=True)
+        )
+
+    @cached_property
+    def undetermined(self) -> list[tuple[float, str]]:
+        """Directions that the recording does not determine, see `determined.weak_directions`."""
+        return weak_directions(self.names, self.covariance, self.magnitude)
+
+    @property
+    def remedy(self) -> str:
+        """What would determine more."""
+        if self.parameters is not None:
+            return f"{self.advice}, or leave such terms out"
+        return f"{self.advice}, or give a prior or feasible=True (--prior, --feasible)"
+
+    @property
+    def doubt(self) -> str:
+        """One line on what is not determined or impossible, "" where nothing is."""
+        vague, wrong = (
+            [name for name, mark in zip(self.names, self.marks, strict=True) if mark == kind]
+            for kind in ("not determined", "impossible")
+        )
+        parts = []
+        if vague or self.undetermined:
+            weakest = self.undetermined[0][1] if self.undetermined else vague[0]
+            parts.append(
+                f"this motion does not determine {len(vague)} of {len(self.names)} base "
+                f"parameters, the least {weakest}: {self.remedy}"
+            )
+        if wrong:
+            parts.append(
+                f"{', '.join(wrong[:_SHOWN])} {'is' if len(wrong) == 1 else 'are'} beyond what "
+                f"such a machine can have: look at units, signs and zeros of the recording"
+            )
+        return "; ".join(parts)
+
+    @cached_property
+    def nominal(self) -> Array:
+        """(r,) what the machine's description says."""
+        return self.base.values(self.model.nominal)
+
+    def predict(self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike) -> Array:
+        """Forces of a motion by the identified parameters.
+
+        Args:
+            q_a: (N, n) [m], [rad].
+            v_a: (N, n).
+            a_a: (N, n).
+
+        Returns:
+            (N, n) [N], [N m].
+        """
+        at = self.model.samples(q_a, v_a, a_a)
+        W = self.model.regressor(at)[:, :, self.base.independent]
+        return W @ self.values + self.model.known(at)
+
+    @property
+    def machine(self) -> Machine:
+        """The machine that was identified."""
+        return self.model.machine
+
+    def to_text(self) -> str:
+        """Tables of the fit and of the parameters."""
+        lines = [
+            f"{self.machine.name}: {self.base.rank} base parameters of {len(self.base.names)}, "
+            f"{self.method}{', feasible' if self.feasible else ''}; condition number "
+            f"{self.estimate.condition:.3g}, columns scaled {self.estimate.scaled_condition:.3g}",
+            "",
+        ]
+        for title, fit in (("training", self.training), ("validation", self.validation)):
+            if fit is None:
+                continue
+            rows = [["force", "RMS error", "", "relative", "PE (9)"]]
+            for i, joint in enumerate(fit.joints):
+                unit = "N" if self.machine.unit(joint) == "m" else "N m"
+                relative = f"{100 * fit.relative[i]:.2f} %"
+                squared = f"{fit.percentage_error[i]:.3f} %"
+                rows.append([joint, f"{fit.rmse[i]:.4g}", unit, relative, squared])
+            rows.append(["all, stacked", "", "", f"{100 * fit.stacked:.2f} %", ""])
+            lines += [f"{title}, moving rows", *aligned(rows, (0, 2)), ""]
+        rows = [["parameter", "value", "std", "rel. std", "description", ""]]
+        for name, value, std, before, mark in zip(
+            self.names, self.values, self.std, self.nominal, self.marks, strict=True
+        ):
+            share = f"{100 * std / abs(value):.1f} %" if std < 10 * abs(value) else "-"
+            rows.append([name, f"{value:.6g}", f"{std:.2g}", share, f"{before:.6g}", mark])
+        lines += aligned(rows, (0, 5))
+        if self.undetermined:
+            lines += ["", "not determined by this motion, in units of what can be:"]
+            lines += [f"  +- {std:.2g}  {words}" for std, words in self.undetermined[:_SHOWN]]
+            if more := len(self.undetermined[_SHOWN:]):
+                lines.append(f"  and {more} more directions")
+            lines.append(self.remedy)
+        return "\n".join(lines) + "\n"
+
+
+def aligned(rows: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> list[str]:
+    """Lines of a table whose columns are as wide as what is in them, two blanks between.
+
+    Args:
+        rows: Cells, as many in each row.
+        left: Columns that are aligned left, the others right.
+    """
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = [
+            cell.ljust(width) if i in left else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return lines

@@ -1,0 +1,267 @@
+"""An identified machine as files: its URDFs and its machine file with other numbers."""
+
+import csv
+import dataclasses
+import shutil
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lxml import etree
+
+from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
+from crane.common.output import replacing, staging
+from crane.description import Chain, Friction, MachineSpec
+from crane.dynamics import Dynamics
+from crane.formats import read
+from crane.formats.parallel_robots import is_parallel_robot
+from crane.identification.mechanics.base import random_samples
+from crane.identification.mechanics.division import divided
+from crane.identification.mechanics.model import PER_BODY
+from crane.identification.mechanics.result import Identification
+from crane.identification.mechanics.urdf import changed_urdf
+from crane.machine import Machine, load
+
+_SAME = 1e-9  # of the largest force, by which the written machine may differ
+_FRICTION = tuple(item.name for item in dataclasses.fields(Friction))
+
+
+def write_parameters(result: Identification, path: str | Path) -> None:
+    """Write the base parameters as CSV: value, deviation, 95 % interval, description, mark.
+
+    Raises:
+        OutputError: It cannot be written there.
+    """
+    columns = [result.values, result.std, *result.interval().T, result.nominal]
+    with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(
+            ["parameter", "value", "std", "lower", "upper", "description", "mark", "group"]
+        )
+        for name, numbers, mark, words in zip(
+            result.names, np.column_stack(columns).tolist(), result.marks, result.base.groups,
+            strict=True,
+        ):  # fmt: skip
+            table.writerow([name, *map(repr, numbers), mark, words])
+
+
+def write_machine(result: Identification, folder: str | Path) -> Path:
+    """Write the identified machine: a URDF per sub-chain and a machine file beside them.
+
+    Each body's parameters stand in the link that its joint moves, and the inertials of links
+    fixed to it are removed. Friction is the identified one, passive forces are the machine's.
+    What locked joints made one body is divided among its links as they are described, see
+    `division.divided`. Everything else is as in the files that the machine was read from; what
+    they draw is found where it is. The written files are loaded, and compared where the machine
+    was locked, before they are put in place.
+
+    Args:
+        result: With `parameters`, so of a prior or a feasible estimate.
+        folder: Created where there is none; files of the same names are replaced.
+
+    Returns:
+        The machine file.
+
+    Raises:
+        InputError: The machine comes from another format, there are no parameters, the machine is
+            not as its files describe it, or a machine file cannot hold the model's terms.
+        CraneError: The parameters belong to no possible machine.
+        OutputError: The folder cannot be written, or holds the files that the machine came from.
+    """
+    machine, parameters = result.machine, result.parameters
+    check_rewritable(machine)
+    if parameters is None or not result.model.bodies:
+        raise InputError("forces determine base parameters only: give prior or feasible=True")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)  # told when the machine was loaded
+        spec = read(machine.path)
+        whole = load(machine.path) if machine.locks else machine
+    bodies = divided(machine, parameters, whole)
+    names = _names(spec)
+    file = f"{machine.path.stem}.yaml"
+    originals = {machine.path, *(chain.urdf for chain in _files(spec))}
+    for name in (file, *names.values()):
+        if (place := (Path(folder) / name).resolve()) in originals:
+            raise OutputError(
+                f"{place}: is what '{machine.name}' was read from, choose another folder"
+            )
+    how = f"identified by {result.method}{', feasible' if result.feasible else ''}"
+    content = _content(result, spec, names, how)
+    with staging(folder) as part:
+        for chain in spec.chains:
+            tree = changed_urdf(chain.urdf, bodies, _carried(spec), how)
+            text = etree.tostring(tree, encoding="utf-8", xml_declaration=True)
+            (part / names[chain.name]).write_bytes(text.rstrip() + b"\n")
+        if spec.payload is not None:
+            carried = spec.payload.chain
+            shutil.copyfile(carried.urdf, part / names[carried.name])
+        (part / file).write_text(content, encoding="utf-8")
+        _check(result, part / file)
+    return Path(folder) / file
+
+
+def check_rewritable(machine: Machine) -> None:
+    """See that the files of a machine can be written again with other numbers in them.
+
+    Raises:
+        InputError: They cannot.
+    """
+    urdf = machine.path.suffix.lower() == ".urdf"
+    if any(chain.urdf.suffix.lower() != ".urdf" for chain in machine.chains) or (
+        not urdf and is_parallel_robot(machine.path)
+    ):
+        raise InputError(
+            f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
+            f"one: crane convert {machine.path.name} FOLDER"
+        )
+    if machine.changes:
+        raise InputError(
+            f"'{machine.name}' was loaded with changed numbers, identify it as its files "
+            "describe it"
+        )
+
+
+def _names(spec: MachineSpec) -> dict[str, str]:
+    """File of each chain: the name it has, with a number where two are alike."""
+    taken: dict[str, str] = {}
+    for number, chain in enumerate(_files(spec)):
+        name = chain.urdf.name
+        taken[chain.name] = f"{number}_{name}" if name in taken.values() else name
+    return taken
+
+
+def _files(spec: MachineSpec) -> tuple[Chain, ...]:
+    """The chains, and the payload that the machine file names."""
+    return spec.chains if spec.payload is None else (*spec.chains, spec.payload.chain)
+
+
+def _carried(spec: MachineSpec) -> set[str]:
+    """Links that are fixed to one that a joint moves."""
+    above = {joint.child: joint for joint in spec.tree.joints.values()}
+    found = set()
+    for link in above:
+        at = link
+        while at in above and not above[at].moves:
+            at = above[at].parent
+        if at != link and at in above:
+            found.add(link)
+    return found
+
+
+def _content(result: Identification, spec: MachineSpec, names: Mapping[str, str], how: str) -> str:
+    """The machine file."""
+    import yaml
+
+    machine = result.machine
+    data: dict[str, Any]
+    if machine.path.suffix.lower() == ".urdf":
+        data = {"name": machine.name, "chains": [{"name": spec.chains[0].name}]}
+        loops = [dataclasses.asdict(loop) for loop in spec.loops]
+        data |= {"loops": [{k: v for k, v in loop.items() if k != "where"} for loop in loops]}
+        for loop in data["loops"]:
+            loop["axis"] = list(loop["axis"])
+        data |= {"active": list(spec.active if spec.active is not None else machine.active)}
+        if machine.tip is not None:
+            data["tip"] = machine.tip
+    else:
+        data = yaml.safe_load(machine.path.read_text(encoding="utf-8-sig"))
+    data["source"] = f"{how}; else {machine.source or machine.path.name}"
+    for chain in data["chains"]:
+        chain["urdf"] = names[chain["name"]]
+    if spec.payload is not None:
+        data["payload"] = {"urdf": names[spec.payload.chain.name]}
+    data["friction"], scales = _identified(result, spec)
+    held = set(machine.locks)
+    data["forces"] = [
+        _numbers(x) for x in (*machine.forces, *(x for x in spec.forces if x.joint in held))
+    ]
+    data["gas_springs"] = {
+        item.joint: _numbers(
+            item, joint=None, pressure=item.pressure * scales.get(item.joint, 1.0)
+        )
+        for item in (*machine.gas_springs, *(x for x in spec.gas_springs if x.joint in held))
+    }
+    data["end_stops"] = {
+        item.joint: _numbers(item, joint=None)
+        for item in (*machine.end_stops, *(x for x in spec.end_stops if x.joint in held))
+    }
+    for key in ("loops", "forces", "gas_springs", "end_stops"):
+        if not data.get(key):
+            data.pop(key, None)
+    return str(
+        yaml.safe_dump(
+            data, sort_keys=False, allow_unicode=True, width=100, default_flow_style=None
+        )
+    )
+
+
+def _identified(
+    result: Identification, spec: MachineSpec
+) -> tuple[dict[str, dict[str, float]], dict[str, float]]:
+    """Friction and scales of gas springs by joint.
+
+    A joint that the model gives no friction has none, whatever its files say.
+    """
+    machine, model = result.machine, result.model
+    assert result.parameters is not None
+    found: dict[str, dict[str, float]] = {}
+    scales: dict[str, float] = {}
+    values = result.parameters.tolist()
+    for name, value in list(zip(model.names, values, strict=True))[10 * len(model.bodies) :]:
+        joint, _, kind = name.rpartition(".")
+        if joint in machine.joints and kind in _FRICTION:
+            found.setdefault(joint, {})[kind] = value
+        elif kind == "gas_scale":
+            scales[joint] = value
+    friction = {
+        joint: _numbers(spec.friction[joint]) for joint in spec.friction if joint in machine.locks
+    }
+    for joint in machine.joints:
+        if joint in found:
+            # a joint without friction of its own is identified with a sign that jumps
+            law = machine.friction.get(joint, Friction(smoothing=0.0))
+            try:
+                new = Friction(smoothing=law.smoothing, stribeck=law.stribeck, **found[joint])
+            except InputError as error:
+                raise InputError(f"'{joint}': {error}, give feasible=True") from None
+            friction[joint] = _numbers(new) or {"viscous": 0.0}
+        elif joint in spec.friction:
+            friction[joint] = {"viscous": 0.0}
+    return friction, scales
+
+
+def _numbers(item: Any, **changed: Any) -> dict[str, Any]:
+    """What of a dataclass is not as by default."""
+    values = {
+        field.name: changed.get(field.name, getattr(item, field.name))
+        for field in dataclasses.fields(item)
+        if field.name not in changed or changed[field.name] is not None
+    }
+    defaults = {field.name: field.default for field in dataclasses.fields(item)}
+    return {key: value for key, value in values.items() if value != defaults[key]}
+
+
+def _check(result: Identification, file: Path) -> None:
+    """Load what was written and compare its forces with those of the parameters."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CraneWarning)
+            written = load(file, lock=dict(result.machine.locks))
+    except CraneError as error:
+        hint = "" if result.feasible else ", give feasible=True"
+        raise InputError(f"the identified machine cannot be: {error}{hint}") from None
+    model, parameters = result.model, result.parameters
+    assert parameters is not None
+    at = random_samples(model, 20)
+    wanted = model.regressor(at) @ parameters + model.known(at)
+    dynamics = Dynamics(written, path="pinocchio")
+    found = dynamics.inverse(at.q_a, at.v_a, at.a_a, friction=True)
+    off = np.abs(found - wanted).max(axis=0)
+    if off.max() <= _SAME * np.abs(wanted).max():
+        return
+    kinds = {*_FRICTION, "gas_scale", *PER_BODY}
+    others = [name for name in model.names if name.rpartition(".")[2] not in kinds]
+    what = f"'{others[0]}'" if others else "friction over other velocities than the machine's"
+    raise InputError(f"the model has {what}, for which a machine file has no place, leave it out")

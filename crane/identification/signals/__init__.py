@@ -1,0 +1,1 @@
+"""What a recording tells of motion and force: filters, derivatives, outliers, hum."""

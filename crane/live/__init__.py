@@ -1,5 +1,0 @@
-"""A machine to play with: sliders for its active joints, its loops closed at every move."""
-
-from crane.live.session import Posture, Session
-
-__all__ = ["Posture", "Session"]

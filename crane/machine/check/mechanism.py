@@ -1,0 +1,143 @@
+"""Whether the parts make a machine: every loop that does not close or does nothing."""
+
+import warnings
+from collections.abc import Iterator
+
+import numpy as np
+import pinocchio as pin
+
+from crane.closure import Closure
+from crane.closure.equations import LoopEquations
+from crane.closure.structure import least_squares_step
+from crane.common.errors import CraneWarning, DescriptionError, MechanismError
+from crane.common.samples import Array
+from crane.description import MachineSpec
+from crane.description.findings import Findings, note
+from crane.machine.ambiguity import warn_of_assemblies
+from crane.machine.assemble import assemble, closed, home_guess
+
+_OPEN = 1e-6  # [m], [rad] from which on a loop is said to be open
+
+
+def check_mechanism(spec: MachineSpec, found: Findings) -> Closure | None:
+    """Assemble and close a machine, and note what is wrong with it.
+
+    Loops that lock nothing are left out once noted, so that the rest is checked, too.
+
+    Args:
+        spec: The machine as read.
+        found: What has been noted so far.
+
+    Returns:
+        The closure, None where there is none.
+    """
+    model = assemble(spec)
+    guess = home_guess(spec, model)
+    if not found.usable:
+        return None
+    loops = list(spec.loops)
+    while True:
+        try:
+            closure = closed(spec, model, guess, loops)
+        except MechanismError as error:
+            idle = [loop for loop in loops if error.about == f"loop {loop.name}"]
+            if "locks nothing" in str(error) and idle:
+                note(error)
+                loops.remove(idle[0])
+                continue
+            _note_with_gaps(spec, model, guess, error)
+            return None
+        _warn_of_limits(spec, closure)
+        warn_of_assemblies(spec, closure, guess, thorough=True)
+        return closure
+
+
+def _note_with_gaps(
+    spec: MachineSpec, model: pin.Model, guess: Array, error: MechanismError
+) -> None:
+    """Note an error; where loops stay open, how far each does."""
+    gaps = _gaps(spec, model, guess) if "cannot be closed" in str(error) else {}
+    apart = gaps.pop(error.about, "")
+    note(MechanismError(f"{error}{f' (it is {apart})' if apart else ''}", error.about))
+    for about, gap in gaps.items():
+        what = f"loop '{about.removeprefix('loop ')}' stays open, too: it is {gap}"
+        note(MechanismError(f"{spec.where.get(about, spec.path.name)}: {what}", about))
+
+
+def _gaps(spec: MachineSpec, model: pin.Model, guess: Array) -> dict[str, str]:
+    """How far apart and askew the frames of open loops are, as near as they come to closing."""
+    equations = LoopEquations(model, spec.loops, spec.couplings)
+    active = [model.joints[model.getJointId(name)].idx_v for name in spec.active or ()]
+    every = np.arange(model.nv)
+    phi = np.zeros(0)
+    for free in (every, np.setdiff1d(every, active)):
+        q = guess.copy()
+        for _ in range(200):
+            phi, jacobian = equations.evaluate(q)
+            q[free] += least_squares_step(jacobian[:, free], phi)
+        phi, _ = equations.evaluate(q)
+        if np.abs(phi).max() > _OPEN:
+            break
+    found = {}
+    for index, loop in enumerate(equations.loops):
+        rows = equations.loop_of_row == index
+        length = float(np.linalg.norm(phi[rows & equations.is_translation]))
+        # rows of rotations are cosines of angles that are right ones when closed
+        sine = min(1.0, float(np.linalg.norm(phi[rows & ~equations.is_translation])))
+        if max(length, sine) > _OPEN:
+            found[f"loop {loop.name}"] = (
+                f"{_length(length)} apart and {np.degrees(np.arcsin(sine)):.3g} deg askew"
+            )
+    return found
+
+
+def _length(metres: float) -> str:
+    return f"{metres:.3g} m" if metres >= 1 else f"{1e3 * metres:.3g} mm"
+
+
+def _warn_of_limits(spec: MachineSpec, closure: Closure) -> None:
+    """Warn of passive joints that are outside of their limits at home."""
+    model = closure.model
+    for column in closure.passive:
+        name = model.names[int(column) + 1]
+        lower, upper = model.lowerPositionLimit[column], model.upperPositionLimit[column]
+        q = closure.home[column]
+        if not lower - 1e-9 <= q <= upper + 1e-9:
+            place = spec.tree.joints[name].where
+            warnings.warn(
+                f"{place}: passive joint '{name}' is at {q:.4g} with the loops closed at home, "
+                f"outside of its limits {lower:g} to {upper:g}, widen them or correct the home",
+                CraneWarning,
+                stacklevel=2,
+            )
+
+
+def massless(spec: MachineSpec) -> Iterator[DescriptionError]:
+    """Errors about bodies without mass in a tree that cannot be assembled."""
+    joints = [joint for joint in spec.tree.joints.values() if not joint.cut]
+    if not all(joint.parent and joint.child for joint in joints):
+        return  # what has no place may be the mass that seems to be missing
+    fixed: dict[str, list[str]] = {}
+    for joint in joints:
+        if not joint.moves:
+            fixed.setdefault(joint.parent, []).append(joint.child)
+    links = spec.tree.links
+    heavy = {
+        link.name
+        for link in links.values()
+        if link.refused or link.between or (link.inertial and link.inertial.mass > 0)
+    }
+    for joint in joints:
+        if not joint.moves or joint.child not in links:
+            continue
+        body, waiting = set(), [joint.child]
+        while waiting:
+            link = waiting.pop()
+            if link not in body:
+                body.add(link)
+                waiting += fixed.get(link, ())
+        if not body & heavy:
+            yield DescriptionError(
+                f"{links[joint.child].where}: joint '{joint.name}' moves link '{joint.child}', "
+                "which has no mass, give it an <inertial>"
+            )

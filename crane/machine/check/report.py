@@ -1,0 +1,139 @@
+"""The check of a machine: reading, assembling and closing it, and whether its numbers fit."""
+
+import re
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+from crane.closure import Closure
+from crane.common.errors import CraneWarning
+from crane.description import MachineSpec
+from crane.description.findings import collecting, kept, note
+from crane.description.sources import find
+from crane.formats import read
+from crane.machine.check.mechanism import check_mechanism, massless
+from crane.machine.check.plausible import implausible
+
+# "four_bar.yaml:12: what", or a file that has no line to point at
+_PLACE = re.compile(r"(?P<file>.+?)(?::(?P<line>\d+)|(?<=\.yaml|\.urdf)|(?<=\.xml|\.yml)): ")
+_MOST = 500  # findings in a report
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong or unusual.
+
+    Attributes:
+        file: Name of the file, without its folder.
+        line: Its line; 0 where it is about the whole file.
+        error: Whether it keeps the machine from being loaded.
+        what: What it is, and what to do about it.
+    """
+
+    file: str
+    line: int
+    error: bool
+    what: str
+
+    def __str__(self) -> str:
+        place = f"{self.file}:{self.line}" if self.line else self.file
+        return f"{place}: {'error' if self.error else 'warning'}: {self.what}"
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a check found.
+
+    Attributes:
+        findings: By file and line.
+        summary: One line on the machine, None where it cannot be loaded.
+        full: Whether there was more than is listed.
+    """
+
+    findings: tuple[Finding, ...]
+    summary: str | None
+    full: bool
+
+    @property
+    def errors(self) -> int:
+        """Number of errors."""
+        return sum(finding.error for finding in self.findings)
+
+    @property
+    def warnings(self) -> int:
+        """Number of warnings."""
+        return len(self.findings) - self.errors
+
+    @property
+    def status(self) -> int:
+        """Exit status: 2 with errors, 1 with warnings only, else 0."""
+        return 2 if self.errors else 1 if self.findings else 0
+
+    @property
+    def counts(self) -> str:
+        """One line with the number of errors and of warnings."""
+        words = [
+            f"{number or 'no'} {word}{'s' * (number != 1)}"
+            for number, word in ((self.errors, "error"), (self.warnings, "warning"))
+        ]
+        return ", ".join(words) + ("; there is more, mend these first" if self.full else "")
+
+
+def check(name: str | Path) -> Report:
+    """Read a machine as far as possible, and say all that is wrong or unusual about it.
+
+    The first error that `load` would raise is among the findings.
+
+    Args:
+        name: As for `load`.
+
+    Raises:
+        DescriptionError: There is no such file.
+    """
+    path = find(name)
+    spec: MachineSpec | None = None
+    closure: Closure | None = None
+    with warnings.catch_warnings(record=True) as caught, collecting() as found:
+        warnings.simplefilter("always", CraneWarning)
+        with kept():
+            spec = read(path)
+        if spec is not None and found.usable:
+            with kept():
+                closure = check_mechanism(spec, found)
+        elif spec is not None:
+            for error in massless(spec):
+                note(error)
+        implausible(found.files, spec)
+    findings = [_finding(str(error), True, path.name) for error in found.errors]
+    findings += [
+        _finding(str(one.message), False, path.name)
+        for one in caught
+        if issubclass(one.category, CraneWarning)
+    ]
+    summary = None
+    if spec is not None and closure is not None and not found.errors:
+        summary = _summary(spec, closure)
+    ordered = sorted(set(findings), key=lambda x: (x.file, x.line, not x.error, x.what))
+    return Report(tuple(ordered[:_MOST]), summary, found.full or len(ordered) > _MOST)
+
+
+def _finding(message: str, error: bool, file: str) -> Finding:
+    message = _printable(message)
+    place = _PLACE.match(message)
+    if place is None:
+        return Finding(_printable(file), 0, error, message)
+    what = message[place.end() :]
+    return Finding(Path(place["file"]).name, int(place["line"] or 0), error, what)
+
+
+def _printable(text: str) -> str:
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def _summary(spec: MachineSpec, closure: Closure) -> str:
+    residual = float(closure.residual(closure.home))
+    joints, freedom = closure.model.njoints - 1, closure.degrees_of_freedom
+    return (
+        f"{_printable(spec.name)}: {joints} joints, {len(spec.loops)} loops, {freedom} degrees of "
+        f"freedom, loops closed to {residual:.1e} m at home"
+    )

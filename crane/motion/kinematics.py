@@ -1,0 +1,373 @@
+"""The tip (or any other frame) as a function of the active coordinates, and back."""
+
+import itertools
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+from scipy.interpolate import make_interp_spline
+
+from crane.closure.traced import Constants, Motion, folded
+from crane.codegen import Number, Program, Tape, TooLongError
+from crane.codegen.scalar import add, cross, dot, scale, subtract, times
+from crane.common.errors import ClosureError, InputError, UnreachableTipError
+from crane.common.samples import Array, as_sample, as_samples, per_sample
+from crane.machine import Machine
+
+_ACCURACY = 1e-11  # [m] per metre of machine
+_STRIDE = 16  # samples of a path between those that are searched for one by one
+_BESIDE = 0.02  # share of the strokes by which a sample may miss the curve through those
+
+
+class Kinematics:
+    """Position of one frame as a function of q_A.
+
+        x = p(f(q_A)),    x' = J gamma v_A,    x'' = J gamma a_A + bias.
+
+    Args:
+        machine: The machine.
+        frame: A link; the machine's tip if not given.
+
+    Raises:
+        InputError: Unknown frame, or the machine has no tip.
+    """
+
+    def __init__(self, machine: Machine, frame: str | None = None):
+        if frame is None:
+            if machine.tip is None:
+                raise InputError(f"machine '{machine.name}' has no tip, name a frame")
+            frame = machine.tip
+        self.machine, self.frame = machine, frame
+        self._model, self._data = machine.model, machine.model.createData()
+        self._frame = machine.frame(frame)
+        span = machine.upper - machine.lower
+        self._scale = np.where(np.isfinite(span), span, 1.0)
+
+    def __repr__(self) -> str:
+        """What moves, of what."""
+        return f"Kinematics of '{self.frame}' of '{self.machine.name}'"
+
+    def position(self, q_a: ArrayLike) -> Array:
+        """Position in the world.
+
+        Args:
+            q_a: (n,) or (N, n) [m], [rad].
+
+        Returns:
+            (3,) or (N, 3) [m].
+        """
+        return self.positions(self.machine.closure.solve(q_a))
+
+    def positions(self, q: ArrayLike) -> Array:
+        """Position in the world at postures that are closed already.
+
+        Args:
+            q: (nq,) or (N, nq) [m], [rad].
+
+        Returns:
+            (3,) or (N, 3) [m].
+        """
+        q = as_samples(q, self._model.nq, "q", self.machine.joints)
+        if q.ndim == 2 and self._fast is not None:
+            return self._fast.rows(q)[:, :3]
+        return per_sample(self.position_at, q)
+
+    def position_at(self, q: Array) -> Array:
+        """Position (3,) [m] of one posture (nq,)."""
+        pin.forwardKinematics(self._model, self._data, q)
+        placement = pin.updateFramePlacement(self._model, self._data, self._frame)
+        return np.array(placement.translation)
+
+    def jacobian(self, q_a: ArrayLike) -> Array:
+        """Reduced Jacobian dx/dq_A = J gamma.
+
+        Args:
+            q_a: (n,) or (N, n) [m], [rad].
+
+        Returns:
+            (3, n) or (N, 3, n).
+        """
+        q = self.machine.closure.solve(q_a)
+        if q.ndim == 2 and self._fast is not None:
+            return self._fast.rows(q)[:, 3:-3].reshape(len(q), 3, -1)
+        return per_sample(self._jacobian, q)
+
+    def bias(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
+        """Acceleration of the frame at a_A = 0.
+
+        Args:
+            q_a: (n,) or (N, n) [m], [rad].
+            v_a: The same shape [m/s], [rad/s].
+
+        Returns:
+            (3,) or (N, 3) [m/s2].
+        """
+        names = self.machine.active
+
+        def one(q: Array, v_a: Array) -> Array:
+            v = self.machine.closure.gamma(q) @ v_a
+            drift = self.machine.closure.drift(q, v)
+            pin.forwardKinematics(self._model, self._data, q, v, drift)
+            acceleration = pin.getFrameClassicalAcceleration(
+                self._model, self._data, self._frame, pin.LOCAL_WORLD_ALIGNED
+            )
+            return np.array(acceleration.linear)
+
+        v_a = as_samples(v_a, len(names), "v_a", names)
+        q = self.machine.closure.solve(q_a)
+        if q.ndim == 2 and q.shape[:1] == v_a.shape[:-1] and self._fast is not None:
+            return self._fast.rows(q, v_a)[:, -3:]
+        return per_sample(one, q, v_a)
+
+    def inverse(self, position: ArrayLike, guess: ArrayLike | None = None) -> Array:
+        """Active coordinates within their limits that put the frame at a position.
+
+        Levenberg-Marquardt on the reduced Jacobian with the limits as bounds, from the guess or
+        the nearest of a grid of postures. A stack is tracked like a path: where its samples are
+        near each other, some of them, and Newton's method from the curve through these for all.
+        Where there are more active joints than directions, each step of the descent is the
+        shortest.
+
+        Args:
+            position: (3,) or (N, 3) in the world [m].
+            guess: (n,) active coordinates to start from.
+
+        Returns:
+            q_A, (n,) or (N, n) [m], [rad].
+
+        Raises:
+            InputError: Wrong shape or not finite.
+            UnreachableTipError: The position is out of reach.
+        """
+        targets = as_samples(position, 3, "position", ("x", "y", "z"))
+        start = None
+        if guess is not None:
+            names = self.machine.active
+            start = self.machine.check_limits(
+                as_sample(guess, len(names), "guess", names), "guess"
+            )
+        if targets.ndim == 1:
+            return self._inverse(targets, start, "")
+        if len(targets) == 0:
+            raise InputError("position is an empty stack, give at least one sample")
+        if (tracked := self._track(targets, start)) is not None:
+            return tracked
+        out = np.empty((len(targets), len(self.machine.active)))
+        for i, target in enumerate(targets):
+            start = out[i] = self._inverse(target, start, f" (sample {i})")
+        return out
+
+    @cached_property
+    def _fast(self) -> "_FastFrame | None":
+        """Machine code for stacks; None where the machine is too large for it."""
+        try:
+            return _FastFrame(self.machine, self._frame)
+        except TooLongError:
+            return None
+
+    def _track(self, targets: Array, start: Array | None) -> Array | None:
+        """Strokes along a dense path (N, 3), or None where that takes a closer look.
+
+        Every sample is as exact as those searched for one by one, or None is returned.
+
+        Raises:
+            UnreachableTipError: The path leaves the reach.
+        """
+        machine, n = self.machine, len(self.machine.active)
+        if n > targets.shape[1] or len(targets) < 4 * _STRIDE or self._fast is None:
+            return None
+        knots = np.unique(np.r_[0 : len(targets) : _STRIDE, len(targets) - 1])
+        searched = np.empty((len(knots), n))
+        for i, knot in enumerate(knots):
+            try:
+                start = searched[i] = self._inverse(targets[knot], start, "")
+            except UnreachableTipError:
+                # say which sample is the first one, or see that it can be reached after all
+                for k in range(knots[max(i - 1, 0)], knot + 1):
+                    start = self._inverse(targets[k], start, f" (sample {k})")
+                return None
+        try:
+            curve = make_interp_spline(knots, searched)(np.arange(len(targets)))
+            q_a = curve = np.clip(curve, machine.lower, machine.upper)
+            best, before = q_a, np.full(len(targets), np.inf)
+            for _ in range(10):
+                rows = self._fast.rows(machine.closure.solve(q_a))
+                error = targets - rows[:, :3]
+                distance = np.linalg.norm(error, axis=1)
+                closer = distance < before
+                best = np.where(closer[:, None], q_a, best)
+                before = np.minimum(distance, before)
+                if not (closer & (distance > 1e-15)).any():  # [m] rounding
+                    break
+                step = np.linalg.pinv(rows[:, 3:-3].reshape(-1, 3, n)) @ error[:, :, None]
+                q_a = np.clip(q_a + step[:, :, 0], machine.lower, machine.upper)
+        except (ClosureError, np.linalg.LinAlgError):
+            return None
+        beside = np.abs(best - curve) <= _BESIDE * self._scale
+        tolerance = 1e-2 * _ACCURACY * max(1.0, float(np.abs(targets).max()))
+        return best if beside.all() and before.max() <= tolerance else None
+
+    def tree_jacobian(self, q: Array) -> Array:
+        """Jacobian dx/dq (3, nv) of the spanning tree at one posture (nq,)."""
+        tree: Array = pin.computeFrameJacobian(
+            self._model, self._data, q, self._frame, pin.LOCAL_WORLD_ALIGNED
+        )
+        return tree.reshape(6, -1)[:3]  # of a single joint it comes as a vector
+
+    def _jacobian(self, q: Array) -> Array:
+        reduced: Array = self.tree_jacobian(q) @ self.machine.closure.gamma(q)
+        return reduced
+
+    @cached_property
+    def _grid(self) -> list[tuple[Array, Array]]:
+        """Postures (q, tip) all over the strokes to start from."""
+        machine = self.machine
+        home = machine.home[machine.closure.active]
+        axes = [
+            (low + span * np.array([0.2, 0.5, 0.8]) if np.isfinite(span) else [at])
+            for low, span, at in zip(
+                machine.lower, machine.upper - machine.lower, home, strict=True
+            )
+        ]
+        found = [(np.array(machine.home), self.position_at(machine.home))]
+        for q_a in itertools.islice(itertools.product(*axes), 243):
+            try:
+                q = machine.closure.solve(np.array(q_a))
+            except ClosureError:
+                continue
+            found.append((q, self.position_at(q)))
+        return found
+
+    def _inverse(self, target: Array, start: Array | None, sample: str) -> Array:
+        closure = self.machine.closure
+        best = (np.inf, self.machine.home)
+        if start is not None:
+            best = self._descend(target, closure.solve(start))
+        tolerance = _ACCURACY * max(1.0, float(np.abs(target).max()))
+        if best[0] > tolerance:
+            near = sorted(self._grid, key=lambda item: float(np.sum((item[1] - target) ** 2)))
+            for q, _ in near[:5]:
+                best = min(best, self._descend(target, q), key=lambda item: item[0])
+                if best[0] <= tolerance:
+                    break
+        distance, q = best
+        q_a: Array = q[closure.active]
+        if distance > tolerance:
+            at = ", ".join(f"{value:.4g}" for value in target)
+            where = ", ".join(
+                f"{name} = {value:.4g}"
+                for name, value in zip(self.machine.active, q_a, strict=True)
+            )
+            raise UnreachableTipError(
+                f"'{self.frame}' cannot reach ({at}) m{sample}: it stays {distance:.3g} m away, "
+                f"nearest at {where}; choose a point within reach"
+            )
+        return q_a
+
+    def _descend(self, target: Array, q: Array) -> tuple[float, Array]:
+        """Bounded Levenberg-Marquardt; the distance reached and the posture."""
+        closure, machine = self.machine.closure, self.machine
+        error = target - self.position_at(q)
+        distance = float(np.linalg.norm(error))
+        damping = 1e-6
+        for _ in range(100):
+            if distance < 1e-15:  # [m] rounding
+                break
+            q_a = q[closure.active]
+            jacobian = self._jacobian(q) * self._scale
+            pull = jacobian.T @ error
+            blocked = ((q_a <= machine.lower) & (pull < 0)) | ((q_a >= machine.upper) & (pull > 0))
+            free = np.flatnonzero(~blocked)
+            gram = jacobian[:, free].T @ jacobian[:, free]
+            weight = damping * max(float(np.trace(gram)), 1e-300)
+            move = np.zeros(len(q_a))
+            move[free] = np.linalg.solve(gram + weight * np.eye(len(free)), pull[free])
+            trial = np.clip(q_a + self._scale * move, machine.lower, machine.upper)
+            try:
+                q_new = closure.solve(trial, guess=q)
+            except ClosureError:
+                damping = max(10 * damping, 1e-4)
+                continue
+            error_new = target - self.position_at(q_new)
+            closer = float(np.linalg.norm(error_new))
+            if closer < distance:
+                stalled = closer > 0.999 * distance and damping < 1e-9
+                q, error, distance = q_new, error_new, closer
+                damping = max(damping / 10, 1e-15)
+                if stalled:
+                    break
+            else:
+                if distance < 1e-13 or damping > 1e6:
+                    break
+                damping = max(10 * damping, 1e-9)
+        return distance, q
+
+
+class _FastFrame:
+    """Position, reduced Jacobian and bias of a frame as machine code.
+
+    Args:
+        machine: The machine.
+        frame: Pinocchio's index of the frame.
+
+    Raises:
+        TooLongError: It would take too long to compile.
+    """
+
+    def __init__(self, machine: Machine, frame: int):
+        fast = self._closure = machine.closure.fast
+        placed = machine.model.frames[frame]
+        self._body = placed.parentJoint
+        self._place = fast.geometry.turns[self._body].T @ placed.placement.translation
+        self._n = len(machine.active)
+        key = ("frame", self._body, folded(self._place))
+        if key not in fast.programs:
+            fast.programs[key] = self._compile(machine.model.nq)
+        self._program = fast.programs[key]
+
+    def rows(self, q: Array, v_a: Array | None = None) -> Array:
+        """Rows [x (3), J gamma (3 n), bias (3)] at postures (N, nq) and velocities (N, n)."""
+        v_a = np.zeros((len(q), self._n)) if v_a is None else np.ascontiguousarray(v_a)
+        out = np.empty((len(q), self._program.outputs("formula").size))
+        arrays = (self._closure.geometry.numbers, self._place, np.ascontiguousarray(q), v_a, out)
+        self._program.call("rows", len(q), *arrays)
+        return out
+
+    def _compile(self, nq: int) -> Program:
+        tape, n, body = Tape(), self._n, self._body
+        _, posture, loops = self._closure.trace(tape, 0, 2)
+        v_a, parents = tape.loads(3, 0, n), posture.geometry.parents
+        rates: list[Number] = [0.0]
+        rates += [dot(loops.gamma[i], v_a) for i in range(1, len(parents))]
+        motion = Motion(posture, loops, rates, [0.0] * 3, parents)
+        place = Constants(tape, 1, self._place).vector(0)
+        point = add(posture.origin[body], times(posture.rotation[body], place))
+        columns: list[list[Number]] = [[0.0] * 3 for _ in range(n)]
+        (v, w), (a, e) = motion.velocity[body], motion.acceleration[body]
+        i = body
+        while i > 0:  # what the joints that carry it do to the point
+            linear, angular = posture.columns[i]
+            moved = add(linear, cross(angular, point))
+            columns = [
+                add(column, scale(factor, moved))
+                for column, factor in zip(columns, loops.gamma[i], strict=True)
+            ]
+            a = add(a, scale(motion.drift[i], linear))
+            e = add(e, scale(motion.drift[i], angular))
+            i = parents[i]
+        bend = add(a, cross(e, point), cross(w, add(v, cross(w, point))))
+        world = [list(axis) for axis in zip(*posture.rotation[0], strict=True)]
+        jacobian = [times(world, column) for column in columns]
+        outputs = times(world, subtract(point, posture.origin[0]))
+        outputs += [column[row] for row in range(3) for column in jacobian]
+        program = Program()
+        size = program.add("formula", 4, [*outputs, *times(world, bend)]).size
+        arrays = ("geometry", "place", "q", "v", "out")
+        with program.routine("rows", counts=("count",), arrays=arrays) as r:
+            with r.loop(r.count) as i:
+                rows = r.q.row(i, nq), r.v.row(i, n), r.out.row(i, size)
+                r.call("formula", r.geometry, r.place, *rows)
+            r.give(r.count)
+        program.compile()
+        return program

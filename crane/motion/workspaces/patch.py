@@ -1,0 +1,153 @@
+"""A grid over one or two active coordinates: which postures close."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crane.common.errors import ClosureError
+from crane.common.samples import Array, Brief
+from crane.machine import Machine
+
+Node = tuple[int, int]
+
+_STEPS = 16  # from one posture of the grid to the next, where one step fails
+_EDGE = 2.0**-30  # share of a way to which its last closed posture is found
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Patch(Brief):
+    """Postures over two active coordinates (one, if the second axis has one value).
+
+    Attributes:
+        pair: Indices of both among the active joints.
+        base: (n,) where the others are held.
+        axes: Values of both, (a,) and (b,).
+        closed: (a, b) whether the loops close, connected with home along lines of the grid.
+        q: (a, b, nq) postures, NaN where open.
+    """
+
+    pair: tuple[int, int]
+    base: Array
+    axes: tuple[Array, Array]
+    closed: NDArray[np.bool_]
+    q: Array
+
+    def target(self, node: Node) -> Array:
+        """Active coordinates (n,) of a node."""
+        q_a = self.base.copy()
+        for joint, axis, k in zip(self.pair, self.axes, node, strict=True):
+            if len(axis) > 1:
+                q_a[joint] = axis[k]
+        return q_a
+
+
+def last_closed(machine: Machine, q: Array, target: Array) -> tuple[Array, bool]:
+    """Follow the branch along the straight line of q_A as far as it leads.
+
+    In machine code that is until an entry of gamma exceeds 1000, some 1e-5 rad or m short of the
+    end at most.
+
+    Args:
+        machine: The machine.
+        q: (nq,) closed posture to start from.
+        target: (n,) active coordinates.
+
+    Returns:
+        The last closed posture (nq,), and whether it is at the target.
+    """
+    closure = machine.closure
+    start = q[closure.active]
+    out = np.empty((1, len(q)))
+    cursor = closure.fast.cursor() if closure.compiled else None
+    if cursor is not None and not closure.fast.start_near(cursor, q):
+        return q, False
+    done, step, last = 0.0, 1.0, q
+    while done < 1.0 and step > _EDGE:
+        goal = min(1.0, done + step)
+        way = (target if goal == 1.0 else start + goal * (target - start))[None]
+        if cursor is not None:
+            able = closure.fast.follow(cursor, way, out) == 1
+        else:
+            try:
+                out[0], able = closure.solve(way[0], guess=last), True
+            except ClosureError:
+                able = False
+        if able:
+            done, last = goal, out[0].copy()
+        step = step * 2 if able else step / 2
+    return last, done == 1.0
+
+
+def fill(
+    machine: Machine, base: Array, pair: tuple[int, int], axes: tuple[Array, Array]
+) -> Patch | None:
+    """The closed postures of a patch, from the one nearest to home on.
+
+    Returns:
+        None where the way from home to the patch is barred.
+    """
+    closure, shape = machine.closure, (len(axes[0]), len(axes[1]))
+    patch = Patch(
+        pair, base, axes, np.zeros(shape, dtype=bool), np.full((*shape, machine.model.nq), np.nan)
+    )
+    home = machine.home[closure.active]
+    first = tuple(int(np.abs(axis - home[i]).argmin()) for i, axis in zip(pair, axes, strict=True))
+    q, able = last_closed(machine, machine.home, patch.target((first[0], first[1])))
+    if not able:
+        return None
+    start = (first[0], first[1])
+    patch.closed[start], patch.q[start] = True, q
+    if closure.compiled:
+        _flood(machine, patch, start)
+        return patch
+    waiting = [start]
+    while waiting:
+        at = waiting.pop()
+        for near in _beside(at, shape):
+            if not patch.closed[near]:
+                q, able = last_closed(machine, patch.q[at], patch.target(near))
+                if able:
+                    patch.closed[near], patch.q[near] = True, q
+                    waiting.append(near)
+    return patch
+
+
+def _flood(machine: Machine, patch: Patch, start: tuple[int, int]) -> None:
+    """Close all nodes connected with one that is closed: rows of nodes at once."""
+    fast, (a, b) = machine.closure.fast, patch.closed.shape
+    waiting = [start]
+    tried = np.zeros((a, b, 4), dtype=bool)
+    while waiting:
+        at = waiting.pop()
+        for side, (di, dj) in enumerate(((1, 0), (-1, 0), (0, 1), (0, -1))):
+            row, i, j = [], at[0] + di, at[1] + dj
+            while 0 <= i < a and 0 <= j < b and not patch.closed[i, j]:
+                row.append((i, j))
+                i, j = i + di, j + dj
+            if not row or tried[(*at, side)]:
+                continue
+            tried[(*at, side)] = True
+            cursor = fast.cursor()
+            if not fast.start_near(cursor, patch.q[at]):
+                continue
+            targets = np.array([patch.target(node) for node in row])
+            out = np.empty((len(row), patch.q.shape[2]))
+            count = fast.follow(cursor, targets, out)
+            for node, q in zip(row[:count], out[:count], strict=True):
+                patch.closed[node], patch.q[node] = True, q
+                waiting.append(node)
+            if count < len(row):  # perhaps in smaller steps
+                before = patch.q[row[count - 1]] if count else patch.q[at]
+                from_a = before[machine.closure.active]
+                way = from_a + np.linspace(0, 1, _STEPS + 1)[1:, None] * (targets[count] - from_a)
+                steps = np.empty((_STEPS, patch.q.shape[2]))
+                if fast.start_near(cursor, before) and fast.follow(cursor, way, steps) == _STEPS:
+                    patch.closed[row[count]], patch.q[row[count]] = True, steps[-1]
+                    waiting.append(row[count])
+
+
+def _beside(at: tuple[int, int], shape: tuple[int, int]) -> list[tuple[int, int]]:
+    i, j = at
+    near = ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1))
+    return [(k, m) for k, m in near if 0 <= k < shape[0] and 0 <= m < shape[1]]

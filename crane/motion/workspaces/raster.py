@@ -1,0 +1,61 @@
+"""The area that patches cover in the section."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_closing
+
+from crane.common.samples import Array
+
+_PIXELS = 800  # along the longer side
+
+
+class Raster:
+    """Points of a fine grid over the section, and which of them some cell covers.
+
+    Args:
+        points: (N, 2) all that is to be covered lies among them [m].
+
+    Attributes:
+        u: (W,) first coordinates of the points [m].
+        w: (H,) second coordinates [m].
+        covered: (H, W).
+    """
+
+    def __init__(self, points: Array):
+        low, high = points.min(axis=0), points.max(axis=0)
+        self.size = max(float((high - low).max()), 1e-9) / _PIXELS
+        count = np.ceil((high - low) / self.size).astype(int) + 3
+        self.u = low[0] + self.size * (np.arange(count[0]) - 0.5)
+        self.w = low[1] + self.size * (np.arange(count[1]) - 0.5)
+        self.covered: NDArray[np.bool_] = np.zeros((count[1], count[0]), dtype=bool)
+
+    @property
+    def area(self) -> float:
+        """Of what is covered [m2]."""
+        return float(self.covered.sum()) * self.size**2
+
+    def without_cracks(self, width: int) -> Array:
+        """(H, W) 1 where covered or in a crack of at most 2 width points, else 0."""
+        padded = np.pad(self.covered, width + 1)
+        return binary_closing(padded, iterations=width)[
+            width + 1 : -width - 1, width + 1 : -width - 1
+        ].astype(np.float64)
+
+    def cover(self, triangles: Array) -> None:
+        """Cover all points within triangles (N, 3, 2)."""
+        start = np.array([self.u[0], self.w[0]])
+        places = (triangles - start) / self.size
+        low = np.maximum(np.ceil(places.min(axis=1) - 1e-9).astype(int), 0)
+        high = np.floor(places.max(axis=1) + 1e-9).astype(int) + 1
+        for corners, (x0, y0), (x1, y1) in zip(places, low, high, strict=True):
+            if x1 <= x0 or y1 <= y0:
+                continue
+            block = self.covered[y0:y1, x0:x1]
+            if block.all():
+                continue
+            x, y = np.arange(x0, x1), np.arange(y0, y1)[:, None]
+            sides = []
+            for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+                sides.append((bx - ax) * (y - ay) - (by - ay) * (x - ax))
+            inside = (np.minimum.reduce(sides) >= -1e-9) | (np.maximum.reduce(sides) <= 1e-9)
+            block |= inside

@@ -1,0 +1,149 @@
+"""Logs of other programs: which of their columns are which of a recording, and in what unit.
+
+A file of columns has a line per column of the recording, its name and unit and how it is computed
+from the arrays of the log, and notes as a recording has them:
+
+    # machine: kr300
+    time [s] = time
+    q2 [deg] = motor_position_deg[1] - 90
+    q2_force [N m] = gear_ratio[1] * motor_torque[1]
+
+Arrays are those of an npz file, or the columns of a CSV by the words of its header row; names that
+are no identifiers stand in quotes. a[i] is the i-th column of a table a, counted from 0, or the
+i-th number of a list. There are + - * /, brackets, numbers and pi.
+"""
+
+import ast
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from crane.common.errors import RecordingError, known
+from crane.recordings import timeseries
+from crane.recordings.timeseries import TIME, Table
+
+_LONGEST = 1000  # characters of an expression
+_LINE = re.compile(r"\s*([^=\[\]]+?\s*(?:\[[^\]]*\])?)\s*=\s*(.+?)\s*")
+_OPERATORS = {
+    ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide,
+}  # fmt: skip
+
+
+def read_log(path: str | Path, columns: str | Path) -> Table:
+    """The table of a recording from a log.
+
+    Args:
+        path: The log, CSV or npz.
+        columns: A file as above.
+
+    Returns:
+        Columns in SI units, time strictly increasing.
+
+    Raises:
+        RecordingError: A file is missing or malformed, or a column cannot be computed; the
+            message names file and line.
+    """
+    path, columns = Path(path), Path(columns)
+    notes, lines = _lines(columns)
+    arrays = timeseries.arrays(path)
+    found = {}
+    for line, (heading, expression) in lines.items():
+        try:
+            if heading in found:
+                raise RecordingError(f"column '{heading}' is there twice, remove one")
+            found[heading] = _evaluated(expression, arrays)
+        except RecordingError as error:
+            raise RecordingError(f"{columns}:{line}: {error}") from None
+    count = max((len(x) for x in found.values() if x.ndim), default=1)
+    for line, (heading, _) in lines.items():
+        if found[heading].shape not in ((), (count,)):
+            raise RecordingError(
+                f"{columns}:{line}: '{heading}' has {len(found[heading])} samples, others have "
+                f"{count}, choose a column of a table by its number, as in a[0]"
+            )
+    whole = {name: np.broadcast_to(values, (count,)) for name, values in found.items()}
+    table = timeseries.from_columns(columns, whole, notes)
+    for name, values in zip(table.units, table.values.T, strict=True):
+        bad = ~np.isfinite(values)
+        if name == TIME:
+            bad |= np.append(False, np.diff(values) <= 0)
+        if bad.any():
+            at = int(bad.argmax())
+            what = "strictly increasing times" if name == TIME else "finite numbers"
+            raise RecordingError(f"{path}: '{name}' is {values[at]} at sample {at}, give {what}")
+    return table
+
+
+def _lines(path: Path) -> tuple[dict[str, str], dict[int, tuple[str, str]]]:
+    """Notes, and heading and expression by the number of their line."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: is not text, save it as UTF-8") from None
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(f"{path}: {reason}, give a file of columns") from None
+    notes, found = {}, {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.strip().startswith("#"):
+            key, _, value = line.strip().removeprefix("#").partition(":")
+            notes[key.strip()] = value.strip()
+        elif line.strip():
+            match = _LINE.fullmatch(line)
+            if match is None or len(line) > _LONGEST:
+                raise RecordingError(
+                    f"{path}:{number}: is no column, write 'name [unit] = expression', as in "
+                    "'q1 [deg] = angle[0] - 90'"
+                )
+            found[number] = match[1], match[2]
+    if not found:
+        raise RecordingError(f"{path}: names no columns, write 'name [unit] = expression'")
+    return notes, found
+
+
+def _evaluated(expression: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """A number () or samples (N,)."""
+    try:
+        tree = ast.parse(expression, mode="eval")
+        with np.errstate(all="ignore"):  # what is not finite is refused with its name
+            value = np.asarray(_value(tree.body, arrays), dtype=np.float64)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        raise RecordingError(
+            f"'{expression}' cannot be computed, combine columns by + - * / and numbers"
+        ) from None
+    if value.ndim > 1:
+        raise RecordingError(
+            f"'{expression}' has the shape {value.shape}, choose a column by its number: a[0]"
+        )
+    return value
+
+
+def _value(node: ast.expr, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
+        return _OPERATORS[type(node.op)](_value(node.left, arrays), _value(node.right, arrays))
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
+        return -_value(node.operand, arrays)
+    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        return np.asarray(node.value, dtype=np.float64)
+    if isinstance(node, ast.Subscript):
+        whole, at = _value(node.value, arrays), node.slice
+        if not (isinstance(at, ast.Constant) and type(at.value) is int) or not whole.ndim:
+            raise ValueError
+        if at.value >= whole.shape[-1]:
+            raise RecordingError(
+                f"'{ast.unparse(node)}' is not there, give numbers from 0 to {whole.shape[-1] - 1}"
+            )
+        return np.asarray(whole[..., at.value])
+    if isinstance(node, ast.Name) or isinstance(node, ast.Constant) and type(node.value) is str:
+        name = node.id if isinstance(node, ast.Name) else str(node.value)
+        if name in arrays:
+            if arrays[name].dtype.kind not in "biuf":
+                raise RecordingError(f"'{name}' of the log is {arrays[name].dtype}, no numbers")
+            return arrays[name].astype(np.float64)
+        if name == "pi":
+            return np.asarray(math.pi)
+        raise RecordingError(f"the log has no '{name}', {known(arrays, name)}")
+    raise ValueError

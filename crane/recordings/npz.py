@@ -1,0 +1,173 @@
+"""Columns of an npz file, read with bounds.
+
+An npz is a zip of arrays, each with a header that declares its type and shape. numpy believes the
+headers; here sizes are compared with what is there, and nothing that could run is loaded.
+"""
+
+import lzma
+import math
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import IO, TypeVar
+
+import numpy as np
+
+from crane.common.errors import RecordingError
+from crane.common.samples import Array
+
+MOST = 1 << 27  # numbers in a file: 1 GiB
+MOST_COLUMNS = 4096
+NUMBERS = "biuf"  # kinds of numpy's types
+_AT_ONCE = 1 << 20  # numbers
+T = TypeVar("T")
+_DAMAGED = (
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError,
+)  # fmt: skip
+
+
+def read_columns(path: Path) -> tuple[list[str], Array]:
+    """Names and values (N, columns) of the columns, in the order of the file.
+
+    Raises:
+        OSError: The file cannot be opened.
+        RecordingError: It is no npz file, is damaged or encrypted, or holds other than columns of
+            equal length, or too many numbers. The message does not name the file.
+    """
+    return _opened(path, _columns)
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Arrays of any shape by name; of those that hold no numbers nothing but their type.
+
+    Raises:
+        OSError: The file cannot be opened.
+        RecordingError: It is no npz file, is damaged or encrypted, or holds too many numbers. The
+            message does not name the file.
+    """
+    return _opened(path, _arrays)
+
+
+def _opened(path: Path, read: Callable[[zipfile.ZipFile], T]) -> T:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return read(archive)
+    except _DAMAGED as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:80]
+        raise RecordingError(
+            f"is no npz file of arrays ({reason}), give one as numpy.savez writes it"
+        ) from None
+
+
+def _declared(archive: zipfile.ZipFile) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
+    """Shape and type of each array."""
+    entries = archive.infolist()
+    if len(entries) > MOST_COLUMNS:
+        raise RecordingError(f"holds {len(entries)} arrays, give at most {MOST_COLUMNS}")
+    types: dict[str, tuple[tuple[int, ...], np.dtype]] = {}
+    for entry in entries:
+        name = _name(entry)
+        if name in types:
+            raise RecordingError(f"column '{name}' is there twice, rename or remove one")
+        if entry.flag_bits & 1:
+            raise RecordingError(f"'{name}' is encrypted, save the file without a password")
+        with archive.open(entry) as file:
+            types[name] = _header(name, file)
+    return types
+
+
+def _columns(archive: zipfile.ZipFile) -> tuple[list[str], Array]:
+    types = _declared(archive)
+    count = max((shape[0] for shape, _ in types.values() if len(shape) == 1), default=0)
+    for name, (shape, dtype) in types.items():
+        if shape != (count,) or dtype.kind not in NUMBERS:
+            raise RecordingError(
+                f"'{name}' has the shape {shape} of {str(dtype)[:40]}, give ({count},) numbers "
+                "per column"
+            )
+    if not count:
+        raise RecordingError("holds no samples, give an array per column")
+    if count * len(types) > MOST:
+        raise RecordingError(
+            f"declares {count} samples of {len(types)} columns, give at most {MOST} numbers"
+        )
+    _check_sizes(archive, types)
+    values = np.empty((count, len(types)))
+    for column, entry in enumerate(archive.infolist()):
+        _fill(archive, entry, types, values[:, column])
+    return list(types), values
+
+
+def _arrays(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
+    types = _declared(archive)
+    numbers = {name for name, (_, dtype) in types.items() if dtype.kind in NUMBERS}
+    if (count := sum(math.prod(types[name][0]) for name in numbers)) > MOST:
+        raise RecordingError(f"declares {count} numbers, give at most {MOST}")
+    _check_sizes(archive, {name: types[name] for name in numbers})
+    found: dict[str, np.ndarray] = {}
+    for entry in archive.infolist():
+        name = _name(entry)
+        shape, dtype = types[name]
+        found[name] = np.empty(0, dtype)
+        if name in numbers:
+            values = np.empty(math.prod(shape))
+            fortran = _fill(archive, entry, types, values)
+            found[name] = values.reshape(shape, order="F" if fortran else "C")
+    return found
+
+
+def _check_sizes(
+    archive: zipfile.ZipFile, types: Mapping[str, tuple[tuple[int, ...], np.dtype]]
+) -> None:
+    """Compare what the headers declare with what is there."""
+    for entry in archive.infolist():
+        shape, dtype = types.get(_name(entry), ((0,), np.dtype(float)))
+        if entry.file_size < math.prod(shape) * dtype.itemsize:
+            raise RecordingError(f"'{_name(entry)}' is cut short, save the file again")
+
+
+def _fill(
+    archive: zipfile.ZipFile,
+    entry: zipfile.ZipInfo,
+    types: Mapping[str, tuple[tuple[int, ...], np.dtype]],
+    values: Array,
+) -> bool:
+    """Read an array's numbers one after the other; whether its columns stand together."""
+    with archive.open(entry) as file:
+        np.lib.format.read_magic(file)
+        _, fortran, _ = np.lib.format.read_array_header_1_0(file)
+        _read(_name(entry), file, types[_name(entry)][1], values)
+    return bool(fortran)
+
+
+def _name(entry: zipfile.ZipInfo) -> str:
+    return entry.filename.removesuffix(".npy")
+
+
+def _header(name: str, file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and type of an array, of which the data are left to be read."""
+    try:
+        if np.lib.format.read_magic(file) != (1, 0):  # others are of long headers
+            raise ValueError("not of numbers alone")
+        shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    except (*_DAMAGED, OSError):
+        raise
+    except Exception as error:  # whatever becomes of a text that is evaluated as Python's literals
+        raise ValueError(type(error).__name__) from None
+    if any(length < 0 for length in shape):
+        raise RecordingError(f"'{name}' has the shape {shape}, save the file again")
+    return shape, dtype
+
+
+def _read(name: str, file: IO[bytes], dtype: np.dtype, column: Array) -> None:
+    """Fill a column (N,)."""
+    for start in range(0, len(column), _AT_ONCE):
+        part = column[start : start + _AT_ONCE]
+        data = file.read(len(part) * dtype.itemsize)
+        if len(data) != len(part) * dtype.itemsize:
+            raise RecordingError(f"'{name}' is cut short, save the file again")
+        with np.errstate(over="ignore", invalid="ignore"):  # told by those who look at values
+            part[:] = np.frombuffer(data, dtype)
+    if file.read(1):
+        raise RecordingError(f"'{name}' holds more than it declares, save the file again")

@@ -1,0 +1,306 @@
+"""What a machine did: time series of its active joints, and whatever else was recorded.
+
+As a file it is a CSV of SI units (see crane.recordings.timeseries):
+
+    # crane recording
+    # machine: mini_forwarder
+    # task: loading
+    # controller: PI
+    time [s],q1 [rad],X1 [m],q1_velocity [rad/s],X1_velocity [m/s],q1_force [N m],X1_force [N],...
+
+A column X is an active joint if X_force exists; X_velocity may be missing and is the derivative of
+X then. X_velocity and X_force without X is an error. Every other column is a channel, such as the
+angle q2 of a joint that is not active, with q2_velocity beside it or without. The order of the
+columns is free, the joints come in the order of their displacements. The comment lines may be left
+out. Other units are converted where crane.recordings.timeseries knows them. An npz file serves,
+too: one array per column, named like those of the CSV. What a crane's sensors tell instead of
+displacements and forces, crane.recordings.measured turns into them.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.common.errors import RecordingError, at, known
+from crane.common.samples import Array
+from crane.recordings import timeseries
+from crane.recordings.timeseries import TIME, Table, check_unit
+
+VELOCITY_UNITS = {"rad": "rad/s", "m": "m/s"}
+FORCE_UNITS = {"rad": "N m", "m": "N"}
+
+VELOCITY, FORCE = "_velocity", "_force"
+_LISTED = 40  # names in a message
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Samples of N instants of a machine with n active joints.
+
+    The arrays are copied to contiguous float64 and checked: shapes, finite numbers, time
+    strictly increasing. Treat them as constants.
+
+    Attributes:
+        time: Instants (N,) [s], N >= 1.
+        joints: Names of the active joints, in the order of the columns below.
+        q: Active coordinates (N, n) [rad or m].
+        v: Their velocities (N, n) [rad/s or m/s].
+        tau: Their generalized forces (N, n) [N m or N].
+        units: Unit of each joint's coordinate, "rad" or "m".
+        channels: Further columns (N,) by name.
+        channel_units: Their units; "" where none is given.
+        machine: Name of the bundled machine or path of the machine file, "" if not known.
+        task: What it was doing, "" if not known.
+        controller: What drove it, "" if not known.
+    """
+
+    time: Array
+    joints: tuple[str, ...]
+    q: Array
+    v: Array
+    tau: Array
+    units: dict[str, str]
+    channels: dict[str, Array] = field(default_factory=dict)
+    channel_units: dict[str, str] = field(default_factory=dict)
+    machine: str = ""
+    task: str = ""
+    controller: str = ""
+
+    def __post_init__(self) -> None:
+        joints = tuple(self.joints)
+        count = np.size(self.time)
+        shape = (count, len(joints))
+        for name in self.channel_units:
+            if name not in self.channels:
+                raise RecordingError(f"unit of the channel '{name}', {known(self.channels, name)}")
+        if set(self.units) != set(joints):
+            raise RecordingError(f"units are for {_listed(self.units)}, give {_listed(joints)}")
+        checked = {
+            "joints": joints,
+            "units": {x: self.units[x] for x in joints},
+            "time": _array(TIME, self.time, (count,)),
+            "q": _array("q", self.q, shape, joints),
+            "v": _array("v", self.v, shape, joints),
+            "tau": _array("tau", self.tau, shape, joints),
+            "channels": {
+                name: _array(f"channel '{name}'", values, (count,))
+                for name, values in self.channels.items()
+            },
+            "channel_units": {name: self.channel_units.get(name, "") for name in self.channels},
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        self._check_names()
+        self._check_values()
+
+    def _check_names(self) -> None:
+        names = self._names()
+        for name, count in Counter(names).items():
+            if count > 1:
+                raise RecordingError(f"column '{name}' is there twice, rename or remove one")
+        if _some_joints(names) != self.joints:
+            raise RecordingError(
+                f"channels {_listed(self.channels)} hold an active joint, "
+                f"rename those that end in {VELOCITY} and {FORCE}"
+            )
+        units = self._units()
+        for name, unit in units.items():
+            timeseries.check_column(name, unit)
+        for name in ("machine", "task", "controller"):
+            text = getattr(self, name)
+            if text != text.strip() or not text.isprintable():
+                raise RecordingError(f"{name} {text!r} is not one line of text, give one")
+
+    def _check_values(self) -> None:
+        if not len(self.time):
+            raise RecordingError("no samples, give at least one")
+        arrays = (self.time, self.q, self.v, self.tau, *self.channels.values())
+        if not all(np.isfinite(values).all() for values in arrays):
+            check_finite(self.columns())
+        if (back := np.diff(self.time) <= 0).any():
+            sample = int(np.argmax(back)) + 1
+            before, now = self.time[sample - 1 : sample + 1]
+            raise RecordingError(
+                f"time goes from {before} to {now} s at sample {sample}, "
+                f"give strictly increasing times"
+            )
+
+    def __repr__(self) -> str:
+        """What it is of, how long, and its joints."""
+        what = ": ".join(word for word in (self.machine, self.task) if word)
+        joints = ", ".join(f"{joint} [{self.units[joint]}]" for joint in self.joints)
+        return (
+            f"Recording of {what or 'a machine'}, {self.time[-1] - self.time[0]:.6g} s in "
+            f"{len(self.time)} samples: {joints}, {len(self.channels)} channels"
+        )
+
+    def _names(self) -> list[str]:
+        """Names of all columns, in the order in which they are written."""
+        joints = [x + suffix for suffix in ("", VELOCITY, FORCE) for x in self.joints]
+        return [TIME, *joints, *self.channels]
+
+    def _units(self) -> dict[str, str]:
+        """Units of all columns.
+
+        Raises:
+            RecordingError: A joint has a unit other than rad or m.
+        """
+        for joint, unit in self.units.items():
+            check_unit(joint, unit, VELOCITY_UNITS)
+        return (
+            {TIME: "s"}
+            | self.units
+            | {x + VELOCITY: VELOCITY_UNITS[unit] for x, unit in self.units.items()}
+            | {x + FORCE: FORCE_UNITS[unit] for x, unit in self.units.items()}
+            | self.channel_units
+        )
+
+    def columns(self) -> dict[str, Array]:
+        """All columns (N,) by name, as they are written; views, not copies."""
+        joints = [*self.q.T, *self.v.T, *self.tau.T]
+        columns = [self.time, *joints, *self.channels.values()]
+        return dict(zip(self._names(), columns, strict=True))
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the recording as CSV, whole or not at all.
+
+        Raises:
+            OutputError: It cannot be written there.
+        """
+        notes = {"crane recording": "", "machine": self.machine, "task": self.task}
+        if self.controller:
+            notes["controller"] = self.controller
+        timeseries.write_columns(path, self._units(), list(self.columns().values()), notes)
+
+    @classmethod
+    def from_csv(cls, path: str | Path) -> "Recording":
+        """Read a recording.
+
+        Raises:
+            RecordingError: The file does not exist or is not such a CSV; the message names the
+                file, the line or column, and what to change.
+        """
+        return cls.from_table(timeseries.read_csv(path), path)
+
+    @classmethod
+    def read(cls, path: str | Path) -> "Recording":
+        """Read a recording from a CSV or npz file.
+
+        Raises:
+            RecordingError: As `from_csv`, or the suffix is another one.
+        """
+        return cls.from_table(timeseries.read(path), path)
+
+    @classmethod
+    def from_table(cls, table: Table, path: str | Path) -> "Recording":
+        """The recording in a table that was read from a path.
+
+        Raises:
+            RecordingError: A column is missing, in a wrong unit, or not a recording's.
+        """
+        try:
+            return cls._from_table(table)
+        except RecordingError as error:
+            raise RecordingError(at(str(path), error)) from None
+
+    @classmethod
+    def _from_table(cls, table: Table) -> "Recording":
+        units, column = table.units, dict(zip(table.units, table.values.T, strict=True))
+        joints = _some_joints(list(units))
+        for joint in joints:
+            check_unit(joint, unit := units[joint], VELOCITY_UNITS)
+            if joint + VELOCITY in units:
+                check_unit(joint + VELOCITY, units[joint + VELOCITY], [VELOCITY_UNITS[unit]])
+            else:
+                column[joint + VELOCITY] = derivative(column[joint], column[TIME])
+            check_unit(joint + FORCE, units[joint + FORCE], [FORCE_UNITS[unit]])
+        q, v, tau = (
+            np.column_stack([column[x + suffix] for x in joints])
+            for suffix in ("", VELOCITY, FORCE)
+        )
+        used = {TIME} | {x + suffix for x in joints for suffix in ("", VELOCITY, FORCE)}
+        channels = {x: values for x, values in column.items() if x not in used}
+        return cls(
+            time=column[TIME],
+            joints=joints,
+            q=q,
+            v=v,
+            tau=tau,
+            units={x: units[x] for x in joints},
+            channels=channels,
+            channel_units={x: units[x] for x in channels},
+            machine=table.notes.get("machine", ""),
+            task=table.notes.get("task", ""),
+            controller=table.notes.get("controller", ""),
+        )
+
+
+def derivative(x: Array, time: Array) -> Array:
+    """Central differences (N,) of x (N,); zero where time does not tell (it is refused later)."""
+    if len(x) < 2 or not (np.diff(time) > 0).all():
+        return np.zeros_like(x)
+    return np.asarray(np.gradient(x, time))
+
+
+def check_finite(columns: Mapping[str, Array]) -> None:
+    """See that columns (N,) hold finite numbers.
+
+    Raises:
+        RecordingError: One does not.
+    """
+    for name, values in columns.items():
+        if not np.isfinite(values).all():
+            sample = int(np.argmin(np.isfinite(values)))
+            raise RecordingError(
+                f"'{name}' is {values[sample]} at sample {sample}, give finite numbers"
+            )
+
+
+def _array(
+    what: str, value: ArrayLike, shape: tuple[int, ...], names: Sequence[str] = ()
+) -> Array:
+    """A float64 copy of that shape."""
+    try:
+        array = np.array(value, dtype=np.float64, order="C")
+    except (TypeError, ValueError):
+        raise RecordingError(f"{what} is not an array of numbers, give {shape}") from None
+    if array.shape != shape:
+        columns = f", a column each for {_listed(names)}" if names else ""
+        raise RecordingError(f"{what} has the shape {array.shape}, give {shape}{columns}")
+    return array
+
+
+def _listed(names: Iterable[str]) -> str:
+    names = list(names)
+    more = [f"{len(names) - _LISTED} more"] if len(names) > _LISTED else []
+    return ", ".join([f"'{name}'" for name in names[:_LISTED]] + more) or "none"
+
+
+def find_joints(names: Sequence[str]) -> tuple[str, ...]:
+    """The active joints among columns, by the rule in the module's docstring.
+
+    Raises:
+        RecordingError: There are velocity and force of a joint without its displacement.
+    """
+    there = set(names)
+    for stem in (x.removesuffix(FORCE) for x in names if x.endswith(FORCE)):
+        if stem not in there and stem + VELOCITY in there:
+            raise RecordingError(
+                f"column '{stem}' is missing beside '{stem}{VELOCITY}', '{stem}{FORCE}', "
+                f"add it, or rename those if '{stem}' is not an active joint"
+            )
+    return tuple(x for x in names if x + FORCE in there)
+
+
+def _some_joints(names: Sequence[str]) -> tuple[str, ...]:
+    joints = find_joints(names)
+    if not joints:
+        raise RecordingError(
+            f"no active joint among the columns {_listed(names)}, give for each joint "
+            f"its displacement, force and perhaps velocity, as in q1, q1{FORCE}, q1{VELOCITY}"
+        )
+    return joints

@@ -1,0 +1,426 @@
+"""Time series as a CSV: a table of columns with names and units, the first of them time.
+
+Comment lines `# key: value`, then one header row `time [s],name [unit],...`, then one row per
+sample. A unit may be left out, for all columns but time. What is read is in SI units: columns in
+bar, deg, mm and others of `_TO_SI` are converted, those in other units stay as they are. Numbers
+are written with the fewest digits that give the same float64 again.
+"""
+
+import csv
+import io
+import math
+import re
+import stat
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from crane.common.errors import RecordingError, at
+from crane.common.output import replacing
+from crane.common.samples import Array, Brief
+from crane.recordings.npz import MOST, MOST_COLUMNS, read_arrays, read_columns
+
+T = TypeVar("T")
+
+TIME = "time"
+_WORD = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
+_ROWS_AT_ONCE = 4096
+_BLOCK = 1 << 20  # bytes, and so many at most in a line
+_LONG_HEADING, _LONG_NAME = 1 << 16, 200  # characters
+_LARGEST = 1e30  # in SI units; what is computed from larger ones overflows
+
+# unit: (SI unit, a, b) with x a / b in SI units; two factors, so that 12.3 mm is 0.0123 m exactly
+_TO_SI = {
+    "ms": ("s", 1.0, 1e3),
+    "deg": ("rad", math.pi, 180.0),
+    "deg/s": ("rad/s", math.pi, 180.0),
+    "mm": ("m", 1.0, 1e3),
+    "cm": ("m", 1.0, 1e2),
+    "mm/s": ("m/s", 1.0, 1e3),
+    "cm/s": ("m/s", 1.0, 1e2),
+    "kN": ("N", 1e3, 1.0),
+    "kN m": ("N m", 1e3, 1.0),
+    "kPa": ("Pa", 1e3, 1.0),
+    "MPa": ("Pa", 1e6, 1.0),
+    "bar": ("Pa", 1e5, 1.0),
+    "l/min": ("m3/s", 1.0, 6e4),
+    "mV": ("V", 1.0, 1e3),
+}
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Table(Brief):
+    """Columns of a file.
+
+    Attributes:
+        units: Unit of each column by its name, in the order of the columns; "" where not given.
+            SI units in a table that was read, unless a unit is none of those that are converted.
+        values: Samples (N, columns).
+        notes: Comment lines by their key.
+    """
+
+    units: dict[str, str]
+    values: Array
+    notes: dict[str, str]
+
+
+def check_column(name: str, unit: str) -> None:
+    """See that a header can hold this name and unit.
+
+    Raises:
+        RecordingError: It cannot.
+    """
+    words = {"name": name, "unit": unit} if unit else {"name": name}
+    for what, text in words.items():
+        if not _WORD.fullmatch(text) or not text.isprintable():
+            raise RecordingError(
+                f"column '{name}': {text!r} cannot be the {what} of a column, "
+                f"use no commas, brackets, quotes or outer blanks"
+            )
+
+
+def spellings(unit: str) -> list[str]:
+    """An SI unit and the units of a file that are converted to it."""
+    return [unit, *(other for other, (si, _, _) in _TO_SI.items() if si == unit)]
+
+
+def write(path: str | Path, table: Table) -> None:
+    """Write a table, whole or not at all.
+
+    Raises:
+        OutputError: It cannot be written there.
+    """
+    write_columns(path, table.units, list(table.values.T), table.notes)
+
+
+def write_columns(
+    path: str | Path, units: Mapping[str, str], columns: Sequence[Array], notes: Mapping[str, str]
+) -> None:
+    """The same of single columns (N,), of which no table has to be made.
+
+    Raises:
+        OutputError: It cannot be written there.
+    """
+    head = [f"# {key}: {value}" if value else f"# {key}" for key, value in notes.items()]
+    head.append(",".join(f"{x} [{unit}]" if unit else x for x, unit in units.items()))
+    with replacing(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
+        file.write("\n".join(head) + "\n")
+        for start in range(0, len(columns[0]), _ROWS_AT_ONCE):
+            rows = np.column_stack([x[start : start + _ROWS_AT_ONCE] for x in columns])
+            file.write("".join([",".join(map(repr, row)) + "\n" for row in rows.tolist()]))
+
+
+def read(path: str | Path) -> Table:
+    """Read a table from a CSV or npz file, by its suffix.
+
+    Raises:
+        RecordingError: As `read_csv` and `read_npz`, or the suffix is another one.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".csv":
+        return read_csv(path)
+    if path.suffix.lower() != ".npz":
+        missing = "" if path.exists() else "no such file, "
+        raise RecordingError(f"{path}: {missing}a recording is a .csv or .npz file, name one")
+    return read_npz(path)
+
+
+def read_csv(path: str | Path) -> Table:
+    """Read a table: columns named once, finite numbers, time strictly increasing.
+
+    Raises:
+        RecordingError: The file does not exist or is not such a table; the message names the
+            file, the line or column, and what to change.
+    """
+    path = Path(path)
+    try:
+        check_plain(path)
+        lines = _count_lines(path)
+        notes, heading, line = _head(path)
+        units = _units(heading)
+        if (lines - line) * len(units) > MOST:
+            raise RecordingError(
+                f"holds {lines - line} lines of {len(units)} columns, give at most {MOST} numbers"
+            )
+        return _in_si(Table(units, _values(path, line, units), notes))
+    except RecordingError as error:
+        raise RecordingError(at(str(path), error)) from None
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path}: is not text, give a CSV in UTF-8") from None
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(f"{path}: {reason}, give the path of a CSV file") from None
+
+
+def read_npz(path: Path) -> Table:
+    """Read a table from arrays (N,) of equal length, named like the columns of a CSV.
+
+    Raises:
+        RecordingError: The file does not exist, or as `crane.recordings.npz.read_columns`.
+    """
+    names, values = _npz(path, read_columns)
+    return _table(path, names, values, {})
+
+
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    """What an npz file or a CSV of another program holds, by name: nothing is converted.
+
+    A CSV has one header row; it separates columns by commas, semicolons or tabs.
+
+    Raises:
+        RecordingError: The file does not exist or is none of these.
+    """
+    if path.suffix.lower() == ".npz":
+        return _npz(path, read_arrays)
+    try:
+        check_plain(path)
+        _count_lines(path)
+        _, heading, line = _head(path)
+        between = max(",;\t", key=heading.count)
+        names = [cell.strip() for cell in next(csv.reader([heading], delimiter=between))]
+        values = np.loadtxt(
+            path, delimiter=between, comments=None, skiprows=line, ndmin=2, encoding="utf-8"
+        )
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(f"{path}: {reason}, give the path of a CSV or npz file") from None
+    except (ValueError, csv.Error) as error:  # text that is none among them
+        reason = str(error).rstrip(".")
+        raise RecordingError(f"{path}: no table of numbers ({reason}), correct it") from None
+    if values.shape[1] != len(names) or len(set(names)) < len(names):
+        raise RecordingError(
+            f"{path}: {len(set(names))} different names head {values.shape[1]} columns, name each"
+        )
+    return dict(zip(names, values.T, strict=True))
+
+
+def _npz(path: Path, read: Callable[[Path], T]) -> T:
+    try:
+        check_plain(path)
+        return read(path)
+    except RecordingError as error:
+        raise RecordingError(at(str(path), error)) from None
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise RecordingError(f"{path}: {reason}, give the path of an npz file") from None
+
+
+def from_columns(path: Path, columns: Mapping[str, np.ndarray], notes: dict[str, str]) -> Table:
+    """A table in SI units of arrays (N,) named 'name [unit]'; the path is for errors.
+
+    Raises:
+        RecordingError: They are not named like columns.
+    """
+    return _table(path, list(columns), np.column_stack(list(columns.values())), notes)
+
+
+def _table(path: Path, names: Sequence[str], values: Array, notes: dict[str, str]) -> Table:
+    heading = io.StringIO()
+    csv.writer(heading).writerow(names)
+    try:
+        return _in_si(Table(_units(heading.getvalue().rstrip()), values, notes))
+    except RecordingError as error:
+        raise RecordingError(at(str(path), error)) from None
+
+
+def check_plain(path: Path) -> None:
+    """See that a file ends, as devices and pipes need not.
+
+    Raises:
+        OSError: It is not there.
+        RecordingError: It is no plain file.
+    """
+    if not stat.S_ISREG(mode := path.stat().st_mode) and not stat.S_ISDIR(mode):
+        raise RecordingError("is no plain file, copy it into one")
+
+
+def _count_lines(path: Path) -> int:
+    """Number of lines of a text.
+
+    Raises:
+        RecordingError: One of them is none, by its length.
+    """
+    ended, since = 0, 0  # lines, bytes of the one that has not ended
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            ends = block.replace(b"\r", b"\n")
+            first, last = ends.find(b"\n"), ends.rfind(b"\n")
+            since += first if first >= 0 else len(block)
+            if since > _BLOCK:
+                what = f"line {ended + 1} has more than {_BLOCK} bytes"
+                raise RecordingError(f"{what}, write one line per sample")
+            ended += block.count(b"\n") or block.count(b"\r")
+            if last >= 0:
+                since = len(block) - last - 1
+    return ended + (since > 0)
+
+
+def _in_si(table: Table) -> Table:
+    units, values = dict(table.units), table.values
+    for i, (name, unit) in enumerate(table.units.items()):
+        if unit in _TO_SI:
+            units[name], a, b = _TO_SI[unit]
+            with np.errstate(over="ignore"):  # infinite values are refused with their name
+                values[:, i] = values[:, i] * a / b
+    for i, name in enumerate(table.units):
+        column = values[:, i]
+        beyond = np.isfinite(column) & (np.abs(column) > _LARGEST)
+        if beyond.any():
+            sample = int(np.argmax(beyond))
+            raise RecordingError(
+                f"'{name}' is {column[sample]:.3g} at sample {sample}, beyond all that is "
+                "measured, correct it"
+            )
+    return Table(units, values, table.notes)
+
+
+def _head(path: Path) -> tuple[dict[str, str], str, int]:
+    """Notes, the header row, and its line number."""
+    notes: dict[str, str] = {}
+    passed = 0  # characters
+    with path.open(encoding="utf-8-sig") as file:
+        for line, text in enumerate(file, start=1):
+            passed += len(text)
+            text = text.strip()
+            if text.startswith("#"):
+                key, _, value = text.removeprefix("#").partition(":")
+                notes[key.strip()] = value.strip()
+            elif text:
+                if len(text) > _LONG_HEADING:
+                    raise RecordingError(
+                        f"line {line}, the header row, has {len(text)} characters, give at most "
+                        f"{_LONG_HEADING}"
+                    )
+                return notes, text, line
+            if passed > _BLOCK:
+                raise RecordingError(
+                    f"has no header row within {_BLOCK} characters, name the columns before"
+                )
+    raise RecordingError("is empty, write a header row and one row per sample")
+
+
+def _units(heading: str) -> dict[str, str]:
+    """Names and units of the columns from the header row."""
+    for other in (";", "\t"):
+        if other in heading and "," not in heading:
+            raise RecordingError(f"separates columns by {other!r}, use commas")
+    try:
+        cells = next(csv.reader([heading]))
+    except csv.Error as error:
+        raise RecordingError(f"has a header row that is none ({error}), correct it") from None
+    if len(cells) > MOST_COLUMNS:
+        raise RecordingError(f"has {len(cells)} columns, give at most {MOST_COLUMNS}")
+    if all(_number(cell) is not None for cell in cells):
+        raise RecordingError(
+            "has no header, name the columns in the first row (without '#'), "
+            "as in 'time [s],q1 [rad],q1_velocity [rad/s],q1_force [N m]'"
+        )
+    units: dict[str, str] = {}
+    for position, cell in enumerate(cells, start=1):
+        name, unit = _heading(cell)
+        if not name or len(cell) > _LONG_NAME:
+            hint = f", at most {_LONG_NAME} characters" if name else ""
+            raise RecordingError(
+                f"column {position} is headed '{_shown(cell)}', write 'name [unit]'{hint}"
+            )
+        if name in units:
+            raise RecordingError(f"column '{name}' is there twice, rename or remove one")
+        check_column(name, unit)
+        units[name] = unit
+    if TIME not in units:
+        raise RecordingError(f"no column '{TIME}' in the header, add '{TIME} [s]'")
+    check_unit(TIME, units[TIME], spellings("s"))
+    return units
+
+
+def _heading(cell: str) -> tuple[str, str]:
+    """Name and unit in 'name [unit]'; no name where it is something else."""
+    name, bracket, unit = cell.strip().partition("[")
+    if bracket:
+        if not unit.endswith("]"):
+            return "", ""
+        unit = unit[:-1]
+    if any(mark in part for part in (name, unit) for mark in "[]"):
+        return "", ""
+    return name.strip(), unit.strip()
+
+
+def _shown(cell: str) -> str:
+    cell = cell.strip()
+    return cell if len(cell) < 60 else cell[:60] + "..."
+
+
+def check_unit(column: str, unit: str, allowed: Iterable[str]) -> None:
+    """See that a column is in one of some units.
+
+    Raises:
+        RecordingError: It is not.
+    """
+    if unit not in allowed:
+        found = f"is in [{unit}]" if unit else "has no unit"
+        wanted = " or ".join(f"'{column} [{x}]'" for x in allowed)
+        raise RecordingError(f"column '{column}' {found}, give {wanted}")
+
+
+def _values(path: Path, header: int, units: Mapping[str, str]) -> Array:
+    """Numbers (N, columns) below the header row, which is line `header`."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about a file without samples
+            values = np.loadtxt(
+                path, delimiter=",", comments=None, skiprows=header, ndmin=2, encoding="utf-8"
+            )
+    except ValueError as error:
+        _find_fault(path, header, units)
+        reason = " ".join(str(error).split())[:120]
+        raise RecordingError(f"{reason}, correct the file") from None
+    if not values.size:
+        raise RecordingError("has a header and no samples, write one row per sample")
+    if (
+        values.shape[1] != len(units)
+        or not np.isfinite(values).all()
+        or (np.diff(values[:, list(units).index(TIME)]) <= 0).any()
+    ):
+        _find_fault(path, header, units)
+    return values
+
+
+def _number(cell: str) -> float | None:
+    try:
+        return float(cell) if "_" not in cell else None
+    except ValueError:
+        return None
+
+
+def _find_fault(path: Path, header: int, units: Mapping[str, str]) -> None:
+    """Raise an error about the first line that is wrong."""
+    names, last = list(units), -np.inf
+    with path.open(encoding="utf-8-sig") as file:
+        for line, text in enumerate(file, start=1):
+            if line <= header or not text.strip():
+                continue
+            cells = text.rstrip("\n").split(",")
+            if len(cells) != len(names):
+                raise RecordingError(
+                    f"line {line} has {len(cells)} cells, give {len(names)} as in the header"
+                )
+            for name, cell in zip(names, cells, strict=True):
+                value = _number(cell)
+                if value is None or not np.isfinite(value):
+                    raise RecordingError(
+                        f"line {line}, column '{name}': '{_shown(cell)}' is not a finite "
+                        f"number, correct or remove the line"
+                    )
+            now = float(cells[names.index(TIME)])
+            if now <= last:
+                raise RecordingError(
+                    f"line {line}: time goes from {last} to {now} {units[TIME]}, "
+                    f"give strictly increasing times"
+                )
+            last = now

@@ -1,0 +1,146 @@
+"""Many simulations at once: variants of a machine, initial states, payloads."""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.common.errors import CraneError, InputError
+from crane.common.samples import Array, Brief
+from crane.control import Controller
+from crane.dynamics import Dynamics
+from crane.machine import Machine
+from crane.motion.trajectories import beyond_limits
+from crane.simulation.recorded import imbalance
+from crane.simulation.run import Progress, trajectory
+
+_Result = tuple[Array, Array, Array, Array, Array, str]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Batch(Brief):
+    """Results of B simulations of N instants with n active joints.
+
+    Attributes:
+        time: (N,) [s].
+        q: (B, N, n) active coordinates [m], [rad]; NaN where a simulation failed.
+        v: (B, N, n) their velocities [m/s], [rad/s].
+        tau: (B, N, n) active forces [N], [N m].
+        energy: (B, N, 4) kinetic, potential, work of the active forces, dissipated [J].
+        failures: Why a simulation failed, by its index.
+        warnings: What is doubtful about one that did not, by its index.
+    """
+
+    time: Array
+    q: Array
+    v: Array
+    tau: Array
+    energy: Array
+    failures: dict[int, str]
+    warnings: dict[int, str]
+
+
+def simulate_batch(
+    machines: Machine | Sequence[Machine],
+    controller: Callable[[Machine], Controller] | None = None,
+    initial: Sequence[ArrayLike | tuple[ArrayLike, ArrayLike] | None] | None = None,
+    duration: float | None = None,
+    step: float = 1e-3,
+    *,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Batch:
+    """Simulate many variants over threads; see `simulate` for what is computed.
+
+    Variants made by `Machine.replace` and `Machine.with_payload` share their machine code. A
+    variant that fails does not stop the others.
+
+    Args:
+        machines: B machines with the same active joints, or one for all initial states.
+        controller: Makes the controller of a machine; None for no force.
+        initial: B initial states as `simulate` takes them, or None for its default.
+        duration: [s]; that of the controller's path if not given.
+        step: [s].
+        threads: Number of threads; one per core if not given.
+        progress: Called with the finished share, 0 to 1.
+
+    Raises:
+        InputError: Lengths or active joints that do not go together.
+    """
+    if isinstance(machines, Machine):
+        machines = [machines] * (1 if initial is None else len(initial))
+    if not machines:
+        raise InputError("there are no machines, give at least one")
+    starts = [None] * len(machines) if initial is None else list(initial)
+    if len(starts) != len(machines):
+        raise InputError(
+            f"{len(machines)} machines and {len(starts)} initial states do not go together, give "
+            "one state per machine, or one machine"
+        )
+    active = machines[0].active
+    for i, machine in enumerate(machines):
+        if machine.active != active:
+            raise InputError(
+                f"machine {i} is driven at {', '.join(machine.active)}, the first one at "
+                f"{', '.join(active)}: simulate them apart"
+            )
+
+    beyond: dict[int, str] = {}
+
+    def run(i: int) -> _Result:
+        machine = machines[i]
+        control = None if controller is None else controller(machine)
+        path = getattr(control, "path", None)
+        if path is not None:
+            text = beyond_limits(machine, path, np.inf if duration is None else duration)
+            beyond.update({i: text} if text else {})
+        time, rows = trajectory(Dynamics(machine), control, starts[i], duration, step)
+        energy = np.hstack([rows.kinetic, rows.potential, rows.work, rows.lost])
+        q_a = rows.q[:, machine.closure.active]
+        return time, q_a, rows.v_a, rows.tau, energy, imbalance(rows, step)
+
+    results: dict[int, _Result] = {}
+    failures: dict[int, str] = {}
+    # one first, so that the others find their machine code made
+    waiting = list(range(len(machines)))
+    workers = threads or os.cpu_count() or 1
+    with ThreadPoolExecutor(workers) as pool:
+        for group in (waiting[:1], waiting[1:]):
+            futures = {pool.submit(run, i): i for i in group}
+            for future in as_completed(futures):
+                try:
+                    results[futures[future]] = future.result()
+                except CraneError as error:
+                    failures[futures[future]] = str(error)
+                if progress is not None:
+                    progress((len(results) + len(failures)) / len(machines))
+    if not results:
+        raise InputError(f"all {len(machines)} simulations failed, the first: {failures[0]}")
+    return _stack(results, failures, beyond, len(machines))
+
+
+def _stack(
+    results: dict[int, _Result],
+    failures: dict[int, str],
+    beyond: dict[int, str],
+    count: int,
+) -> Batch:
+    lengths = {len(result[0]) for result in results.values()}
+    if len(lengths) > 1:
+        raise InputError(
+            f"the paths give recordings of {sorted(lengths)} samples, give one duration for all"
+        )
+    first = next(iter(results.values()))
+    stacks = [np.full((count, *part.shape), np.nan) for part in first[1:5]]
+    for i, result in results.items():
+        for stack, part in zip(stacks, result[1:5], strict=True):
+            stack[i] = part
+    q, v, tau, energy = stacks
+    doubts = {}
+    for i in sorted(results):
+        if text := "; ".join(filter(None, (beyond.get(i, ""), results[i][5]))):
+            doubts[i] = text
+    return Batch(first[0], q, v, tau, energy, dict(sorted(failures.items())), doubts)

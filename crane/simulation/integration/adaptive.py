@@ -1,0 +1,93 @@
+"""Motion in time by scipy's adaptive methods."""
+
+from typing import Any
+
+import numpy as np
+
+from crane.common.errors import ClosureError
+from crane.common.samples import Array
+from crane.control import Controller
+from crane.dynamics import Dynamics
+from crane.simulation.integration.halt import HaltedError
+from crane.simulation.integration.stepwise import Progress, PythonStepper
+
+_FASTEST = (
+    300.0  # [rad/s], [m/s] of a passive joint: where the branch ends they grow beyond bounds
+)
+ADAPTIVE = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
+
+
+class AdaptiveSteps:
+    """An adaptive method with dense output, loops closed to rounding at the recorded instants.
+
+    Args:
+        dynamics: The machine.
+        control: Its controller.
+        own: Number of the controller's states.
+        method: One of `ADAPTIVE`.
+
+    Attributes:
+        slow: Observes.
+        done: Number of instants that have their row where it halted; none, it keeps no history.
+    """
+
+    done = 0
+
+    def __init__(self, dynamics: Dynamics, control: Controller, own: int, method: str):
+        self.slow = PythonStepper(dynamics, control, own)
+        self._closure, self._method = dynamics.machine.closure, method
+
+    def finer(self, times: Array, rows: Array, step: float) -> float:
+        """No step: the method has found the finest itself."""
+        return 0.0
+
+    def run(
+        self, times: Array, state: Array, step: float, rows: Array, progress: Progress = None
+    ) -> None:
+        """See `Steps.run`.
+
+        Raises:
+            HaltedError: The method gives up, or the loops cannot be closed any more.
+        """
+        from scipy.integrate import solve_ivp
+
+        closure, end = self._closure, times[0] + step * len(times)
+        view = self.slow.layout.view
+
+        def rate(time: float, state: Array) -> Array:
+            if progress is not None:
+                progress(int(min(max(time - times[0], 0.0) / step, len(times))))
+            return self.slow.observe(time, state)[0]
+
+        def calm(time: float, state: Array) -> float:
+            at = view(state)
+            try:
+                gamma = closure.gamma(at.q)[closure.passive]
+            except ClosureError:
+                return -_FASTEST
+            return _FASTEST - float(np.abs(gamma @ at.v_a).max(initial=0.0))
+
+        calm.terminal = True  # type: ignore[attr-defined]
+        method: Any = self._method
+        result: Any = solve_ivp(
+            rate, (times[0], end), state, method=method, t_eval=[*times, end],
+            rtol=1e-9, atol=1e-11, events=calm,
+        )  # fmt: skip
+        if result.status == 1:
+            q_a = view(result.y_events[0][0]).q[closure.active]
+            what = f" the motion explodes (a passive joint exceeds {_FASTEST:g} m/s or rad/s)"
+            raise HaltedError(result.t_events[0][0], q_a, what, ": look at its forces and gains")
+        if not result.success:
+            last = float(result.t[-1]) if len(result.t) else 0.0
+            q = view(result.y[:, -1] if len(result.t) else state).q
+            what = f" {self._method} gives up: {result.message.rstrip('.').lower()}"
+            raise HaltedError(last, q[closure.active], what, ", try another method")
+        for time, row, sample in zip([*times, end], [*rows, None], result.y.T, strict=False):
+            q = view(sample).q
+            try:
+                q[:] = closure.solve(q[closure.active], guess=q)
+            except ClosureError as error:
+                raise HaltedError(time, q[closure.active], f": {error}") from None
+            if row is not None:
+                row[:] = [*sample, *self.slow.observe(time, sample)[1]]
+        state[:] = result.y[:, -1]

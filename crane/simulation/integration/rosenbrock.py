@@ -1,0 +1,257 @@
+"""Steps of a Rosenbrock method in machine code, for stiff circuits."""
+
+import numpy as np
+
+from crane.closure.traced import Constants, folded
+from crane.codegen import Expression, Number, Program, Tape, largest, maximum, select
+from crane.codegen.derivative import derivatives
+from crane.codegen.factors import eliminated, loaded, stored, substituted
+from crane.codegen.scalar import add, apply, dot, minimum, scale, subtract, times
+from crane.common.samples import Array
+from crane.control import StiffController, Traced
+from crane.dynamics import Dynamics
+from crane.dynamics.traced import Sweep
+from crane.simulation.integration.state import seen_layout, state_layout
+
+# ROS34PW2 of Rang and Angermann (2005): order 3 with any Jacobian, L-stable, stiffly accurate,
+# with an embedded method of order 2.
+GAMMA = 4.3586652150845900e-01
+ALPHA = np.array([
+    [0.0, 0.0, 0.0, 0.0],
+    [8.7173304301691801e-01, 0.0, 0.0, 0.0],
+    [8.4457060015369423e-01, -1.1299064236484185e-01, 0.0, 0.0],
+    [0.0, 0.0, 1.0, 0.0],
+])  # fmt: skip
+LOWER = np.array([
+    [GAMMA, 0.0, 0.0, 0.0],
+    [-8.7173304301691801e-01, GAMMA, 0.0, 0.0],
+    [-9.0338057013044082e-01, 5.4180672388095326e-02, GAMMA, 0.0],
+    [2.4212380706095346e-01, -1.2232505839045147e00, 5.4526025533510214e-01, GAMMA],
+])  # fmt: skip
+WEIGHTS = np.array([2.4212380706095346e-01, -1.2232505839045147e00, 1.5452602553351020e00, GAMMA])
+EMBEDDED = np.array([3.7810903145819369e-01, -9.6042292212423178e-02, 0.5, 2.1793326075422950e-01])
+STAGES = len(WEIGHTS)
+
+_RELATIVE = 1e-8  # accuracy of a step, per size of the state
+_COORDINATE, _VELOCITY = 1e-11, 1e-9  # accuracy that matters [m], [rad], and per second
+_FASTER, _SLOWER, _SAFETY = 6.0, 0.2, 0.9  # change of the step's length from one to the next
+_SHORTEST = 1e-9  # part of a recorded step that is given up on
+_NEARLY = 1.0 - 2.0**-41  # of what is left of a recorded step: all of it
+
+
+class StiffStepper:
+    """Many steps at once in machine code, by a method that stiff circuits do not shorten.
+
+    y' = f(y) is stepped by ROS34PW2 with its own choice of length within each recorded step. The
+    Jacobian is exact for the controller's states and for what forces, friction and passive forces
+    do to the velocities, and zero for the rest (coordinates, centrifugal forces, integrals):
+    the order does not depend on it. In the transformed variables u = sum gamma_ij k_j, stage i
+    solves
+
+        (1 / (h gamma) - J) u_i = f(y + sum a_ij u_j) + sum c_ij / h u_j.
+
+    (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.7.)
+
+    Args:
+        dynamics: The machine.
+        control: Its controller.
+
+    Raises:
+        TooLongError: It would take too long to compile.
+    """
+
+    def __init__(self, dynamics: Dynamics, control: StiffController):
+        machine = dynamics.machine
+        self._fast, self._numbers = machine.closure.fast, dynamics.numbers
+        self._carriers, self._control = dynamics.carriers, control
+        self._state = state_layout(machine, len(control.scales))
+        self._seen = seen_layout(machine, control)
+        self._stiff = int(np.isfinite(control.scales).sum())
+        key = (
+            "stiff",
+            type(control),
+            control.columns,
+            folded(control.settings),
+            control.form,
+            folded(self._numbers),
+            dynamics.carriers,
+        )
+        if key not in self._fast.programs:
+            self._fast.programs[key] = self._compile()
+        self._program = self._fast.programs[key]
+        self._scales = np.concatenate(
+            [
+                np.full(self._state.parts["q"], 1.0 / _COORDINATE),
+                np.full(self._state.parts["v_a"], 1.0 / _VELOCITY),
+                1.0 / control.scales,
+            ]
+        )
+        self._lengths = np.zeros(2)
+
+    def run(self, times: Array, state: Array, step: float, out: Array) -> int:
+        """See `CompiledStepper.run`."""
+        halves = times[0] + 0.5 * step * np.arange(2 * len(times) + 1)
+        references = np.ascontiguousarray(self._control.references(halves))
+        settings = np.ascontiguousarray(self._control.settings)
+        if self._lengths[0] != step:
+            self._lengths[:] = step, 0.01 * step
+        return self._program.call(
+            "run", len(times), self._fast.close_address, self._fast.geometry.numbers,
+            self._numbers, settings, references, state, out, self._lengths, self._fast.bounds,
+            self._scales,
+        )  # fmt: skip
+
+    def _trace(self, tape: Tape, state: int, theta: int | None) -> tuple[Sweep, Traced]:
+        """The machine at a state, its references between three rows or in one."""
+        control = self._control
+        q, posture, loops = self._fast.trace(tape, 0, state)
+        parts = self._state.view(tape.loads(state, 0, self._state.size))
+        constants = Constants(tape, 1, self._numbers)
+        sweep = Sweep(posture, loops, constants, q, parts.v_a, self._carriers)
+        settings = Constants(tape, 2, control.settings).vector(0, len(control.settings))
+        rows = [tape.loads(3, control.columns * row, control.columns) for row in range(3)]
+        reference = rows[0]
+        if theta is not None:
+            # the parabola through the rows at 0, 1/2, 1
+            s = tape.load(theta, 0)
+            shares = ((2.0 * s - 1.0) * (s - 1.0), 4.0 * s * (1.0 - s), s * (2.0 * s - 1.0))
+            reference = [dot(shares, values) for values in zip(*rows, strict=True)]
+        return sweep, Traced(sweep, q, parts.v_a, parts.own, settings, reference)
+
+    def _compile(self) -> Program:
+        program, control = Program(), self._control
+        tape = Tape()
+        sweep, at = self._trace(tape, 5, 4)
+        tau, own_rate = control.trace(at)
+        a_a = sweep.forward(tau, friction=True)
+        powers = [dot(tau, at.v_a), sweep.dissipation]
+        program.add("rate", 6, [*sweep.rates[1:], *a_a, *own_rate, *powers])
+        tape = Tape()
+        sweep, at = self._trace(tape, 4, None)
+        tau, _ = control.trace(at)
+        seen = [*tau, *sweep.friction, sweep.kinetic, sweep.potential, *control.look(at)]
+        program.add("observe", 5, seen)
+        factors, mass = self._add_prepare(program)
+        self._add_sums(program, factors, mass)
+        self._add_run(program)
+        program.compile()
+        return program
+
+    def _add_run(self, program: Program) -> None:
+        """run: recorded steps of length h[0], each in as many parts as their error asks for.
+
+        h[1] is the length to try next.
+        """
+        size, seen, columns = self._state.size, self._seen.size, self._control.columns
+        names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds", "scales")
+        with program.routine("run", counts=("steps",), functions=("close",), arrays=names) as r:
+            following = r.array("following", program.outputs("finish"))
+            u = r.array("u", STAGES * size)
+            stage, slope = r.array("stage", size), r.array("slope", size)
+            factors = r.array("factors", program.outputs("prepare"))
+            result = r.array("result", self._fast.outputs("newton"))
+            theta, part = r.array("theta", 1), r.array("part", 1)
+            whole = r.let(r.h[0])
+            with r.loop(r.steps) as i:
+                refs, row = r.refs.row(i, 2 * columns), r.out.row(i, size + seen)
+                machine = (r.geometry, r.numbers, r.control, refs)
+                r.copy(row, r.state, size)
+                r.call("observe", *machine, r.state, row.at(size))
+                t = r.let(0.0)
+                with r.forever():
+                    left, proposed = r.let(whole - t), r.let(r.h[1])
+                    last = r.let(proposed >= left * _NEARLY)
+                    length = r.let(select(last, left, proposed))
+                    with r.when(~(length >= whole * _SHORTEST)):
+                        r.give(i)
+                    r.store(part, 0, length)
+                    r.store(theta, 0, t / whole)
+                    r.call("prepare", *machine, theta, r.state, part, factors)
+                    for k in range(STAGES):
+                        r.store(theta, 0, (t + length * float(ALPHA[k].sum())) / whole)
+                        r.call(f"combine{k}", r.state, u, stage)
+                        r.call("rate", *machine, theta, stage, slope)
+                        r.call(f"solve{k}", slope, u, factors, part, u.at(k * size))
+                    r.call("finish", r.state, u, r.scales, following)
+                    change = following["change"]
+                    wanted = r.let(length * select(change > 0.0, change, _SLOWER))  # NaN: slower
+                    with r.when(following["error"] <= 1.0):
+                        closed = r.call("close", r.geometry, following, result, r.bounds)
+                        with r.when(closed < 1):
+                            r.give(i)
+                        r.copy(r.state, following, size)
+                        # a last part that was cut short says nothing against the length it was
+                        # cut from
+                        r.store(r.h, 1, select(last & (proposed > wanted), proposed, wanted))
+                        r.set(t, t + length)
+                        with r.when(last):
+                            r.leave()
+                    with r.otherwise():
+                        r.store(r.h, 1, wanted)
+            r.give(r.steps)
+
+    def _add_prepare(self, program: Program) -> tuple[list[list[Number]], list[list[Number]]]:
+        """prepare(..., h): elimination of 1 - h gamma J, rows of the velocities times M_A."""
+        tape = Tape()
+        sweep, at = self._trace(tape, 5, 4)
+        tau, own_rate = self._control.trace(at)
+        net = subtract(add(tau, sweep.passive), sweep.friction)
+        unknown = [x for x in (*at.state[: self._stiff], *at.v_a) if isinstance(x, Expression)]
+        jacobian = derivatives([*own_rate[: self._stiff], *net], unknown)
+        reach = GAMMA * tape.load(6, 0)
+        matrix = [[-1.0 * (reach * entry) for entry in row] for row in jacobian]
+        for i in range(self._stiff):
+            matrix[i][i] = matrix[i][i] + 1.0
+        for i, row in enumerate(sweep.mass):
+            for j, entry in enumerate(row):
+                at_row = matrix[self._stiff + i]
+                at_row[self._stiff + j] = at_row[self._stiff + j] + entry
+        factors = eliminated(matrix)
+        program.add("prepare", 7, {"factors": stored(factors), "mass": stored(sweep.mass)})
+        return factors, sweep.mass
+
+    def _add_sums(
+        self, program: Program, factors: list[list[Number]], mass: list[list[Number]]
+    ) -> None:
+        """combine(s, u), solve(rate, u, factors, h) of each stage, and finish(s, u, scales)."""
+        inverse = np.tril(np.linalg.inv(LOWER))  # rounding above would read what is not there
+        forward = ALPHA @ inverse
+        backward = np.diag(np.diag(inverse)) - inverse
+        final, second = WEIGHTS @ inverse, EMBEDDED @ inverse
+        size, stiff = self._state.size, self._stiff
+
+        def mixed(tape: Tape, array: int, weights: Array) -> list[Number]:
+            out: list[Number] = [0.0] * size
+            for j, weight in enumerate(weights):
+                if weight:
+                    out = add(out, scale(float(weight), tape.loads(array, j * size, size)))
+            return out
+
+        for i in range(STAGES):
+            tape = Tape()
+            state = tape.loads(0, 0, size)
+            program.add(f"combine{i}", 2, add(state, mixed(tape, 1, forward[i])))
+            tape = Tape()
+            right = scale(GAMMA * tape.load(3, 0), tape.loads(0, 0, size))
+            right = add(right, scale(GAMMA, mixed(tape, 1, backward[i])))
+            there = loaded(factors, tape, 2, 0)
+            inertia = loaded(mass, tape, 2, program.outputs("prepare").start("mass"))
+            part = self._state.view(right)
+            x = substituted(there, [*part.own[:stiff], *times(inertia, part.v_a)])
+            own = [*x[:stiff], *part.own[stiff:]]
+            program.add(f"solve{i}", 4, [*part.q, *x[stiff:], *own, *part.work, *part.lost])
+        tape = Tape()
+        state = tape.loads(0, 0, size)
+        after = add(state, mixed(tape, 1, final))
+        gap = mixed(tape, 1, final - second)
+        used = self._state.start("own") + stiff
+        shares = [
+            gap[i] / (1.0 / tape.load(2, i) + _RELATIVE * apply("abs", after[i]))
+            for i in range(used)
+        ]
+        # the integrals count only so far as that NaN and infinity anywhere show
+        error = maximum(largest(shares), largest(scale(1e-30, gap[used:])))
+        usable = minimum(maximum(error, 1e-9), 1e9)
+        change = _SAFETY * apply("exp", (-1.0 / 3.0) * apply("log", usable))
+        change = minimum(maximum(change, _SLOWER), _FASTER)
+        program.add("finish", 3, {"state": after, "error": [error], "change": [change]})

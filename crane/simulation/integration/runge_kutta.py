@@ -1,0 +1,136 @@
+"""Steps of the classical Runge-Kutta method in machine code."""
+
+import numpy as np
+
+from crane.closure.traced import Constants, folded
+from crane.codegen import Program, Tape, largest
+from crane.codegen.scalar import add, dot, scale
+from crane.common.samples import Array
+from crane.control import Traced, TracedController
+from crane.dynamics import Dynamics
+from crane.dynamics.traced import Sweep
+from crane.simulation.integration.state import seen_layout, state_layout
+
+
+class CompiledStepper:
+    """Many steps at once in machine code, with a controller that is traced along.
+
+    Args:
+        dynamics: The machine.
+        control: Its controller.
+        states: Number of the controller's states.
+
+    Raises:
+        TooLongError: It would take too long to compile.
+    """
+
+    def __init__(self, dynamics: Dynamics, control: TracedController, states: int):
+        machine = dynamics.machine
+        self._fast, self._numbers = machine.closure.fast, dynamics.numbers
+        self._carriers = dynamics.carriers
+        self._control = control
+        self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
+        key = (
+            type(control),
+            control.columns,
+            len(control.settings),
+            states,
+            folded(self._numbers),
+            dynamics.carriers,
+        )
+        if key not in self._fast.programs:
+            self._fast.programs[key] = self._compile()
+        self._program = self._fast.programs[key]
+
+    def _compile(self) -> Program:
+        program, control = Program(), self._control
+        for name in ("observe", "rate"):
+            tape = Tape()
+            q, posture, loops = self._fast.trace(tape, 0, 4)
+            at = self._state.view(tape.loads(4, 0, self._state.size))
+            constants = Constants(tape, 1, self._numbers)
+            sweep = Sweep(posture, loops, constants, q, at.v_a, self._carriers)
+            settings = tape.loads(2, 0, len(control.settings))
+            reference = tape.loads(3, 0, control.columns)
+            tau, own_rate = control.trace(Traced(sweep, q, at.v_a, at.own, settings, reference))
+            a_a = sweep.forward(tau, friction=True)
+            powers = [dot(tau, at.v_a), sweep.dissipation]
+            outputs = {"rate": [*sweep.rates[1:], *a_a, *own_rate, *powers]}
+            if name == "observe":
+                outputs["seen"] = [*tau, *sweep.friction, sweep.kinetic, sweep.potential]
+            program.add(name, 5, outputs)
+        self._add_sums(program)
+        self._add_run(program)
+        program.compile()
+        return program
+
+    def _add_run(self, program: Program) -> None:
+        """run: steps, each recorded before it is made, until one needs a closer look."""
+        size, seen, columns = self._state.size, self._seen.size, self._control.columns
+        names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds")
+        with program.routine("run", counts=("steps",), functions=("close",), arrays=names) as r:
+            following = r.array("following", program.outputs("finish"))
+            k1 = r.array("k1", program.outputs("observe"))
+            k2, k3, k4 = (r.array(f"k{i}", size) for i in (2, 3, 4))
+            result = r.array("result", self._fast.outputs("newton"))
+            machine, half = (r.geometry, r.numbers, r.control), r.h.at(1)
+            with r.loop(r.steps) as i:
+                first = r.refs.row(i, 2 * columns)
+                middle, last = first.at(columns), first.at(2 * columns)
+                r.call("observe", *machine, first, r.state, k1)
+                row = r.out.row(i, size + seen)
+                r.copy(row, r.state, size)
+                r.copy(row.at(size), k1.at("seen"), seen)
+                r.call("blend", r.state, k1, half, following)
+                r.call("rate", *machine, middle, following, k2)
+                r.call("blend", r.state, k2, half, following)
+                r.call("rate", *machine, middle, following, k3)
+                r.call("blend", r.state, k3, r.h, following)
+                r.call("rate", *machine, last, following, k4)
+                r.call("finish", r.state, k1, k2, k3, k4, r.h, following)
+                with r.when(~(following["move"] < 1.0)):
+                    r.give(i)
+                closed = r.call("close", r.geometry, following, result, r.bounds)
+                with r.when(closed < 1):
+                    r.give(i)
+                r.copy(r.state, following, size)
+            r.give(r.steps)
+
+    def run(self, times: Array, state: Array, step: float, out: Array) -> int:
+        """Steps from the first of `times` on, one row of `out` before each.
+
+        Args:
+            times: (steps,) [s].
+            state: The state at the first time; replaced by that after the last step done.
+            step: [s].
+            out: (steps, size + seen), state and observations at each of the times.
+
+        Returns:
+            How many steps were done; the one after them needs a closer look.
+        """
+        halves = times[0] + 0.5 * step * np.arange(2 * len(times) + 1)
+        references = np.ascontiguousarray(self._control.references(halves))
+        settings = np.ascontiguousarray(self._control.settings)
+        steps = np.array([step, 0.5 * step])
+        return self._program.call(
+            "run", len(times), self._fast.close_address, self._fast.geometry.numbers,
+            self._numbers, settings, references, state, out, steps, self._fast.bounds,
+        )  # fmt: skip
+
+    def _add_sums(self, program: Program) -> None:
+        """blend(s, k, h) = s + h k; finish(s, k1, k2, k3, k4, h) = s + h/6 (...), largest move."""
+        size, coordinates = self._state.size, self._state["q"]
+        tape = Tape()
+        state, rate = tape.loads(0, 0, size), tape.loads(1, 0, size)
+        program.add("blend", 3, add(state, scale(tape.load(2, 0), rate)))
+        tape = Tape()
+        state = tape.loads(0, 0, size)
+        k1, k2, k3, k4 = (tape.loads(array, 0, size) for array in range(1, 5))
+        h = tape.load(5, 0)
+        mean = add(k1, scale(2.0, add(k2, k3)), k4)
+        after = add(state, scale(h * (1.0 / 6.0), mean))
+        # the largest of all changes, so that NaN and infinity anywhere show
+        move = h * largest(
+            [*k1[coordinates], *k2[coordinates], *k3[coordinates], *scale(1e-9, mean)]
+        )
+        program.add("finish", 6, {"state": after, "move": [move]})

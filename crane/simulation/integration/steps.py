@@ -1,0 +1,91 @@
+"""Steps of a fixed length by the classical Runge-Kutta method."""
+
+from contextlib import suppress
+
+import numpy as np
+
+from crane.codegen import TooLongError, carefully
+from crane.common.samples import Array
+from crane.control import Controller, StiffController, TracedController
+from crane.dynamics import Dynamics
+from crane.simulation.integration.halt import HaltedError
+from crane.simulation.integration.runge_kutta import CompiledStepper
+from crane.simulation.integration.stepwise import Progress, PythonStepper
+
+_CHUNK = 1000  # steps between reports of progress
+_BACK, _AHEAD = 40, 20  # steps before and after a halt that are done anew with finer ones
+_FINER = (2, 8)  # how much finer
+
+
+class Steps:
+    """Runge-Kutta steps in machine code, with care where that stops.
+
+    Args:
+        dynamics: The machine.
+        control: Its controller.
+        own: Number of the controller's states.
+
+    Attributes:
+        slow: Makes a step with care, or says why it cannot.
+        done: Number of instants that have their row, after a run or where it halted.
+    """
+
+    def __init__(self, dynamics: Dynamics, control: Controller, own: int):
+        self.slow = PythonStepper(dynamics, control, own)
+        self.done = 0
+        self._fast: CompiledStepper | None = None
+        if isinstance(control, StiffController) or dynamics.path != "compiled":
+            return
+        if isinstance(control, TracedController):
+            with suppress(TooLongError):
+                self._fast = CompiledStepper(dynamics, control, own)
+
+    def run(
+        self, times: Array, state: Array, step: float, rows: Array, progress: Progress = None
+    ) -> None:
+        """Integrate from each of the times to the next.
+
+        Args:
+            times: (N,) instants [s].
+            state: At the first; replaced by that a step after the last.
+            step: [s].
+            rows: (N, .), filled with state and observations at the instants.
+            progress: Called with the number of finished steps.
+
+        Raises:
+            HaltedError: A step cannot be taken.
+        """
+        fast, size = self._fast, len(state)
+        self.done = 0
+
+        def quick(first: int, beyond: int) -> int:
+            assert fast is not None
+            return fast.run(times[first:beyond], state, step, rows[first:])
+
+        def careful(i: int) -> None:
+            self.done = i + 1
+            rows[i, :size] = state
+            rate, rows[i, size:] = self.slow.observe(times[i], state)
+            state[:] = self.slow.advance(times[i], state, rate, step)
+
+        carefully(len(times), quick if fast else None, careful, _CHUNK, progress)
+        self.done = len(times)
+
+    def finer(self, times: Array, rows: Array, step: float) -> float:
+        """A step [s] with which the motion goes on where it halted; 0 if none was found.
+
+        Arguments as those of the run that halted.
+        """
+        done = self.done
+        back, beyond = max(0, done - _BACK), min(done + _AHEAD, len(times))
+        for share in _FINER:
+            part = step / share
+            again = times[back] + part * np.arange(share * (beyond - back))
+            state = rows[back, : self.slow.layout.size].copy()
+            with suppress(HaltedError):
+                self.run(again, state, part, np.empty((len(again), rows.shape[1])))
+                self.slow.observe(again[-1] + part, state)
+                self.done = done
+                return part
+        self.done = done
+        return 0.0

@@ -1,0 +1,306 @@
+"""Measured valve signals put through the model, and what comes out beside what was measured."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from crane.common.errors import CraneWarning, InputError, RecordingError, at, known
+from crane.common.samples import Array, Brief, as_number
+from crane.control import Signals, ValveDrive
+from crane.machine import Machine
+from crane.recordings import timeseries
+from crane.recordings.measured import (
+    check_pressures,
+    column,
+    motion_of,
+    moved_locks,
+    tell_disagreement,
+)
+from crane.recordings.recording import (
+    FORCE,
+    FORCE_UNITS,
+    VELOCITY,
+    VELOCITY_UNITS,
+    Recording,
+    derivative,
+)
+from crane.recordings.timeseries import TIME, Table, check_unit, spellings
+from crane.simulation.run import Progress, simulate
+
+_SIGNAL, _SUPPLY, _TANK = "voltage_", "pressure_supply", "pressure_tank"
+_FIRST, _LONGEST = 0.1, 1.0  # over which the start is fitted, and a rest looked for [s]
+_FEWEST = 5  # samples of that fit
+_BEYOND = 0.01  # of a range, beyond a limit, that noise does not explain
+_RESTS = 1e-12  # variation of a channel that is rounding, per its size
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Channel(Brief):
+    """One channel, measured and simulated at the measured instants.
+
+    Attributes:
+        name: Of the column.
+        unit: Its unit.
+        measured: (N,).
+        simulated: (N,).
+    """
+
+    name: str
+    unit: str
+    measured: Array
+    simulated: Array
+
+    @property
+    def rms(self) -> float:
+        """Root of the mean square of the difference, in the channel's unit."""
+        return float(np.sqrt(np.mean((self.simulated - self.measured) ** 2)))
+
+    @property
+    def relative(self) -> float:
+        """The same over that of the measured channel about its mean; infinite if that rests."""
+        spread = float(np.std(self.measured))
+        if spread < _RESTS * float(np.abs(self.measured).max()):
+            spread = 0.0
+        return self.rms / spread if spread > 0 else (0.0 if self.rms == 0 else np.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A recording beside the simulation of the same inputs.
+
+    Attributes:
+        time: Instants (N,) [s] from the start.
+        channels: What both hold.
+    """
+
+    time: Array
+    channels: tuple[Channel, ...]
+
+    def __repr__(self) -> str:
+        """How long, and what is compared."""
+        return (
+            f"Comparison over {self.time[-1] - self.time[0]:.6g} s in {len(self.time)} samples: "
+            + ", ".join(channel.name for channel in self.channels)
+        )
+
+    def to_markdown(self) -> str:
+        """A table with a row per channel."""
+        lines = [
+            "| channel | unit | RMS error | relative to its variation |",
+            "|---|---|---:|---:|",
+        ]
+        lines += [
+            f"| {x.name} | {x.unit} | {x.rms:.4g} | {100 * x.relative:.2f} % |"
+            for x in self.channels
+        ]
+        return "\n".join(lines) + "\n"
+
+
+def replay(
+    machine: Machine, path: str | Path, step: float = 1e-3, progress: Progress | None = None
+) -> tuple[Recording, Comparison]:
+    """Simulate a hydraulic machine with measured valve signals.
+
+    The file has a column voltage_X [V] for every valve that was moved, pressures of pump and tank
+    where they were measured (pressure_supply, pressure_tank), and whatever else is to be compared:
+    strokes or angles, velocities, pressures (see `crane.recordings.measured`). The simulation
+    starts from the measured posture and velocity, at rest or fitted over the first tenth of a
+    second, and from the measured pressures; where the file does not tell, from the home posture at
+    rest, and from what holds it.
+
+    Args:
+        machine: The machine.
+        path: A CSV or npz file.
+        step: Of the simulation [s].
+        progress: Called with the finished share, 0 to 1.
+
+    Returns:
+        The simulated recording, and its comparison with the file.
+
+    Raises:
+        RecordingError: The file is malformed, or has no signals.
+        InputError: The machine has no valves.
+    """
+    step = as_number(step, "the step", "s", above=0)
+    table = timeseries.read(path)
+    try:
+        time, drive, initial = _prepare(machine, table)
+    except RecordingError as error:
+        raise RecordingError(at(str(path), error)) from None
+    steps = int(time[-1] / step + 1e-9)
+    if steps < 1:
+        raise RecordingError(f"{path}: is shorter than a step of {step:g} s, shorten the step")
+    task = Path(path).stem
+    recording = simulate(machine, drive, initial, steps * step, step, task=task, progress=progress)
+    try:
+        return recording, compare(table, recording)
+    except RecordingError as error:
+        raise RecordingError(at(str(path), error)) from None
+
+
+def compare(table: Table, recording: Recording) -> Comparison:
+    """Channels that a file and a simulation both hold, but for the inputs.
+
+    Args:
+        table: What was measured.
+        recording: What was simulated from the same instant on.
+
+    Raises:
+        RecordingError: A channel of the file is in a unit of something else.
+    """
+    time = column(table, TIME)
+    time = time - time[0]
+    inside = time <= recording.time[-1] * (1 + 1e-12)
+    columns = recording.columns()
+    units = recording.units | recording.channel_units
+    units |= {x + VELOCITY: VELOCITY_UNITS[unit] for x, unit in recording.units.items()}
+    units |= {x + FORCE: FORCE_UNITS[unit] for x, unit in recording.units.items()}
+    for name, unit in table.units.items():
+        if name in units:
+            check_unit(name, unit, spellings(units[name]))
+    found = [
+        Channel(
+            name,
+            table.units[name],
+            column(table, name)[inside],
+            np.interp(time[inside], recording.time, columns[name]),
+        )
+        for name in table.units
+        if name in columns and name not in (TIME, _SUPPLY, _TANK) and not name.startswith(_SIGNAL)
+    ]
+    return Comparison(time[inside], tuple(found))
+
+
+def _prepare(
+    machine: Machine, table: Table
+) -> tuple[Array, ValveDrive, tuple[Array, Array] | None]:
+    """Time from zero, the valves' drive, and the state at the start."""
+    joints = machine.hydraulics.joints if machine.hydraulics else ()
+    if not joints:
+        raise InputError(
+            f"machine '{machine.name}' has no valves, describe its circuit under 'hydraulics' of "
+            "the machine file"
+        )
+    time = column(table, TIME)
+    time = time - time[0]
+    if len(time) < 2:
+        raise RecordingError("has one sample, give at least two")
+    signals = {}
+    for name in table.units:
+        if name.startswith(_SIGNAL):
+            joint = name.removeprefix(_SIGNAL)
+            if joint in machine.locks:
+                continue  # the valve of a joint that is held moves nothing
+            if joint not in joints:
+                raise RecordingError(f"column '{name}' is of no valve, {known(joints, joint)}")
+            signals[joint] = column(table, name, "V")
+    if not signals:
+        names = ", ".join(f"'{_SIGNAL}{joint} [V]'" for joint in joints)
+        raise RecordingError(f"no signal of a valve, give at least one of {names}")
+    check_pressures(machine, table)
+    supply, tank = (
+        column(table, name, "Pa") if name in table.units else None for name in (_SUPPLY, _TANK)
+    )
+    pressures: dict[str, tuple[float, float]] = {}
+    for joint in joints:
+        pair = [f"pressure_{joint}_{side}" for side in "ab"]
+        there = [name for name in pair if name in table.units]
+        if len(there) == 1:
+            missing = pair[pair[0] in there]
+            raise RecordingError(f"'{missing}' is missing beside '{there[0]}', add or remove one")
+        if there:
+            a, b = (float(column(table, name)[0]) for name in pair)
+            pressures[joint] = a, b
+    drive = ValveDrive(machine, Signals(machine, time, signals, supply, tank), pressures)
+    initial = None
+    if any(joint in table.units for joint in machine.joints):
+        for text in moved_locks(machine, _columns(table), table.units):
+            raise RecordingError(f"{text}, do not lock it, or lock it where it is")
+        tell_disagreement(machine, table)
+        q_a, v_a = motion_of(machine, table)
+        _warn_of_limits(machine, time, q_a)
+        steady = time <= _steady(time, list(signals.values()))
+        states = []
+        for i, joint in enumerate(machine.active):
+            rates = joint + VELOCITY in table.units or joint not in table.units
+            states.append(_start(time, q_a[:, i], v_a[:, i] if rates else None, steady))
+        initial = np.array([x for x, _ in states]), np.array([v for _, v in states])
+    return time, drive, initial
+
+
+def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
+    """Warn of measured coordinates (N, n) where the simulated machine cannot be."""
+    span = machine.upper - machine.lower
+    excess = np.maximum(machine.lower - q_a, q_a - machine.upper)
+    excess /= np.where(np.isfinite(span), span, 1.0)
+    for i, joint in enumerate(machine.active):
+        k = int(np.argmax(excess[:, i]))
+        if excess[k, i] > _BEYOND:
+            limit = machine.lower[i] if q_a[k, i] < machine.lower[i] else machine.upper[i]
+            unit = machine.unit(joint)
+            warnings.warn(
+                f"measured '{joint}' goes to {q_a[k, i]:.6g} {unit} at t = {time[k]:.4g} s, "
+                f"beyond its limit {limit:.6g} {unit}: look at the limits and the sensor's zero",
+                CraneWarning,
+                stacklevel=4,
+            )
+
+
+def _columns(table: Table) -> dict[str, Array]:
+    return dict(zip(table.units, table.values.T, strict=True))
+
+
+def _steady(time: Array, signals: list[Array]) -> float:
+    """Until when no valve is moved [s], within bounds."""
+    moved = [np.abs(x - x[0]) > 1e-9 * max(float(np.ptp(x)), 1e-300) for x in signals]
+    first = min(float(time[x.argmax()]) if x.any() else np.inf for x in moved)
+    least = float(time[min(_FEWEST, len(time)) - 1])
+    return max(min(first, _LONGEST), _FIRST, least)
+
+
+def _start(time: Array, x: Array, v: Array | None, steady: np.ndarray) -> tuple[float, float]:
+    """Coordinate and velocity of a joint at the first sample, from all samples near it.
+
+    At rest, if over the stretch that is steady a straight line rises by no more than three times
+    what is left about it. Else by parabolas, see `_first`: of velocities (N,) where they were
+    recorded, else of the coordinates.
+    """
+    near, place = time[steady], x[steady]
+    if len(x) < _FEWEST:
+        return float(x[0]), float(derivative(x, time)[0] if v is None else v[0])
+    line = np.polyfit(near, place, 1)
+    left = float(np.std(place - np.polyval(line, near)))
+    if abs(line[0]) * (near[-1] - near[0]) <= 3 * left or np.ptp(place) == 0:
+        return float(place.mean()), 0.0
+    return _first(time, x, 0), _first(time, x, 1) if v is None else _first(time, v, 0)
+
+
+def _first(time: Array, x: Array, order: int) -> float:
+    """Value (order 0) or rate (1) at the first sample, of parabolas over ever longer stretches.
+
+    Longer ones have less noise, as long as they agree with all shorter ones within two standard
+    deviations of both (Lepski 1990).
+    """
+    lowest, highest, found = -np.inf, np.inf, 0.0
+    if order == 0 and len(x) > _FEWEST:  # the sample itself, its noise by third differences
+        std = float(np.sqrt(np.mean(np.diff(x[time <= time[0] + _FIRST], 3) ** 2) / 20))
+        found, lowest, highest = float(x[0]), x[0] - 2 * std, x[0] + 2 * std
+    count, last = _FEWEST, np.searchsorted(time, time[0] + _FIRST, side="right")
+    while count <= max(last, _FEWEST):
+        value, std = _parabola(time[:count], x[:count], order)
+        if value + 2 * std < lowest or value - 2 * std > highest:
+            break
+        lowest, highest = max(lowest, value - 2 * std), min(highest, value + 2 * std)
+        found, count = value, count + max(1, count // 2)
+    return found
+
+
+def _parabola(time: Array, x: Array, order: int) -> tuple[float, float]:
+    """Value or rate of a parabola at the first instant, and its standard deviation."""
+    A = np.vander(time - time[0], 3)
+    values, *_ = np.linalg.lstsq(A, x, rcond=None)
+    spread = float(np.sum((x - A @ values) ** 2)) / (len(x) - 3)
+    std = np.sqrt(spread * np.diag(np.linalg.pinv(A.T @ A)))
+    return float(values[2 - order]), float(std[2 - order])

@@ -1,0 +1,164 @@
+"""What a page computes postures from: the tree of joints, and their coordinates per frame.
+
+A page holds no poses. Its script computes them as Pinocchio does, from the root outwards,
+
+    oM_i = oM_parent(i)  placement_i  exp(S_i q_i),
+
+S_i being the joint's unit axis, which it turns about or slides along.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pinocchio as pin
+
+from crane.common.errors import InputError, RecordingError, known
+from crane.common.samples import Array
+from crane.machine import Machine
+from crane.view.page.arrays import packed, quantised
+
+if TYPE_CHECKING:
+    from crane.recordings.recording import Recording
+
+FPS = 30.0
+MOST_FRAMES = 36_000  # twenty minutes at full rate; longer recordings get fewer per second
+
+
+def tree(machine: Machine) -> dict[str, Any]:
+    """Joints, bodies' masses and link frames for the script; matrices column by column.
+
+    Returns:
+        joints in the order of q, each after its parent; -1 is the world.
+    """
+    model = machine.model
+    joints = []
+    for i in range(1, model.njoints):
+        axis = np.ravel(model.joints[i].createData().S)
+        turns = machine.unit(model.names[i]) == "rad"
+        joints.append(
+            {
+                "name": model.names[i],
+                "parent": model.parents[i] - 1,
+                "column": machine.column(model.names[i]),
+                "placement": matrix(model.jointPlacements[i]),
+                "type": "revolute" if turns else "prismatic",
+                "axis": axis[3:].tolist() if turns else axis[:3].tolist(),
+                "mass": model.inertias[i].mass,
+                "lever": model.inertias[i].lever.tolist(),
+            }
+        )
+    links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+    return {"joints": joints, "links": {link: place(machine, link) for link in links}}
+
+
+def place(machine: Machine, link: str) -> dict[str, Any]:
+    """Where a link's frame is: its joint, and its pose in the joint's frame."""
+    frame = machine.model.frames[machine.frame(link)]
+    return {"joint": frame.parentJoint - 1, "placement": matrix(frame.placement)}
+
+
+def matrix(pose: pin.SE3) -> list[float]:
+    """A pose as 16 numbers, column by column."""
+    values: list[float] = pose.homogeneous.ravel("F").tolist()
+    return values
+
+
+def payload_place(machine: Machine) -> dict[str, Any] | None:
+    """Where the centre of mass of the machine's payload is; None without one."""
+    model = machine.model
+    loads = [chain for chain in machine.chains if chain.name == "payload"]
+    if not loads:
+        there = any(f.name == "payload" and f.type == pin.FrameType.BODY for f in model.frames)
+        return place(machine, "payload") if there else None
+    total, moment, joint = 0.0, np.zeros(3), 0
+    below, waiting = machine.tree.below(), [machine.tree.joints[loads[0].attachment].child]
+    while waiting:
+        link = waiting.pop()
+        waiting += [joint.child for joint in below.get(link, ())]
+        frame = model.frames[machine.frame(link)]
+        joint = frame.parentJoint
+        if (inertial := machine.tree.links[link].inertial) is not None:
+            total += inertial.mass
+            moment += inertial.mass * frame.placement.act(np.array(inertial.com))
+    if not total:
+        return None
+    return {"joint": joint - 1, "placement": matrix(pin.SE3(np.eye(3), moment / total))}
+
+
+def frame_rows(time: Array) -> np.ndarray:
+    """Rows of the samples that are frames: 30 per second, of a long recording fewer."""
+    span = float(time[-1] - time[0])
+    return decimate(time, min(FPS, MOST_FRAMES / span) if span else FPS)
+
+
+def decimate(time: Array, fps: float) -> np.ndarray:
+    """Rows of the samples nearest to the frames of a film, the first and the last among them.
+
+    Args:
+        time: (N,) increasing [s].
+        fps: Frames per second.
+    """
+    wanted = np.arange(time[0], time[-1], 1 / fps)
+    nearest = np.searchsorted((time[1:] + time[:-1]) / 2, wanted)
+    return np.unique(np.append(nearest, len(time) - 1))
+
+
+def motion(time: Array, q: Array) -> dict[str, Any]:
+    """Frames for the script: times (N,) [s] and postures (N, nq)."""
+    return {"time": packed(time, "f8"), "q": [quantised(column) for column in q.T]}
+
+
+def check_joints(machine: Machine, recording: "Recording") -> None:
+    """See that a recording is of this machine.
+
+    Raises:
+        RecordingError: It lacks an active joint, has one that the machine does not have, or one
+            in another unit.
+    """
+    for joint in machine.active:
+        if joint not in recording.joints:
+            raise RecordingError(
+                f"the recording has no joint '{joint}', which drives {machine.name}, "
+                f"{known(recording.joints, joint)}"
+            )
+    for joint in recording.joints:
+        if joint not in machine.joints:
+            raise RecordingError(
+                f"the recording has a joint '{joint}' that {machine.name} does not have, "
+                f"{known(machine.joints, joint)}"
+            )
+        if recording.units[joint] != machine.unit(joint):
+            raise RecordingError(
+                f"'{joint}' is recorded in {recording.units[joint]}, in {machine.name} it is in "
+                f"{machine.unit(joint)}: give a recording of this machine"
+            )
+
+
+def postures(machine: Machine, recording: "Recording", rows: np.ndarray) -> Array:
+    """(len(rows), nq) closed postures of some samples of a recording.
+
+    Raises:
+        RecordingError: It is of a machine with other joints.
+        ClosureError: The loops cannot be closed.
+        InputError: A coordinate is not finite.
+    """
+    check_joints(machine, recording)
+    columns = {joint: recording.q[rows, i] for i, joint in enumerate(recording.joints)}
+    q = np.empty((len(rows), machine.model.nq))
+    if all(joint in columns or _recorded(machine, recording, joint) for joint in machine.joints):
+        for joint in machine.joints:
+            column = columns[joint] if joint in columns else recording.channels[joint][rows]
+            q[:, machine.column(joint)] = column
+    else:
+        q_a = np.column_stack([columns[joint] for joint in machine.active])
+        q = machine.closure.solve(q_a)
+    for joint in machine.joints:
+        if not np.isfinite(q[:, machine.column(joint)]).all():
+            raise InputError(f"joint '{joint}' is not finite, check the recording")
+    return q
+
+
+def _recorded(machine: Machine, recording: "Recording", joint: str) -> bool:
+    """Whether the channel of a passive joint is there, in the joint's unit or in none."""
+    unit = recording.channel_units.get(joint)
+    return unit is not None and unit in ("", machine.unit(joint))

@@ -1,0 +1,288 @@
+"""A recording as one figure: displacements, velocities and forces, and the path of the tip."""
+
+import itertools
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from string import ascii_lowercase
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import FixedLocator, MaxNLocator
+from mpl_toolkits.mplot3d import Axes3D
+
+from crane.common.errors import OutputError
+from crane.common.output import replacing
+from crane.common.samples import Array
+from crane.common.units import reading
+from crane.recordings.recording import FORCE_UNITS, Recording
+from crane.recordings.summary import points, subject, title
+from crane.view.plots.text import plain
+from crane.view.plots.thinning import envelope, thinned
+
+FORMATS: dict[str, dict[str, None] | None] = {  # with the date left out of what is written
+    "png": None,
+    "svg": {"Date": None},
+    "pdf": {"CreationDate": None},
+}
+DASHED: Any = {"color": "#e0701a", "linestyle": (0, (4, 2)), "linewidth": 1.1}
+RECORDED, INK, FAINT = "#1f5fa8", "#333333", "#d4d4d4"
+STYLE: Any = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.5,
+    "mathtext.fontset": "dejavusans",
+    "axes.titlesize": 10,
+    "axes.labelsize": 8.5,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "grid.color": FAINT,
+    "grid.linewidth": 0.5,
+    "lines.linewidth": 1.4,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "legend.frameon": False,
+    "pdf.fonttype": 42,
+    "svg.hashsalt": "crane",
+}
+# Distances of words from the axes of a box [points], of which matplotlib adds the last by itself.
+TICK_OFFSET, LABEL_OFFSET, PAD_OFFSET = 8.0, 14.0, 8.0
+MOST_COLUMNS = 5  # joints beside each other
+# Least height of an axis [SI], so that rounding noise of a joint at rest looks like rest.
+LEAST_SPAN = {
+    "rad": 3e-3, "m": 2e-4, "rad/s": 3e-3, "m/s": 2e-4, "N m": 0.02, "N": 0.2, "Pa": 1e4,
+    "m3/s": 1e-7, "V": 0.01,
+}  # fmt: skip
+# Rows of a hydraulic machine: quantity, unit, channels of a joint by what a line is called.
+HYDRAULIC_ROWS = (
+    ("pressure", "Pa", {"A": "pressure_{}_a", "B": "pressure_{}_b", "supply": "pressure_supply"}),
+    ("flow", "m3/s", {"A": "flow_{}_a", "B": "flow_{}_b"}),
+    ("signal", "V", {"recording": "voltage_{}"}),
+)
+LINES: Mapping[str, Any] = {
+    "recording": {"color": RECORDED},
+    "A": {"color": RECORDED},
+    "B": {"color": "#2a8c4a"},
+    "supply": {"color": "#a8a8a8", "linewidth": 1.0},
+    "reference": DASHED,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Panel:
+    """One quantity of one joint over time [SI]: lines (N,) by what they are called."""
+
+    quantity: str
+    unit: str
+    lines: dict[str, Array]
+
+
+def plot_recording(recording: Recording, path: str | Path) -> None:
+    """Write the figure of a recording to a file.
+
+    Args:
+        recording: What to show.
+        path: Where to write; its suffix .png, .svg or .pdf chooses the format.
+
+    Raises:
+        OutputError: The suffix is another one, or the file cannot be written.
+    """
+    write_figure(path, lambda: recording_figure(recording))
+
+
+def write_figure(path: str | Path, draw: Callable[[], Figure]) -> None:
+    """Draw a figure into a file whose suffix is a known format; see `plot_recording`."""
+    path = Path(path)
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in FORMATS:
+        raise OutputError(f"{path}: unknown kind of picture, end the name in .png, .svg or .pdf")
+    figure = draw()
+    with mpl.rc_context(STYLE), replacing(path) as part:
+        figure.savefig(part, format=kind, dpi=200, metadata=FORMATS[kind])
+
+
+def recording_figure(recording: Recording) -> Figure:
+    """The figure of a recording.
+
+    One column per active joint with its displacement, velocity and force over time, in the units
+    that the page of a run has, many joints in several bands below each other; of cylinders with
+    valves also pressures, flows and signals. Where the channels tip_x, tip_y, tip_z exist, the
+    path of the tip is beside them. References (channels reference_<joint>,
+    reference_velocity_<joint>, reference_tip_x, ...) are dashed; with one for the tip comes its
+    distance from it.
+    """
+    tip, joints = points(recording, "tip"), recording.joints
+    panels = [_panels(recording, index) for index in range(len(joints))]
+    kept = [row for row in range(len(panels[0])) if any(column[row].lines for column in panels)]
+    rows = len(kept)
+    with mpl.rc_context(STYLE):
+        bands = -(-len(joints) // MOST_COLUMNS)
+        columns = -(-len(joints) // bands)
+        widths = [1.0] * columns + [1.6] * (tip is not None)
+        width = 2.4 * sum(widths) + 0.3
+        margin = 0.3 if tip is not None else 0.0  # the layout overlooks the label of the z axis
+        layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0 - margin / width, 1.0))
+        figure = Figure(figsize=(width, 2.0 * rows * bands), layout=layout)
+        grid = figure.add_gridspec(rows * bands, len(widths), width_ratios=widths)
+        letters = iter(ascii_lowercase)
+        for band, row in itertools.product(range(bands), range(rows)):
+            beside = range(band * columns, min((band + 1) * columns, len(joints)))
+            scales = _scales([column[kept[row]] for column in panels])
+            for index in beside:
+                panel = panels[index][kept[row]]
+                if not panel.lines:
+                    continue
+                axes = figure.add_subplot(grid[rows * band + row, index - beside.start])
+                _draw_panel(axes, recording.time, panel, *scales[panel.unit])
+                _letter(axes, letters)
+                if row == 0:
+                    axes.set_title(joint_symbol(joints[index]))
+                if not any(panels[index][below].lines for below in kept[row + 1 :]):
+                    axes.set_xlabel("time [s]")
+                else:
+                    axes.tick_params(labelbottom=False)
+        if tip is not None:
+            reference = points(recording, "reference_tip")
+            tall = slice(3) if reference is None else slice(2)
+            space = figure.add_subplot(grid[tall, -1], projection="3d")
+            _draw_path(space, tip, reference)
+            _letter(space, letters)
+            if reference is not None:
+                axes = figure.add_subplot(grid[2, -1])
+                _draw_panel(axes, recording.time, _tip_error(tip, reference), "mm", 1e3)
+                _letter(axes, letters)
+                axes.set_xlabel("time [s]")
+        _caption(figure, recording)
+    return figure
+
+
+def _panels(recording: Recording, column: int) -> list[_Panel]:
+    """Displacement, velocity and force of an active joint, and its cylinder's; some are empty."""
+    name, channels = recording.joints[column], recording.channels
+    unit = recording.units[name]
+    turns, wanted = unit == "rad", f"reference_{name}"
+
+    def lines(values: Array, reference: str = "") -> dict[str, Array]:
+        beside = {"reference": channels[reference]} if reference in channels else {}
+        return {"recording": values[:, column], **beside}
+
+    found = [
+        _Panel("angle" if turns else "displacement", unit, lines(recording.q, wanted)),
+        _Panel("velocity", f"{unit}/s", lines(recording.v, f"reference_velocity_{name}")),
+        _Panel("torque" if turns else "force", FORCE_UNITS[unit], lines(recording.tau)),
+    ]
+    for quantity, shown, names in HYDRAULIC_ROWS:
+        own = [label for label, channel in names.items() if channel.format(name) != channel]
+        there = {
+            label: channels[channel]
+            for label, channel in ((label, text.format(name)) for label, text in names.items())
+            if recording.channel_units.get(channel) == shown
+        }
+        found.append(_Panel(quantity, shown, there if any(x in there for x in own) else {}))
+    return found
+
+
+def _scales(panels: Sequence[_Panel]) -> dict[str, tuple[str, float]]:
+    """The unit that panels of a row are read in, and its scale, the same for equal units."""
+    peaks: dict[str, float] = {}
+    for panel in panels:
+        for values in panel.lines.values():
+            peaks[panel.unit] = max(peaks.get(panel.unit, 0.0), float(np.abs(values).max()))
+    return {unit: reading(unit, peak) for unit, peak in peaks.items()}
+
+
+def _tip_error(tip: Array, reference: Array) -> _Panel:
+    distance = np.linalg.norm(tip - reference, axis=1)
+    return _Panel("tip to reference", "m", {"recording": distance})
+
+
+def _draw_panel(axes: Axes, time: Array, panel: _Panel, unit: str, scale: float) -> None:
+    marker = "o" if len(time) == 1 else None
+    for label, values in panel.lines.items():
+        axes.plot(*envelope(time, scale * values), marker=marker, label=label, **LINES[label])
+    axes.set_ylabel(f"{panel.quantity} [{unit}]")
+    axes.margins(x=0.0, y=0.08)
+    low, high = axes.get_ylim()
+    if (lacking := scale * LEAST_SPAN[panel.unit] - (high - low)) > 0:
+        axes.set_ylim(low - lacking / 2, high + lacking / 2)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+
+
+def _draw_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
+    """The path of the tip [m] in space, to scale, with its shadow on the ground of the box."""
+    tip, reference = thinned(tip), None if reference is None else thinned(reference)
+    shown = tip if reference is None else np.vstack([tip, reference])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    span = np.maximum(high - low, 0.4 * max(float((high - low).max()), 1e-2)) * 1.1
+    low, high = (low + high - span) / 2, (low + high + span) / 2
+    x, y, z = tip.T
+    axes.plot(x, y, np.full_like(z, low[2]), color="#a8a8a8", linewidth=1.0, label="shadow")
+    axes.plot(x, y, z, color=RECORDED, label="recording")
+    if reference is not None:
+        axes.plot(*reference.T, label="reference", **DASHED)
+    for end, name, face in ((tip[0], "start", "white"), (tip[-1], "end", RECORDED)):
+        axes.plot(*end[:, None], "o", color=RECORDED, markerfacecolor=face, ms=5, label=name)
+        axes.text(*end, f" {name}", fontsize=7.5, va="bottom")
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="path of the tip")
+    axes.set_box_aspect(span, zoom=0.88)
+    axes.view_init(elev=24, azim=-60)
+    for i, axis in enumerate((axes.xaxis, axes.yaxis, axes.zaxis)):
+        axis.set_major_locator(FixedLocator(_ticks(low[i], high[i], span[i] / span.max())))
+        axis.set_pane_color("#fafafa")
+        # matplotlib moves words away from an axis in proportion to the widths across it
+        across = float(np.delete(span, i).max() / span.max())
+        axis.set_tick_params(pad=TICK_OFFSET / across - PAD_OFFSET)
+        axis.labelpad = LABEL_OFFSET / across - PAD_OFFSET
+
+
+def _ticks(low: float, high: float, share: float) -> list[float]:
+    """Round values away from the ends, where other axes begin; few on a short axis."""
+    margin = 0.12 * (high - low)
+    low, high = low + margin, high - margin
+    least, most = (2, 3) if share > 0.5 else (1, 2)
+    inside: list[float] = []
+    for count in range(1, 9):  # how many fit between round values depends on where they lie
+        values = MaxNLocator(count, steps=[1, 2, 5, 10]).tick_values(low, high)
+        inside = [float(value) for value in values if low <= value <= high] or inside
+        if len(inside) >= least:
+            break
+    return inside[:: -(-len(inside) // most)]
+
+
+def _letter(axes: Axes, letters: Iterator[str]) -> None:
+    """(a), (b), ... as panels are referred to in a text."""
+    if letter := next(letters, ""):
+        axes.annotate(f"({letter})", (0, 1), (-28, 7), "axes fraction", "offset points")
+
+
+def _caption(figure: Figure, recording: Recording) -> None:
+    """What is shown, and which line is what."""
+    if words := title(subject(recording), recording.task):
+        figure.suptitle(plain(words), x=0.01, ha="left", fontsize=11, fontweight="bold")
+    lines = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
+    if shown := [lines[label] for label in LINES if label in lines and label != "recording"]:
+        figure.legend(
+            handles=[lines["recording"], *shown], loc="outside upper right", ncols=1 + len(shown)
+        )
+
+
+def joint_symbol(name: str) -> str:
+    """A joint's name as mathematics where it is a letter and a number, q1 as q with index 1."""
+    if match := re.fullmatch(r"([A-Za-z])(\d+)", name):
+        return f"${match[1]}_{{{match[2]}}}$"
+    return plain(name)

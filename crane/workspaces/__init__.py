@@ -1,6 +1,0 @@
-"""Where the strokes of a machine take its tip, and where they cannot."""
-
-from crane.workspaces.explore import workspace
-from crane.workspaces.result import Curve, Extreme, Workspace
-
-__all__ = ["Curve", "Extreme", "Workspace", "workspace"]
