@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from crane.machine import Machine, Payload, load
     from crane.motion import Kinematics, Path, point_to_point, polynomial, task_path, tip_path
     from crane.motion.workspaces import Workspace, workspace
-    from crane.recordings import Recording, read_measured
+    from crane.recordings import Recording
+    from crane.recordings.measured import read_measured
     from crane.simulation import Batch, Comparison, replay, simulate, simulate_batch
     from crane.studies import Study, study
     from crane.view.page import report
@@ -86,10 +87,8 @@ _HOMES = {
         "Workspace",
         "workspace",
     ),
-    "crane.recordings": (
-        "Recording",
-        "read_measured",
-    ),
+    "crane.recordings": ("Recording",),
+    "crane.recordings.measured": ("read_measured",),
     "crane.simulation": (
         "Batch",
         "Comparison",

@@ -294,7 +294,8 @@ def mangled(rng, text):
         elif how == 10:
             lines.insert(0, "# " + rng.choice(
                 ["machine: /dev/zero", "machine: ..", "machine: $\\bad$", "task: $\\bad$",
-                 "a" * 9999, "machine: mini_forwarder --set a=b", "machine: \0", "task:"]
+                 "a" * 9999, "machine: mini_forwarder with {", "machine: \0", "task:",
+                 'machine: mini_forwarder with {"lock": [1]}']
             ))  # fmt: skip
             head += 1
         elif how == 11:

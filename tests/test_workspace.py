@@ -265,7 +265,8 @@ def test_the_command_writes_tables_summary_and_picture(tmp_path):
     assert files == {"workspace.csv", "curves.csv", "workspace.md", "workspace.png"}
     assert (out / "workspace.png").read_bytes()[:4] == b"\x89PNG"
     with (out / "workspace.csv").open() as file:
-        assert file.readline().startswith("# machine: patu655 --set X_lift.upper=0.4 --lock X_ext")
+        start = '# machine: patu655 with {"changes": {"X_lift.upper": 0.4}, "lock": {"X_ext": '
+        assert file.readline().startswith(start)
         rows = list(csv.DictReader(file))
     assert len(rows) == 400
     assert max(float(row["X_lift [m]"]) for row in rows) == pytest.approx(0.4)

@@ -13,7 +13,7 @@ from crane.common.errors import (
     RecordingError,
 )
 from crane.common.output import staging
-from crane.description.sources import find
+from crane.description.sources import find, unchanged
 from crane.machine import Machine, recalled
 from crane.recordings import timeseries
 from crane.recordings.measured import is_measured, read_measured
@@ -210,7 +210,7 @@ def machine_of(path: str | Path, named: str) -> Machine:
             "its header row"
         )
     try:
-        find(named.split(" --")[0])
+        find(unchanged(named))
     except DescriptionError as error:
         raise DescriptionError(
             f"{path}: its machine is not found ({error}); add --machine to say where it is"

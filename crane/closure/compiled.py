@@ -5,10 +5,10 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from crane.closure.branch import Posture as ClosedPosture
+from crane.closure.branch import Posture
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import Indices, Structure
-from crane.closure.traced import Constants, Loops, Posture, folded, geometry_of
+from crane.closure.traced import Bodies, Constants, Loops, folded, geometry_of
 from crane.codegen import Layout, Number, Program, Tape, largest, maximum
 from crane.codegen.scalar import dot
 from crane.common.samples import Array
@@ -29,7 +29,7 @@ class Cursor:
 
     at: Array
 
-    def start(self, posture: ClosedPosture) -> None:
+    def start(self, posture: Posture) -> None:
         """Let the next sample start from a posture."""
         self.at[: len(posture.q)] = posture.q
         self.at[len(posture.q) :] = posture.gamma.ravel()
@@ -80,7 +80,7 @@ class FastClosure:
         structure: Structure,
         active: Indices,
         passive: Indices,
-        home: ClosedPosture,
+        home: Posture,
         size: float,
     ):
         self.geometry = geometry_of(equations)
@@ -177,11 +177,11 @@ class FastClosure:
         q = np.ascontiguousarray(q)
         return self._loops.call("gammas", len(q), self.geometry.numbers, q, out)
 
-    def trace(self, tape: Tape, geometry: int, q: int) -> tuple[list[Number], Posture, Loops]:
+    def trace(self, tape: Tape, geometry: int, q: int) -> tuple[list[Number], Bodies, Loops]:
         """Coordinates, bodies and loops, read from two arguments of a function to be."""
         coordinates = tape.loads(q, 0, self._nq)
         constants = Constants(tape, geometry, self.geometry.numbers)
-        posture = Posture(self.geometry, constants, coordinates)
+        posture = Bodies(self.geometry, constants, coordinates)
         loops = Loops(self._equations, self._structure, self._active, self._passive, posture)
         return coordinates, posture, loops
 
@@ -288,7 +288,7 @@ class FastClosure:
                 r.call("whole", work, r.out.row(sample, self._nq * n))
             r.give(r.count)
 
-    def _signs(self, home: ClosedPosture) -> Array:
+    def _signs(self, home: Posture) -> Array:
         """Of the blocks' determinants on the home branch."""
         blocks = (
             home.jacobian[np.ix_(rows, self._passive[columns])]

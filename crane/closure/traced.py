@@ -128,7 +128,7 @@ def folded(values: Array) -> bytes:
     return np.where(np.isin(values, (0.0, 1.0, -1.0)), values, 2.0).tobytes()
 
 
-class Posture:
+class Bodies:
     """Bodies and loops at traced coordinates, seen from the geometry's trunk.
 
     Args:
@@ -221,7 +221,7 @@ class Loops:
         structure: Structure,
         active: Indices,
         passive: Indices,
-        posture: Posture,
+        posture: Bodies,
     ):
         self._structure = structure
         self.active_joints = [int(column) + 1 for column in active]
@@ -237,7 +237,7 @@ class Loops:
         ]
         self._others = [self._row(equations, int(row), posture) for row in structure.redundant]
 
-    def _row(self, equations: LoopEquations, row: int, posture: Posture) -> Row:
+    def _row(self, equations: LoopEquations, row: int, posture: Bodies) -> Row:
         coupling = int(equations.loop_of_row[row]) - len(equations.loops)
         if coupling >= 0:
             return _coupled(equations.factors[coupling], equations.offsets[coupling], posture.q)
@@ -328,7 +328,7 @@ class Loops:
         return largest(row.phi for row in self._others)
 
 
-class Motion:
+class MovingBodies:
     """Bodies in motion at a traced posture.
 
     Args:
@@ -346,7 +346,7 @@ class Motion:
 
     def __init__(
         self,
-        posture: Posture,
+        posture: Bodies,
         loops: Loops,
         rates: Sequence[Number],
         gravity: Sequence[Number],

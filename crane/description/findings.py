@@ -1,8 +1,8 @@
 """What is wrong with a description: all of it where it is checked, else the first.
 
-Readers raise at the first problem. Within `collecting` they go on instead: `kept` writes an error
-down and ends only the part that has it, a link or an item of a section; `note` does not end even
-that.
+Readers raise at the first problem. Within `collecting` they go on instead: `recoverable` writes an
+error down and ends only the part that has it, a link or an item of a section; `flag` does not end
+even that.
 """
 
 from collections.abc import Iterator
@@ -75,7 +75,7 @@ _current: ContextVar[Findings | None] = ContextVar("findings", default=None)
 
 @contextmanager
 def collecting() -> Iterator[Findings]:
-    """Collect what goes wrong within, as far as it is raised within `kept`."""
+    """Collect what goes wrong within, as far as it is raised within `recoverable`."""
     found = Findings()
     token = _current.set(found)
     try:
@@ -86,7 +86,7 @@ def collecting() -> Iterator[Findings]:
         _current.reset(token)
 
 
-class kept:  # noqa: N801  read as a word: `with kept():`
+class recoverable:  # noqa: N801  read as a word: `with recoverable():`
     """A part of a description whose errors end only this part while findings are collected.
 
     An error after others of the same part follows from them and is not noted.
@@ -127,7 +127,7 @@ class kept:  # noqa: N801  read as a word: `with kept():`
             found.harmless -= self._harmless
 
 
-def note(error: CraneError, harmless: bool = False) -> None:
+def flag(error: CraneError, harmless: bool = False) -> None:
     """Raise an error, or write it down where findings are collected.
 
     Args:
@@ -140,7 +140,7 @@ def note(error: CraneError, harmless: bool = False) -> None:
     found = _current.get()
     if found is None:
         raise error
-    with kept(harmless):
+    with recoverable(harmless):
         raise error
 
 
@@ -154,7 +154,7 @@ def aside() -> Iterator[None]:
         _current.reset(token)
 
 
-def noted(file: "XmlFile") -> None:
+def remember_file(file: "XmlFile") -> None:
     """Keep a parsed file for further checks."""
     if (found := _current.get()) is not None:
         found.files.append(file)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from crane.common.errors import DescriptionError, known
 
+WITH = " with "  # between a machine and the numbers of it that are changed, see `Machine.call`
 SUFFIXES = (".yaml", ".yml", ".urdf", ".xml", ".mjcf")
 
 
@@ -43,6 +44,11 @@ def examples() -> dict[str, Path]:
     if root is None:
         return {}
     return {path.stem: path for path in sorted(root.glob("**/*.urdf"))}
+
+
+def unchanged(call: str) -> str:
+    """The machine or file in what `Machine.call` says."""
+    return call.partition(WITH + "{")[0]
 
 
 def find(name: str | Path) -> Path:

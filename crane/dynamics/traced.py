@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
-from crane.closure.traced import Constants, Geometry, Loops, Motion, Posture, Vector
+from crane.closure.traced import Bodies, Constants, Geometry, Loops, MovingBodies, Vector
 from crane.codegen.scalar import (
     Number,
     add,
@@ -59,7 +59,7 @@ class Sweep:
 
     def __init__(
         self,
-        posture: Posture,
+        posture: Bodies,
         loops: Loops,
         constants: Constants,
         q: Sequence[Number],
@@ -79,7 +79,7 @@ class Sweep:
         self.rates: Vector = [0.0, *(dot(self.gamma[i], v_a) for i in range(1, self._size))]
         # the loops' drift is that of the whole machine whatever carries a body
         whole, alone = (
-            Motion(posture, loops, self.rates, self._gravity, parents)
+            MovingBodies(posture, loops, self.rates, self._gravity, parents)
             for parents in (posture.geometry.parents, carriers)
         )
         self.drift, self._motion = whole.drift, alone

@@ -12,7 +12,7 @@ from crane.dynamics.elements import JointForces
 from crane.machine import Machine
 
 
-class Motion(NamedTuple):
+class ClosedState(NamedTuple):
     """One closed posture in motion.
 
     Attributes:
@@ -96,7 +96,7 @@ class TreeDynamics:
         Returns:
             The result, flattened.
         """
-        motion = Motion(q, *self._closure.motion(q, v_a))
+        motion = ClosedState(q, *self._closure.motion(q, v_a))
         gamma, v = motion.gamma, motion.v
         match quantity:
             case "inverse" | "inverse with friction":
@@ -125,11 +125,11 @@ class TreeDynamics:
                 return (gamma.T @ self._regressor(q, v, gamma @ x + motion.drift)).ravel()
         raise AssertionError(quantity)
 
-    def _forward(self, motion: Motion, tau_a: Array, friction: bool) -> Array:
+    def _forward(self, motion: ClosedState, tau_a: Array, friction: bool) -> Array:
         bias = self._project(motion, motion.drift, friction)
         return solve(self._mass(motion), tau_a - bias)
 
-    def _energy(self, motion: Motion) -> Array:
+    def _energy(self, motion: ClosedState) -> Array:
         """Kinetic and potential."""
         kinetic = 0.0
         for part in self._parts:
@@ -138,20 +138,20 @@ class TreeDynamics:
         weight = pin.computePotentialEnergy(self._model, self._data, motion.q)
         return np.array([kinetic, weight + self._forces.potential(motion.q)])
 
-    def _dissipation(self, motion: Motion) -> float:
+    def _dissipation(self, motion: ClosedState) -> float:
         """Power that friction, dampers and end stops take out."""
         conservative = self._forces.passive(motion.q, np.zeros_like(motion.v))
         braking = conservative - self._forces.passive(motion.q, motion.v)
         return float(motion.v @ (self._forces.friction(motion.v) + braking))
 
-    def _project(self, motion: Motion, a: Array, friction: bool) -> Array:
+    def _project(self, motion: ClosedState, a: Array, friction: bool) -> Array:
         """gamma^T (rnea(q, v, a) - f [+ tau_F])."""
         tau = self._inverse(motion.q, motion.v, a) - self._forces.passive(motion.q, motion.v)
         if friction:
             tau += self._forces.friction(motion.v)
         return np.asarray(motion.gamma.T @ tau)
 
-    def _mass(self, motion: Motion) -> Array:
+    def _mass(self, motion: ClosedState) -> Array:
         total = np.zeros((motion.gamma.shape[1],) * 2)
         for part in self._parts:
             upper = np.triu(pin.crba(part.model, part.data, motion.q[part.columns]))

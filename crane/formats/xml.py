@@ -8,7 +8,7 @@ from pathlib import Path
 from lxml import etree
 
 from crane.common.errors import DescriptionError, known
-from crane.description.findings import note
+from crane.description.findings import flag
 from crane.description.spec import unit_vector
 from crane.description.tree import Placement, Vector
 
@@ -103,7 +103,7 @@ class XmlFile:
             if element.tag in exact or meant:
                 hint = known(allowed, key.lower())
                 problem = f'unknown {key}="..." in <{element.tag}>, {hint}'
-                note(self.fail(element, problem), harmless=meant)
+                flag(self.fail(element, problem), harmless=meant)
             if meant:
                 element.set(near[0], element.attrib.pop(key))
         tags = children.get(element.tag, set())
@@ -115,11 +115,11 @@ class XmlFile:
                 hint = known(tags, child.tag.lower())
                 meant = near[0] in _SEVERAL or element.find(near[0]) is None
                 problem = f"unknown <{child.tag}> in <{element.tag}>, {hint}"
-                note(self.fail(child, problem), harmless=meant)
+                flag(self.fail(child, problem), harmless=meant)
                 if meant:
                     child.tag = near[0]
             elif child.tag not in tags and any(child.tag in x for x in children.values() if tags):
-                note(self.fail(child, f"<{child.tag}> has no place in <{element.tag}>, move it"))
+                flag(self.fail(child, f"<{child.tag}> has no place in <{element.tag}>, move it"))
             if child.tag in tags:
                 self.check(child, children, attributes, exact)
 
@@ -131,7 +131,7 @@ class XmlFile:
         """
         found = element.findall(tag)
         if len(found) > 1:
-            note(self.fail(found[1], f"{what} has {len(found)} <{tag}>, keep one"))
+            flag(self.fail(found[1], f"{what} has {len(found)} <{tag}>, keep one"))
         return found[0] if found else None
 
     def number(
@@ -163,7 +163,7 @@ class XmlFile:
         try:
             return self._vector(element, name, what, length, default)
         except DescriptionError as error:
-            note(error)
+            flag(error)
             return (math.nan,) * length
 
     def _vector(
@@ -205,7 +205,7 @@ class XmlFile:
         axis = self.only(element, "axis", what)
         xyz = default if axis is None else self.vector(axis, "xyz", f"the axis of {what}", 3)
         if (unit := unit_vector(xyz)) is None:
-            note(self.fail(axis, f"the axis of {what} is zero, give a direction"))
+            flag(self.fail(axis, f"the axis of {what} is zero, give a direction"))
             return _X
         return unit
 

@@ -10,7 +10,7 @@ from crane.closure import Closure, frame_id
 from crane.common.errors import DescriptionError, MechanismError, at
 from crane.common.samples import Array
 from crane.description import LoopSpec, MachineSpec, inertia_problem
-from crane.description.findings import kept, note
+from crane.description.findings import flag, recoverable
 from crane.description.rigid import inertia, se3
 from crane.description.tree import Joint, Link
 from crane.machine.axes import wrong_axis
@@ -48,7 +48,7 @@ def home_guess(spec: MachineSpec, model: pin.Model) -> Array:
                 f"home of '{joint}' is {value:g}, outside of its limits "
                 f"{spec.tree.joints[joint].limits}, choose one within them"
             )
-            note(DescriptionError(f"{spec.where[f'home {joint}']}: {problem}"))
+            flag(DescriptionError(f"{spec.where[f'home {joint}']}: {problem}"))
         guess[column] = value
     return guess
 
@@ -180,7 +180,7 @@ def _check_bodies(spec: MachineSpec, model: pin.Model) -> None:
         joint = spec.tree.joints[model.names[index]]
         link = links[joint.child]
         if link.between is None and index not in doubtful:
-            with kept(harmless=True):
+            with recoverable(harmless=True):
                 _check_body(link, joint.name, model.inertias[index])
 
 

@@ -1,13 +1,13 @@
 """From a description to a machine."""
 
-import shlex
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
 from crane.common.errors import DescriptionError, InputError
 from crane.description import changed, locked
-from crane.description.sources import find
+from crane.description.sources import WITH, find
 from crane.formats import read
 from crane.machine.ambiguity import warn_of_assemblies
 from crane.machine.assemble import assemble, closed, home_guess
@@ -80,18 +80,20 @@ def recalled(call: str) -> Machine:
     try:
         find(call)
     except DescriptionError:
-        if not ("--set" in call or "--lock" in call):
+        if WITH not in call:
             raise
     else:
         return load(call)  # a path may hold anything
+    name, _, text = call.partition(WITH)
     try:
-        name, *words = shlex.split(call)
-        numbers: dict[str, dict[str, float]] = {"--set": {}, "--lock": {}}
-        for option, word in zip(words[::2], words[1::2], strict=True):
-            key, _, value = word.rpartition("=")
-            numbers[option][key] = float(value)
-    except (ValueError, KeyError):
-        raise InputError(
-            f"'{call}' names no machine, write NAME --set PARAMETER=VALUE --lock JOINT=VALUE"
-        ) from None
-    return load(name, numbers["--set"], numbers["--lock"])
+        given = json.loads(text)
+        numbers = [
+            {key: float(value) for key, value in given.pop(kind, {}).items()}
+            for kind in ("changes", "lock")
+        ]
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        given = {"": None}
+    if given:
+        example = '{"changes": {"payload.mass": 200}, "lock": {"slew": 0}}'
+        raise InputError(f"'{call}' names no machine, write NAME{WITH}{example}")
+    return load(name, *numbers)

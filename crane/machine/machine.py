@@ -1,7 +1,7 @@
 """Machine: the assembled, immutable result of reading and closing a description."""
 
 import dataclasses
-import shlex
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,6 +27,7 @@ from crane.description import (
     inertia_problem,
 )
 from crane.description.rigid import loaded
+from crane.description.sources import WITH
 from crane.description.tree import Tree
 from crane.hydraulics import Hydraulics
 
@@ -148,14 +149,11 @@ class Machine:
     def call(self) -> str:
         """What `recalled` takes to load it again, changes and locks included.
 
-        It reads like the command line: "patu655 --set payload.mass=200.0 --lock slew=0.0".
+        Such as 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
         """
-        words = [self.reference]
-        words += [
-            word for x, value in self.changes.items() for word in ("--set", f"{x}={value!r}")
-        ]
-        words += [word for x, value in self.locks.items() for word in ("--lock", f"{x}={value!r}")]
-        return shlex.join(words) if len(words) > 1 else words[0]
+        given = {"changes": dict(self.changes), "lock": dict(self.locks)}
+        given = {name: numbers for name, numbers in given.items() if numbers}
+        return f"{self.reference}{WITH}{json.dumps(given)}" if given else self.reference
 
     @property
     def joints(self) -> tuple[str, ...]:

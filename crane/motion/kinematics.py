@@ -8,7 +8,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 
-from crane.closure.traced import Constants, Motion, folded
+from crane.closure.traced import Constants, MovingBodies, folded
 from crane.codegen import Number, Program, Tape, TooLongError
 from crane.codegen.scalar import add, cross, dot, scale, subtract, times
 from crane.common.errors import ClosureError, InputError, UnreachableTipError
@@ -340,7 +340,7 @@ class _FastFrame:
         v_a, parents = tape.loads(3, 0, n), posture.geometry.parents
         rates: list[Number] = [0.0]
         rates += [dot(loops.gamma[i], v_a) for i in range(1, len(parents))]
-        motion = Motion(posture, loops, rates, [0.0] * 3, parents)
+        motion = MovingBodies(posture, loops, rates, [0.0] * 3, parents)
         place = Constants(tape, 1, self._place).vector(0)
         point = add(posture.origin[body], times(posture.rotation[body], place))
         columns: list[list[Number]] = [[0.0] * 3 for _ in range(n)]

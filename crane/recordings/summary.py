@@ -7,6 +7,7 @@ import numpy as np
 
 from crane.common.samples import Array
 from crane.common.units import quantity
+from crane.description.sources import unchanged
 from crane.recordings.recording import FORCE_UNITS, Recording
 
 # Unit to read a coordinate in, and how many of it make one rad or m.
@@ -95,7 +96,7 @@ def title(machine: str, what: str = "") -> str:
 
 def subject(recording: Recording, otherwise: str = "") -> str:
     """Name of what a recording is of: of the bundled machine or file that it names, or else."""
-    return Path(recording.machine.split(" --")[0]).stem or otherwise
+    return Path(unchanged(recording.machine)).stem or otherwise
 
 
 def summarize(recording: Recording) -> Summary:

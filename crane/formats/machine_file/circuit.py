@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from crane.common.errors import CraneWarning, InputError, known
 from crane.common.magnitudes import doubt
-from crane.description.findings import FollowUpError, kept, note
+from crane.description.findings import FollowUpError, flag, recoverable
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.hydraulics.components import (
@@ -43,20 +43,20 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
         return None
     section.only("supply", "oil", "cylinders", "valves", "control")
     supply = None
-    with kept():
+    with recoverable():
         supply_section = section.section("supply", "'supply'")
         if supply_section is None:
             raise section.fail(None, "'hydraulics' has no 'supply', give its pressure")
         supply_section.only(*number_names(Supply))
         supply = _part(supply_section, Supply)
     oil = Oil()
-    with kept():
+    with recoverable():
         oil_section = section.section("oil", "'oil'")
         if oil_section is not None:
             oil_section.only(*number_names(Oil))
             oil = _part(oil_section, Oil)
     if supply is not None and supply_section is not None:
-        with kept():
+        with recoverable():
             _checked(supply_section, check_tank, supply, oil)
             _warn_of_unit(supply_section, "tank", supply.tank)
     named: dict[str, list[str]] = {"cylinder": [], "valve": [], "control": []}
@@ -65,11 +65,11 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
     keys = (*number_names(Cylinder), *holding)
     for joint, item in section.mappings("cylinders", "cylinder of", *keys):
         named["cylinder"].append(joint)
-        with kept():
+        with recoverable():
             _check_joint(joint, item, active)
             if lack := tree.unlimited(joint):
                 problem = f"joint '{joint}' {lack}, a cylinder needs the limits of its stroke"
-                note(item.fail(None, problem))
+                flag(item.fail(None, problem))
             turning = _turns(tree, joint)
             holds = _holding(item, holding)
             cylinder = _part(item, Cylinder, turning, joint=joint, **holds)
@@ -82,24 +82,24 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
     given = (*number_names(Valve), "type", "flow", "meter_out")
     for joint, item in section.mappings("valves", "valve of", *given):
         named["valve"].append(joint)
-        with kept():
+        with recoverable():
             _check_joint(joint, item, active)
             valves[joint] = _valve(item, joint)
     for joint in (*named["cylinder"], *named["valve"]):
         for what in ("cylinder", "valve"):
             if joint not in named[what]:
-                note(section.fail(f"{what}s", f"'{joint}' has no {what}, add it"))
+                flag(section.fail(f"{what}s", f"'{joint}' has no {what}, add it"))
     control: dict[str, PDGains] = {}
     for joint, item in section.mappings("control", "control of", *number_names(PDGains)):
         named["control"].append(joint)
-        with kept():
+        with recoverable():
             _check_joint(joint, item, active)
             control[joint] = _part(item, PDGains)
     if named["control"] and set(named["control"]) != set(named["cylinder"]):
         listed = ", ".join(named["cylinder"])
-        note(section.fail("control", f"give gains of all of {listed}, or none"))
+        flag(section.fail("control", f"give gains of all of {listed}, or none"))
     if not named["cylinder"]:
-        note(section.fail(None, "'hydraulics' drives nothing, give cylinders and valves"))
+        flag(section.fail(None, "'hydraulics' drives nothing, give cylinders and valves"))
     if supply is None or not cylinders.keys() == valves.keys() <= set(active):
         raise FollowUpError("the circuit is not complete")
     order = [joint for joint in active if joint in cylinders]

@@ -3,7 +3,7 @@
 import warnings
 
 from crane.common.errors import CraneWarning
-from crane.description.findings import kept
+from crane.description.findings import recoverable
 from crane.description.spec import EndStop, ForceElement, Friction, GasSpring
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
@@ -17,7 +17,7 @@ def read_friction(top: Section, tree: TreeBuilder) -> dict[str, Friction]:
         "stribeck",
     )  # fmt: skip
     for joint, item in top.mappings("friction", "friction of", *keys):
-        with kept():
+        with recoverable():
             tree.check_joint(joint, item.where())
             stribeck = item.number("stribeck", Friction.stribeck, minimum=0.0)
             if stribeck == 0:
@@ -52,7 +52,7 @@ def read_forces(top: Section, tree: TreeBuilder) -> tuple[ForceElement, ...]:
     forces = []
     keys = ("joint", "stiffness", "rest", "damping", "force")
     for item in top.sections("forces", "force element of", *keys):
-        with kept():
+        with recoverable():
             element = ForceElement(
                 tree.joint(item),
                 stiffness=item.number("stiffness", 0.0, minimum=0.0),
@@ -75,7 +75,7 @@ def read_gas_springs(top: Section, tree: TreeBuilder) -> tuple[GasSpring, ...]:
     springs = []
     keys = ("area", "pressure", "volume", "rest", "exponent")
     for joint, item in top.mappings("gas_springs", "gas spring of", *keys):
-        with kept():
+        with recoverable():
             tree.check_joint(joint, item.where())
             area = item.number("area")
             volume = item.number("volume", minimum=0.0)
@@ -92,7 +92,7 @@ def read_end_stops(top: Section, tree: TreeBuilder) -> tuple[EndStop, ...]:
     """Stops at the limits of joints."""
     stops = []
     for joint, item in top.mappings("end_stops", "end stop of", "stiffness", "damping"):
-        with kept():
+        with recoverable():
             tree.check_joint(joint, item.where())
             if lack := tree.unlimited(joint):
                 hint = "make it revolute" if lack == "is continuous" else "give it both"

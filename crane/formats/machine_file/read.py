@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from crane.common.errors import DescriptionError, known
-from crane.description.findings import Anything, FollowUpError, kept, note
+from crane.description.findings import Anything, FollowUpError, flag, recoverable
 from crane.description.sources import find
 from crane.description.spec import (
     LOOP_TYPES,
@@ -71,9 +71,9 @@ def _read_single(path: Path) -> MachineSpec:
     tree = TreeBuilder()
     tree.add(chain, urdf)
     if not tree.joints:
-        note(DescriptionError(f"{path.name}: no joint moves in this file, add one"))
+        flag(DescriptionError(f"{path.name}: no joint moves in this file, add one"))
     for loop in urdf.loops:
-        with kept():
+        with recoverable():
             tree.check_loop(loop)
     where = _places(urdf.loops, urdf.couplings)
     where |= {f"home {joint}": place for joint, place in urdf.home_lines.items()}
@@ -103,21 +103,21 @@ def _read_machine(path: Path) -> MachineSpec:
     loops = _loops(top, tree)
     couplings += _couplings(top, tree)
     active: tuple[str, ...] = Anything()
-    with kept():
+    with recoverable():
         active = top.names("active") if "active" in top else ()
     for joint in active:
-        with kept():
+        with recoverable():
             tree.check_joint(joint, top.where("active"))
     if not all(joint in tree.joints for joint in active):
         active = Anything()
     where = {key: top.where(key) for key in top} | _places(loops, couplings)
     home = {}
     section = None
-    with kept():
+    with recoverable():
         section = top.section("home", "'home'")
     for joint in section or ():
         assert section is not None
-        with kept():
+        with recoverable():
             tree.check_joint(joint, section.where(joint))
             home[joint] = section.number(joint)
             where[f"home {joint}"] = section.where(joint)
@@ -126,7 +126,7 @@ def _read_machine(path: Path) -> MachineSpec:
     gas_springs = _part(read_gas_springs, (), top, tree)
     end_stops = _part(read_end_stops, (), top, tree)
     tip = top.text("tip", None)
-    with kept(harmless=True):
+    with recoverable(harmless=True):
         if tip is not None:
             tree.check_link(tip, top.where("tip"), "the tip frame")
             if not tree.moves(tip):
@@ -138,7 +138,7 @@ def _read_machine(path: Path) -> MachineSpec:
     control: dict[str, PIGains] = {}
     if active:
         valves: tuple[str, ...] = Anything() if "hydraulics" in top else ()
-        with kept(harmless=True):
+        with recoverable(harmless=True):
             hydraulics = read_hydraulics(top, tree, active)
             if hydraulics is not None and not isinstance(active, Anything):
                 valves = hydraulics.joints
@@ -152,7 +152,7 @@ def _read_machine(path: Path) -> MachineSpec:
 
 def _part(read: Callable[..., Part], nothing: Any, *arguments: object) -> Part:
     """A part that the machine can be assembled without, `nothing` where it is refused."""
-    with kept(harmless=True):
+    with recoverable(harmless=True):
         return read(*arguments)
     return nothing
 
@@ -168,23 +168,23 @@ def _chains(
         tree.complete &= top.complete
         so_far = tree.complete
         tree.complete = False
-        with kept():
+        with recoverable():
             name, parent = item.text("name"), item.text("parent", None)
             file = item.file("urdf")
             if any(chain.name == name for chain in chains):
-                note(item.fail("name", f"two chains are named '{name}', rename one"))
+                flag(item.fail("name", f"two chains are named '{name}', rename one"))
             elif (chains or not so_far) and parent is None:
                 problem = f"chain '{name}' has no 'parent', name the frame it hangs from"
-                note(item.fail(None, problem))
+                flag(item.fail(None, problem))
             elif not chains and so_far and parent is not None:
                 problem = f"chain '{name}' is first and stands on the world, remove its 'parent'"
-                note(item.fail("parent", problem))
+                flag(item.fail("parent", problem))
                 parent = None
             urdf = read_urdf(file)
             chain = Chain(name, file, parent, item.where("parent"), urdf.moving)
             for loop in urdf.loops[:1]:
                 problem = f"a sub-chain has no <loop>, write it under 'loops' of {path.name}"
-                note(DescriptionError(f"{loop.where}: {problem}"))
+                flag(DescriptionError(f"{loop.where}: {problem}"))
             tree.complete = so_far
             tree.add(chain, urdf)
             chains.append(chain)
@@ -192,17 +192,17 @@ def _chains(
             couplings += urdf.couplings
     tree.complete &= top.complete
     if not chains and tree.complete:
-        note(top.fail("chains", "there are no chains, add one under 'chains:'"))
+        flag(top.fail("chains", "there are no chains, add one under 'chains:'"))
         tree.complete = False
     if not tree.joints and tree.complete:
-        note(top.fail("chains", "no joint of these chains moves, add one"))
+        flag(top.fail("chains", "no joint of these chains moves, add one"))
     return tuple(chains), tree, friction, couplings
 
 
 def _loops(top: Section, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
     loops: dict[str, LoopSpec] = {}
     for item in top.sections("loops", "loop", "name", "type", "predecessor", "successor", "axis"):
-        with kept():
+        with recoverable():
             loop = _loop(item, tree)
             if loop.name in loops:
                 raise item.fail("name", f"two loops are named '{loop.name}', rename one")
@@ -215,16 +215,16 @@ def _loop(section: Section, tree: TreeBuilder) -> LoopSpec:
     what = f"loop '{name}'" if name else "a loop"
     if kind and kind not in LOOP_TYPES:
         problem = f"{what} has the unknown type '{kind}', {known(LOOP_TYPES, kind)}"
-        note(section.fail("type", problem))
+        flag(section.fail("type", problem))
     ends = []
     for end in ("predecessor", "successor"):
         frame = section.text(end)
         if frame and frame not in tree.links and tree.complete:
             problem = f"{what} has the unknown {end} '{frame}', {known(tree.links, frame)}"
-            note(section.fail(end, problem))
+            flag(section.fail(end, problem))
         ends.append(frame)
     axis = None
-    with kept():
+    with recoverable():
         axis = unit_vector(section.numbers("axis", (0.0, 0.0, 1.0)))
         if axis is None:
             problem = f"the axis of {what} is no direction"
@@ -245,7 +245,7 @@ def _places(loops: tuple[LoopSpec, ...], couplings: tuple[Coupling, ...]) -> dic
 def _couplings(top: Section, tree: TreeBuilder) -> tuple[Coupling, ...]:
     found: dict[str, Coupling] = {}
     for item in top.sections("couplings", "coupling", "name", "joints", "offset"):
-        with kept():
+        with recoverable():
             name, joints = item.text("name"), item.section("joints", "'joints'")
             if name in found:
                 raise item.fail("name", f"two couplings are named '{name}', rename one")
@@ -254,7 +254,7 @@ def _couplings(top: Section, tree: TreeBuilder) -> tuple[Coupling, ...]:
                 raise item.fail("joints", problem)
             factors = {}
             for joint in joints:
-                with kept():
+                with recoverable():
                     tree.check_joint(joint, joints.where(joint))
                     factors[joint] = joints.number(joint)
                     if factors[joint] == 0:
@@ -275,9 +275,9 @@ def _payload(top: Section, tree: TreeBuilder, tip: str | None) -> Load | None:
     urdf = read_urdf(section.file("urdf"))
     for joint in urdf.tree.moving:
         problem = f"joint '{joint.name}' moves, a payload is rigid: make it fixed"
-        note(DescriptionError(f"{joint.where}: {problem}"))
+        flag(DescriptionError(f"{joint.where}: {problem}"))
     for loop in urdf.loops:
-        note(DescriptionError(f"{loop.where}: a payload has no <loop>, remove it"))
+        flag(DescriptionError(f"{loop.where}: a payload has no <loop>, remove it"))
     if not urdf.tree.mass:
         raise section.fail(
             "urdf", f"no link of {urdf.file.name} has a mass, give one an <inertial>"
@@ -293,10 +293,10 @@ def _control(top: Section, active: tuple[str, ...]) -> dict[str, PIGains]:
     gains, named = {}, []
     for joint, item in top.mappings("control", "control of", "kp", "ki"):
         named.append(joint)
-        with kept():
+        with recoverable():
             if joint not in active:
                 raise item.fail(None, f"'{joint}' is not an active joint, {known(active, joint)}")
-        with kept():
+        with recoverable():
             kp, ki = (item.number(key, minimum=0.0) for key in ("kp", "ki"))
             gains[joint] = PIGains(kp, ki)
     missing = [joint for joint in active if named and joint not in named]

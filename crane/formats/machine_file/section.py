@@ -9,7 +9,7 @@ from typing import Any, overload
 import yaml
 
 from crane.common.errors import DescriptionError, known
-from crane.description.findings import kept, note
+from crane.description.findings import flag, recoverable
 from crane.description.sources import bundled
 
 
@@ -40,19 +40,19 @@ def _construct_map(loader: _Loader, node: yaml.MappingNode) -> _Map:
         line = key_node.start_mark.line + 1
         where = f"{Path(loader.name).name}:{line}"
         if key_node.tag == "tag:yaml.org,2002:merge":
-            note(DescriptionError(f"{where}: '<<' is not supported, write the keys out"))
+            flag(DescriptionError(f"{where}: '<<' is not supported, write the keys out"))
             continue
         key = loader.construct_object(key_node, deep=True)
         if not isinstance(key, str):
             number = isinstance(key, int) and not isinstance(key, bool)
             hint = ", and decimals with a point" if number else ""
             problem = f"key {_shown(key)} is not a name, write names in quotes{hint}"
-            note(DescriptionError(f"{where}: {problem}"))
+            flag(DescriptionError(f"{where}: {problem}"))
             continue
         if key in data:
             first = data.lines[key]
             problem = f"key '{key}' is there twice (first in line {first}), keep one"
-            note(DescriptionError(f"{where}: {problem}"))
+            flag(DescriptionError(f"{where}: {problem}"))
             continue
         data[key] = loader.construct_object(value_node, deep=True)
         data.lines[key] = line
@@ -150,7 +150,7 @@ class Section:
             near = near or [known for known in keys if known.lower() == key.lower()]
             meant = bool(near) and near[0] not in self._data
             problem = f"unknown key '{key}' in {self.title}, {known(keys, key)}"
-            note(self.fail(key, problem), harmless=True)
+            flag(self.fail(key, problem), harmless=True)
             if meant:
                 self._data[near[0]] = self._data[key]
                 self._data.lines[near[0]] = self._data.lines[key]
@@ -181,7 +181,7 @@ class Section:
         try:
             return self._text(key, default)
         except DescriptionError as error:
-            note(error)
+            flag(error)
             return ""
 
     def _text(self, key: str, default: str | None) -> str | None:
@@ -206,7 +206,7 @@ class Section:
                 )
             return number
         except DescriptionError as error:
-            note(error)
+            flag(error)
             return math.nan
 
     def _number(self, key: str, value: Any) -> float:
@@ -306,12 +306,12 @@ class Section:
     def mappings(self, key: str, title: str, *keys: str) -> "Iterator[tuple[str, Section]]":
         """Names and mappings of a mapping of mappings with these keys."""
         outer = None
-        with kept():
+        with recoverable():
             outer = self.section(key, f"'{key}'")
         for name in outer._data if outer is not None else ():
             assert outer is not None
             inner = None
-            with kept():
+            with recoverable():
                 inner = outer.section(name, f"{title} '{name}'")
                 if inner is None or not inner._data:
                     inner = None
@@ -329,13 +329,13 @@ class Section:
             return
         if not isinstance(value, list):
             problem = f"'{key}' is {_shown(value)}, give a list, its items with '- '"
-            note(self.fail(key, problem))
+            flag(self.fail(key, problem))
             self.complete = False
             return
         for item in value:
             if not isinstance(item, _Map):
                 problem = f"'{key}' lists {_shown(item)}, write each item as {{key: value}}"
-                note(self.fail(key, problem))
+                flag(self.fail(key, problem))
                 self.complete = False
                 continue
             name = item.get("name", item.get("joint"))

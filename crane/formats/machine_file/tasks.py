@@ -1,6 +1,6 @@
 """The section `tasks` of a machine file."""
 
-from crane.description.findings import Anything, kept, note
+from crane.description.findings import Anything, flag, recoverable
 from crane.description.spec import Task
 from crane.formats.machine_file.section import Section
 
@@ -16,10 +16,10 @@ def read_tasks(
     tasks = {}
     keys = ("description", "duration", "tip", "active", "joystick")
     for name, item in top.mappings("tasks", "task", *keys):
-        with kept():
+        with recoverable():
             duration = item.number("duration", minimum=0.0)
             if duration == 0:
-                note(item.fail("duration", f"task '{name}' takes no time, give a duration"))
+                flag(item.fail("duration", f"task '{name}' takes no time, give a duration"))
             spaces = {"tip": ("x", "y", "z"), "active": active, "joystick": valves}
             given = [
                 (space, section)
@@ -40,13 +40,13 @@ def read_tasks(
             if space == "joystick":
                 levers = {}
                 for joint in polynomials:
-                    with kept():
+                    with recoverable():
                         levers[joint] = _lever(polynomials, joint, duration)
                 tasks[name] = Task(name, description, duration, space, {}, levers)
                 continue
             coefficients = {}
             for key in spaces[space]:
-                with kept():
+                with recoverable():
                     coefficients[key] = polynomials.numbers(key)
             tasks[name] = Task(name, description, duration, space, coefficients)
     return tasks

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Iterator
 
 from crane.common.errors import CraneError, DescriptionError, known
-from crane.description.findings import FollowUpError, kept, note
+from crane.description.findings import FollowUpError, flag, recoverable
 from crane.description.spec import Chain, LoopSpec
 from crane.description.tree import Joint, Link, Tree
 from crane.formats.machine_file.section import Section
@@ -40,7 +40,7 @@ class TreeBuilder:
             DescriptionError: The frame is unknown, or a name is taken by an earlier chain.
         """
         self._body[urdf.root] = urdf.root
-        with kept():
+        with recoverable():
             self._hang(chain, urdf)
         parts = list(urdf.tree)
         free = list(self.free(parts))
@@ -57,7 +57,7 @@ class TreeBuilder:
             if earlier is None:
                 yield part
                 continue
-            note(_taken(part, earlier))
+            flag(_taken(part, earlier))
             if earlier.where == part.where:
                 return  # one file twice: the rest of it is there, too
 

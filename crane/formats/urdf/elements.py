@@ -8,7 +8,7 @@ import numpy as np
 from lxml import etree
 
 from crane.common.errors import CraneWarning
-from crane.description.findings import FollowUpError, kept, note
+from crane.description.findings import FollowUpError, flag, recoverable
 from crane.description.inertia import inertia_problem
 from crane.description.spec import Friction
 from crane.description.tree import Inertial, Joint, Limits, Link, limit
@@ -28,10 +28,10 @@ def read_link(xml: XmlFile, name: str, element: etree._Element, moved: bool) -> 
     what = f"link '{name}'"
     between = element.get("between") if element.find("inertial") is None else None
     link = Link(name, xml.where(element), between=between)
-    with kept():
+    with recoverable():
         if any(map(any, xml.placement(element, what))):
             raise xml.fail(element, f"{what} has an <origin>, which is its joint's: move it there")
-    with kept(harmless=True):
+    with recoverable(harmless=True):
         inertial = xml.only(element, "inertial", what)
         if inertial is None:
             return link
@@ -43,7 +43,7 @@ def _read_inertial(xml: XmlFile, what: str, inertial: etree._Element, moved: boo
     mass_tag, tensor_tag = (xml.only(inertial, tag, what) for tag in ("mass", "inertia"))
     for tag, found in (("mass", mass_tag), ("inertia", tensor_tag)):
         if found is None:
-            note(xml.fail(inertial, f"the inertial of {what} has no <{tag}>, add it"))
+            flag(xml.fail(inertial, f"the inertial of {what} has no <{tag}>, add it"))
     com, rpy = xml.placement(inertial, what)
     if mass_tag is None or tensor_tag is None:
         raise FollowUpError(f"{what} has no inertia")
@@ -97,7 +97,7 @@ def read_several(
     for tag in ("dynamics", "mimic"):
         if (found := xml.only(element, tag, what)) is not None:
             problem = f"{what} is {kind}, for which <{tag}> has no meaning, remove it"
-            note(xml.fail(found, problem))
+            flag(xml.fail(found, problem))
     axis = xml.direction(element, what, (1.0, 0.0, 0.0))
     place = xml.placement(element, what)
     return series(name, parts_of(kind, axis), place, ends, xml.where(element))
@@ -117,7 +117,7 @@ def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
         return Limits(where=xml.where(joint))
     found: dict[str, float] = {}
     for key in ("effort", "velocity"):
-        with kept(harmless=True):
+        with recoverable(harmless=True):
             if element.get(key) is not None:
                 value = xml.number(element, key, f"the limit of {what}")
                 if value < 0:
@@ -138,7 +138,7 @@ def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
         both = f"lower and upper limit of {what} are both {lower:g}"
         problem = f"{both}, widen them or make it fixed"
     if problem:
-        note(xml.fail(element, problem))
+        flag(xml.fail(element, problem))
     return dataclasses.replace(limits, lower=limit(lower), upper=limit(upper))
 
 

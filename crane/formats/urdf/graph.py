@@ -6,7 +6,7 @@ from difflib import get_close_matches
 from lxml import etree
 
 from crane.common.errors import known
-from crane.description.findings import kept, note
+from crane.description.findings import flag, recoverable
 from crane.formats.series import SEVERAL
 from crane.formats.urdf.loops import unknown_link
 from crane.formats.xml import XmlFile
@@ -50,7 +50,7 @@ def _ends(
     what, kinds = f"joint '{name}'", (*MOVING, *SEVERAL, "fixed")
     kind = joint.get("type")
     if kind not in kinds:
-        note(
+        flag(
             xml.fail(
                 joint,
                 f"{what} has no type, {known(kinds)}"
@@ -70,14 +70,14 @@ def _ends(
         tag = xml.only(joint, end, what)
         link = "" if tag is None else tag.get("link", "").strip()
         if not link:
-            note(xml.fail(joint, f'{what} has no {end} link, add <{end} link="..."/>'))
+            flag(xml.fail(joint, f'{what} has no {end} link, add <{end} link="..."/>'))
         elif link not in links:
-            with kept():
+            with recoverable():
                 raise unknown_link(xml, tag, f"{what} has the unknown {end}", link, links)
             link = ""
         ends.append(link)
     if ends[0] and ends[0] == ends[1]:
-        note(xml.fail(joint, f"{what} joins link '{ends[0]}' to itself, change one end"))
+        flag(xml.fail(joint, f"{what} joins link '{ends[0]}' to itself, change one end"))
         return _CUT
     return ends[0], ends[1]
 
@@ -93,7 +93,7 @@ def _root(
     above: dict[str, tuple[str, str]] = {}  # link -> parent, joint
     for name, (parent, child) in ends.items():
         if child in above:
-            note(
+            flag(
                 xml.fail(
                     joints[name],
                     f"link '{child}' has two parents, joints '{above[child][1]}' and '{name}': "
@@ -113,7 +113,7 @@ def _root(
             if at in seen:
                 last = above[at][1]
                 ring = _ring(above, at)
-                note(
+                flag(
                     xml.fail(
                         joints[last],
                         f"link '{at}' is its own ancestor: cut the ring of joints {ring} at "
@@ -128,7 +128,7 @@ def _root(
     lost = len(xml.root.findall("joint")) - joined  # joints that may have had a root as child
     if len(roots) - lost > 1:
         listed = ", ".join(roots[:4]) + (", ..." if len(roots) > 4 else "")
-        note(
+        flag(
             xml.fail(
                 links[roots[1]], f"{len(roots)} links have no parent ({listed}): join all but one"
             )

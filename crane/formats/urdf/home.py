@@ -5,7 +5,7 @@ from collections.abc import Container, Mapping
 from lxml import etree
 
 from crane.common.errors import DescriptionError, known
-from crane.description.findings import kept
+from crane.description.findings import recoverable
 from crane.formats.xml import XmlFile
 
 _HOME, _TIP = "home", "tip"
@@ -27,7 +27,7 @@ def read_home(xml: XmlFile, joints: Container[str]) -> tuple[dict[str, float], d
         if state.get("name", "").strip() != _HOME:
             continue
         for joint in state.iterfind("joint"):
-            with kept():
+            with recoverable():
                 name, value = _coordinate(xml, joint, joints)
                 if name in home:
                     raise xml.fail(joint, f"home of '{name}' is there twice, keep one")

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from lxml import etree
 
 from crane.common.errors import CraneError, known
-from crane.description.findings import FollowUpError, kept, note
+from crane.description.findings import FollowUpError, flag, recoverable
 from crane.description.spec import LoopSpec
 from crane.description.tree import Joint
 from crane.formats.series import SEVERAL, names_of, parts_of
@@ -33,7 +33,7 @@ def read_loops(
     """
     loops, frames = [], []
     for name, element in elements.items():
-        with kept():
+        with recoverable():
             loop, ends = _loop(xml, name, element, links)
             loops.append(loop)
             frames += ends
@@ -47,21 +47,21 @@ def _loop(
     kind = element.get("type", "")
     if kind not in _TYPES:
         problem = f"the unknown type '{kind}'" if kind else "no type"
-        note(xml.fail(element, f"{what} has {problem}, {known(_TYPES, kind or None)}"))
+        flag(xml.fail(element, f"{what} has {problem}, {known(_TYPES, kind or None)}"))
     ends = []
     for end in ("predecessor", "successor"):
         tag = xml.only(element, end, what)
         link = "" if tag is None else tag.get("link", "").strip()
         if not link:
-            note(xml.fail(element, f'{what} has no {end}, add <{end} link="..."/>'))
+            flag(xml.fail(element, f'{what} has no {end}, add <{end} link="..."/>'))
             continue
         if link not in links:
-            with kept():
+            with recoverable():
                 raise unknown_link(xml, tag, f"{what} has the unknown {end}", link, links)
         if f"{name}_{end}" in links:
             named = links[f"{name}_{end}"]
             problem = f"link '{name}_{end}' has the name of a frame of {what}, rename one"
-            note(xml.fail(named, problem))
+            flag(xml.fail(named, problem))
         xyz, rpy = xml.placement(tag, f"the {end} of {what}")
         frame = f"{name}_{end}"
         ends.append(Joint(f"{frame}_fixed", "fixed", link, frame, where, xyz, rpy))
@@ -100,11 +100,11 @@ def independent(xml: XmlFile, joints: Mapping[str, etree._Element]) -> tuple[str
         joint.set("independent", value)
         if value not in ("true", "false"):
             problem = f"independent=\"{value}\" of joint '{name}' is neither true nor false"
-            note(xml.fail(joint, problem))
+            flag(xml.fail(joint, problem))
             value = "true"
             joint.set("independent", value)
         if value == "true" and joint.get("type") == "fixed":
-            note(xml.fail(joint, f"joint '{name}' is fixed and independent, keep one of the two"))
+            flag(xml.fail(joint, f"joint '{name}' is fixed and independent, keep one of the two"))
             joint.set("independent", "false")
     if not marked:
         return None

@@ -8,7 +8,7 @@ from pathlib import Path
 from lxml import etree
 
 from crane.common.errors import known
-from crane.description.findings import FollowUpError, kept, note, noted
+from crane.description.findings import FollowUpError, flag, recoverable, remember_file
 from crane.description.spec import Coupling, Friction, LoopSpec
 from crane.description.tree import Joint, Link, Tree
 from crane.formats.series import SEVERAL
@@ -120,7 +120,7 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         DescriptionError: With file, line, and what is wrong.
     """
     xml = XmlFile(file)
-    noted(xml)
+    remember_file(xml)
     if xml.root.tag != "robot":
         raise xml.fail(xml.root, f"a URDF starts with <robot>, this file with <{xml.root.tag}>")
     xml.check(xml.root, _CHILDREN, _ATTRIBUTES, _EXACT)
@@ -128,7 +128,7 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         edit(xml)
     for tag, now in _EARLY.items():
         for element in xml.root.iterfind(tag):
-            note(xml.fail(element, f"<{tag}> is not read, URDF+ has <{now}> for it: write one"))
+            flag(xml.fail(element, f"<{tag}> is not read, URDF+ has <{now}> for it: write one"))
     links, joints = _named(xml, "link"), _named(xml, "joint")
     warn_of_strangers(xml, _CHILDREN, _ATTRIBUTES, joints)
     if not links:
@@ -137,27 +137,27 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
     moved = {ends[name][1] for name, joint in joints.items() if joint.get("type") != "fixed"}
     parts: list[Link | Joint] = []
     for name, link in links.items():
-        with kept():
+        with recoverable():
             parts.append(read_link(xml, name, link, name in moved))
     friction = {}
     for name, joint in joints.items():
         if joint.get("type") in SEVERAL:
-            with kept():
+            with recoverable():
                 for part in read_several(xml, name, joint, ends[name]):
                     kind, taken = ("link", links) if isinstance(part, Link) else ("joint", joints)
                     if part.name in taken:
                         problem = f"its {kind} '{part.name}' is there already, rename one"
-                        note(xml.fail(joint, problem))
+                        flag(xml.fail(joint, problem))
                     else:
                         parts.append(part)
             continue
-        with kept():
+        with recoverable():
             read = dataclasses.replace(read_joint(xml, name, joint, ends[name]), cut=name in cut)
             parts.append(read)
             if read.moves:
                 limits = read_limits(xml, name, joint)
                 parts[-1] = dataclasses.replace(read, limits=limits)
-        with kept(harmless=True):
+        with recoverable(harmless=True):
             if (found := read_friction(xml, name, joint)) is not None:
                 friction[name] = found
     driven = independent(xml, joints)
@@ -165,12 +165,12 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
     for frame in frames:
         parts.append(Link(frame.child, frame.where))
         if (same := joints.get(frame.name)) is not None:
-            note(xml.fail(same, f"joint '{frame.name}' has the name of a loop's, rename it"))
+            flag(xml.fail(same, f"joint '{frame.name}' has the name of a loop's, rename it"))
             continue
         parts.append(frame)
     couplings = _mimics(xml, joints, driven)
     for name, element in _named(xml, "coupling").items():
-        with kept():
+        with recoverable():
             couplings += (read_coupling(xml, name, element, joints, ends, links),)
     tree = Tree({}, {}).replacing(*parts)
     home, home_lines = read_home(xml, {joint.name for joint in tree.moving})
@@ -200,7 +200,7 @@ def _mimics(
         mimic = xml.only(joint, "mimic", f"joint '{name}'")
         if mimic is None or name not in moving:
             continue
-        with kept():
+        with recoverable():
             found.append(_mimic(xml, name, mimic, joints, moving, driven or ()))
     return tuple(found)
 
@@ -242,12 +242,12 @@ def _named(xml: XmlFile, kind: str) -> dict[str, etree._Element]:
         name = element.get("name", "").strip()
         if not name:
             xml.nameless.add(kind)
-            note(xml.fail(element, f'a {kind} has no name, add name="..."'))
+            flag(xml.fail(element, f'a {kind} has no name, add name="..."'))
         elif name in found:
             xml.nameless.add(kind)
             first = found[name].sourceline
             problem = f"{kind} '{name}' is there twice (first in line {first}), rename one"
-            note(xml.fail(element, problem))
+            flag(xml.fail(element, problem))
         else:
             found[name] = element
     return found

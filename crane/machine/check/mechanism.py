@@ -12,7 +12,7 @@ from crane.closure.structure import least_squares_step
 from crane.common.errors import CraneWarning, DescriptionError, MechanismError
 from crane.common.samples import Array
 from crane.description import MachineSpec
-from crane.description.findings import Findings, note
+from crane.description.findings import Findings, flag
 from crane.machine.ambiguity import warn_of_assemblies
 from crane.machine.assemble import assemble, closed, home_guess
 
@@ -42,7 +42,7 @@ def check_mechanism(spec: MachineSpec, found: Findings) -> Closure | None:
         except MechanismError as error:
             idle = [loop for loop in loops if error.about == f"loop {loop.name}"]
             if "locks nothing" in str(error) and idle:
-                note(error)
+                flag(error)
                 loops.remove(idle[0])
                 continue
             _note_with_gaps(spec, model, guess, error)
@@ -58,10 +58,10 @@ def _note_with_gaps(
     """Note an error; where loops stay open, how far each does."""
     gaps = _gaps(spec, model, guess) if "cannot be closed" in str(error) else {}
     apart = gaps.pop(error.about, "")
-    note(MechanismError(f"{error}{f' (it is {apart})' if apart else ''}", error.about))
+    flag(MechanismError(f"{error}{f' (it is {apart})' if apart else ''}", error.about))
     for about, gap in gaps.items():
         what = f"loop '{about.removeprefix('loop ')}' stays open, too: it is {gap}"
-        note(MechanismError(f"{spec.where.get(about, spec.path.name)}: {what}", about))
+        flag(MechanismError(f"{spec.where.get(about, spec.path.name)}: {what}", about))
 
 
 def _gaps(spec: MachineSpec, model: pin.Model, guess: Array) -> dict[str, str]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from crane.closure import Closure
 from crane.common.errors import CraneWarning
 from crane.description import MachineSpec
-from crane.description.findings import collecting, kept, note
+from crane.description.findings import collecting, flag, recoverable
 from crane.description.sources import find
 from crane.formats import read
 from crane.machine.check.mechanism import check_mechanism, massless
@@ -95,14 +95,14 @@ def check(name: str | Path) -> Report:
     closure: Closure | None = None
     with warnings.catch_warnings(record=True) as caught, collecting() as found:
         warnings.simplefilter("always", CraneWarning)
-        with kept():
+        with recoverable():
             spec = read(path)
         if spec is not None and found.usable:
-            with kept():
+            with recoverable():
                 closure = check_mechanism(spec, found)
         elif spec is not None:
             for error in massless(spec):
-                note(error)
+                flag(error)
         implausible(found.files, spec)
     findings = [_finding(str(error), True, path.name) for error in found.errors]
     findings += [

@@ -10,7 +10,7 @@ from crane.common.errors import CraneError
 from crane.common.samples import Array
 from crane.recordings.summary import READING_UNITS
 from crane.view.live.playback import Playback
-from crane.view.live.session import Posture, Session, round_up
+from crane.view.live.session import Readout, Session, round_up
 from crane.view.live.stage import Stage
 from crane.view.live.words import numbers, warning
 
@@ -105,7 +105,7 @@ class Page:
             at, self._playing = self._playback.end, False
         self._show(self._go_to(at))
 
-    def _do(self, key: str, value: float) -> Posture:
+    def _do(self, key: str, value: float) -> Readout:
         session = self._session
         if key == _LOAD:
             posture = session.load(value)
@@ -124,21 +124,21 @@ class Page:
         value = float(np.clip(value / scale, session.lower[index], session.upper[index]))
         return session.move(joint, value)
 
-    def _start_or_stop(self) -> Posture:
+    def _start_or_stop(self) -> Readout:
         assert self._playback is not None
         self._playing = not self._playing
         self._told = time.perf_counter()
         at = self._sliders[_TIME].value
         return self._go_to(self._playback.start if at >= self._playback.end else at)
 
-    def _go_to(self, at: float) -> Posture:
+    def _go_to(self, at: float) -> Readout:
         """The posture at a time [s] of the recording."""
         assert self._playback is not None
         q_a, self._recorded = self._playback.at(at)
         self._sliders[_TIME].value = at
         return self._session.place(q_a)
 
-    def _show(self, posture: Posture) -> None:
+    def _show(self, posture: Readout) -> None:
         """Send a posture: links, sliders that are not there, numbers."""
         machine = self._session.machine
         with self._server.atomic():

@@ -21,7 +21,7 @@ _TURN, _WAY = np.pi, 1.0  # how far a slider goes to both sides of home without 
 
 
 @dataclass(frozen=True, eq=False)
-class Posture:
+class Readout:
     """A closed posture and its numbers.
 
     Attributes:
@@ -80,7 +80,7 @@ class Session:
         self.heaviest = round_up(mass / 2)
         self.posture = self._measured(machine.home)
 
-    def move(self, joint: str, value: float) -> Posture:
+    def move(self, joint: str, value: float) -> Readout:
         """Move one active joint, the others held.
 
         Where the loops cannot be closed, the machine goes as far towards the value as they can,
@@ -130,7 +130,7 @@ class Session:
         self.posture = posture
         return posture
 
-    def place(self, q_a: ArrayLike) -> Posture:
+    def place(self, q_a: ArrayLike) -> Readout:
         """Put all active joints (n,) where they are told, wherever they were before.
 
         The machine stays where it is if the loops cannot be closed there.
@@ -142,12 +142,12 @@ class Session:
             self.posture = replace(self.posture, refused=str(error))
         return self.posture
 
-    def home(self) -> Posture:
+    def home(self) -> Readout:
         """Go to the home posture."""
         self.posture = self._measured(self.machine.home)
         return self.posture
 
-    def load(self, mass: float) -> Posture:
+    def load(self, mass: float) -> Readout:
         """Hang a mass [kg] at the tip, in place of what hung there before.
 
         Raises:
@@ -201,7 +201,7 @@ class Session:
             step = min(4 * step, _STEP) if count == len(goals) else step / 8
         return way
 
-    def _measured(self, q: Array) -> Posture:
+    def _measured(self, q: Array) -> Readout:
         """A closed posture (nq,) with its numbers.
 
         Raises:
@@ -218,7 +218,7 @@ class Session:
         condition, weakest = self._condition(q)
         q_a = np.array(q[closure.active])
         rest = np.zeros(len(q_a))
-        return Posture(
+        return Readout(
             q=np.array(q),
             q_a=q_a,
             tip=None if self._kinematics is None else self._kinematics.position_at(q),

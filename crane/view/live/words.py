@@ -8,7 +8,7 @@ from crane.common.units import quantity
 from crane.machine import Machine
 from crane.recordings.recording import FORCE_UNITS
 from crane.recordings.summary import READING_UNITS
-from crane.view.live.session import Posture
+from crane.view.live.session import Readout
 
 _TABLE = '<table style="width:100%;font-size:0.8em;border-spacing:0 0.15em">'
 _HEAD = '<tr style="opacity:0.6">'
@@ -25,7 +25,7 @@ def reading(machine: Machine, joint: str, value: float) -> str:
 
 
 def numbers(
-    machine: Machine, posture: Posture, payload: float, recorded: Array | None = None
+    machine: Machine, posture: Readout, payload: float, recorded: Array | None = None
 ) -> str:
     """Forces, tip, passive joints and the state of the loops as HTML.
 
