@@ -4,8 +4,12 @@ import ctypes
 from collections.abc import Iterable
 from typing import Any
 
+from crane.codegen.llvm.objects import object_code
 from crane.codegen.llvm.text import ENTRY, text_of
 from crane.codegen.representation import Formula, Routine
+
+_SPEED = 2  # of LLVM's levels of optimisation
+_TUNING = {"slp_vectorization": False}  # takes long and gains nothing here
 
 
 class Code:
@@ -16,14 +20,13 @@ class Code:
     """
 
     def __init__(self, functions: Iterable[Formula | Routine]):
-        llvm, target = _target()
-        module = llvm.parse_assembly(text_of(functions))
-        module.verify()
-        options = llvm.create_pipeline_tuning_options(speed_level=2)
-        options.slp_vectorization = False  # takes long and gains nothing here
-        passes = llvm.create_pass_builder(target, options)
-        passes.getModulePassManager().run(module, passes)
-        self._engine = llvm.create_mcjit_compiler(module, target)
+        import llvmlite.binding as llvm
+
+        text, target = text_of(functions), _target()
+        depends = f"{llvm.llvm_version_info} {target.triple} {_cpu()} {_SPEED} {_TUNING} {text}"
+        code = object_code(depends, lambda: _translated(text, target))
+        self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target)
+        self._engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         self._engine.finalize_object()
         self._entries: dict[str, Any] = {}
 
@@ -41,13 +44,33 @@ class Code:
         return found
 
 
-def _target() -> tuple[Any, Any]:
+def _cpu() -> tuple[str, str]:
+    """Name and features of this processor."""
+    import llvmlite.binding as llvm
+
+    return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+
+
+def _target() -> Any:
+    """What to translate for; one per program, because its engine owns it."""
     import llvmlite.binding as llvm
 
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    # one per program: its engine owns it
-    target = llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=2
+    name, features = _cpu()
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=name, features=features, opt=_SPEED
     )
-    return llvm, target
+
+
+def _translated(text: str, target: Any) -> bytes:
+    import llvmlite.binding as llvm
+
+    module = llvm.parse_assembly(text)
+    module.verify()
+    options = llvm.create_pipeline_tuning_options(speed_level=_SPEED)
+    for name, value in _TUNING.items():
+        setattr(options, name, value)
+    passes = llvm.create_pass_builder(target, options)
+    passes.getModulePassManager().run(module, passes)
+    return bytes(target.emit_object(module))

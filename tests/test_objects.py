@@ -1,0 +1,106 @@
+"""Machine code that is kept between runs."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from crane.codegen import Program, Tape
+from crane.codegen.llvm import engine, objects
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    folder = tmp_path / "objects"
+    monkeypatch.setattr(objects, "folder", lambda: folder)
+    return folder
+
+
+@pytest.fixture
+def translated(monkeypatch):
+    """Texts that were translated."""
+    texts, translate = [], engine._translated
+
+    def counted(text, target):
+        texts.append(text)
+        return translate(text, target)
+
+    monkeypatch.setattr(engine, "_translated", counted)
+    return texts
+
+
+def square_sum(factor=3.0):
+    """x y + factor x of a compiled program."""
+    tape, program = Tape(), Program()
+    x, y = tape.loads(0, 0, 2)
+    program.add("formula", 1, [x * y + factor * x])
+    program.compile()
+    out = np.empty(1)
+    program.call("formula", np.array([2.0, 5.0]), out)
+    return out[0]
+
+
+def test_what_was_translated_once_is_read(place, translated):
+    assert square_sum() == 16.0
+    assert square_sum() == 16.0
+    assert len(translated) == 1
+    assert square_sum(4.0) == 18.0  # another program
+    assert len(translated) == 2 and len(list(place.iterdir())) == 2
+
+
+def test_another_process_reads_it(place, translated):
+    square_sum()
+    program = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from pathlib import Path\n"
+        "import test_objects as t\n"
+        "t.objects.folder = lambda: Path(sys.argv[2])\n"
+        "def never(*_): raise AssertionError('translated')\n"
+        "t.engine._translated = never\n"
+        "assert t.square_sum() == 16.0\n"
+    )
+    here = os.path.dirname(__file__)
+    subprocess.run([sys.executable, "-c", program, here, str(place)], check=True)
+
+
+@pytest.mark.parametrize("damage", [b"", b"\0" * 40, None])
+def test_damaged_files_are_made_anew(place, translated, damage):
+    square_sum()
+    (file,) = place.iterdir()
+    whole = file.read_bytes()
+    changed = bytearray(whole)
+    changed[-100] ^= 1
+    file.write_bytes(bytes(changed) if damage is None else damage)
+    assert square_sum() == 16.0
+    assert len(translated) == 2 and file.read_bytes() == whole
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
+def test_a_folder_that_others_may_write_is_not_used(place, translated):
+    place.mkdir(mode=0o700)
+    place.chmod(0o777)
+    assert square_sum() == square_sum() == 16.0
+    assert len(translated) == 2 and not list(place.iterdir())
+
+
+def test_without_a_folder_nothing_is_kept(place, translated):
+    place.write_text("a file")
+    assert square_sum() == square_sum() == 16.0
+    assert len(translated) == 2
+
+
+def test_what_was_used_least_lately_makes_room(place, monkeypatch):
+    for number, name in enumerate("abc"):
+        objects.object_code(name, lambda: b"x" * 100)
+        for file in place.iterdir():
+            if file.stat().st_mtime > 1e9:
+                os.utime(file, (number, number))
+    first = objects.object_code("a", lambda: b"never")  # used now
+    monkeypatch.setattr(objects, "MOST", 350)
+    objects.object_code("d", lambda: b"y" * 100)
+    left = {file.read_bytes()[-1:] for file in place.iterdir()}
+    assert first == b"x" * 100 and left == {b"x", b"y"}
+    assert objects.object_code("a", lambda: b"gone") == first
+    assert objects.object_code("b", lambda: b"gone") == b"gone"
