@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     )
     from crane.description import EndStop, ForceElement, Friction, GasSpring, PIGains
     from crane.dynamics import Dynamics
-    from crane.formats import write_machine, write_mjcf, write_urdf_plus
+    from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
     from crane.identification.hydraulics.cylinder_friction import cylinder_friction
     from crane.identification.hydraulics.orifices import identify_orifices
     from crane.identification.hydraulics.valve import identify_valve
     from crane.identification.mechanics.identify import identify
     from crane.identification.mechanics.result import Identification
-    from crane.machine import Machine, Payload, load
+    from crane.machine import Machine, Payload
     from crane.motion import Kinematics, Path, point_to_point, polynomial, task_path, tip_path
     from crane.motion.workspaces import Workspace, workspace
     from crane.recordings import Recording
@@ -61,6 +61,7 @@ _HOMES = {
     ),
     "crane.dynamics": ("Dynamics",),
     "crane.formats": (
+        "load",
         "write_machine",
         "write_mjcf",
         "write_urdf_plus",
@@ -73,7 +74,6 @@ _HOMES = {
     "crane.machine": (
         "Machine",
         "Payload",
-        "load",
     ),
     "crane.motion": (
         "Kinematics",

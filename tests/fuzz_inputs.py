@@ -29,8 +29,8 @@ import crane  # noqa: E402
 from crane.cli.runs import read_run  # noqa: E402
 from crane.common.errors import CraneError, CraneWarning  # noqa: E402
 from crane.control import controller, joystick  # noqa: E402
+from crane.formats.check import check  # noqa: E402
 from crane.identification.mechanics.identify import identify  # noqa: E402
-from crane.machine.check import check  # noqa: E402
 from crane.motion.trajectories import task_path  # noqa: E402
 from crane.simulation.replays import replay  # noqa: E402
 from crane.view.page import report  # noqa: E402

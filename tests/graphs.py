@@ -22,7 +22,7 @@ from work import TooMuchWorkError, at_most
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
-from crane.machine.check import check
+from crane.formats.check import check
 
 MOST = 500_000  # lines of the package for one file; the longest of 2500 draws ran a fifth
 

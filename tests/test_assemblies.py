@@ -14,7 +14,7 @@ import crane
 from crane.closure.assemblies import ambiguities
 from crane.common.errors import CraneWarning
 from crane.description import bundled
-from crane.machine.check import check
+from crane.formats.check import check
 
 STROKES = np.arange(0.14, 0.96, 0.02).round(2).tolist()
 CHOICES = re.compile(r"under 'home:' write (.+) for the other \(.+\) or (.+) to keep this one")

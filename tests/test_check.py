@@ -26,7 +26,7 @@ from work import TooMuchWorkError, at_most
 import crane
 from crane.description import bundled, examples
 from crane.formats import write_machine
-from crane.machine.check import Report, check
+from crane.formats.check import Report, check
 
 CHAIN_B1 = "urdf/mini_forwarder/chain_b1.urdf"
 CHAIN_B2 = "urdf/mini_forwarder/chain_b2.urdf"

@@ -10,8 +10,8 @@ import crane
 from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.magnitudes import TURNING, USUAL, doubt
 from crane.control import Signals
+from crane.formats.check import check
 from crane.hydraulics import Supply
-from crane.machine.check import check
 
 
 def told(folder, **numbers):

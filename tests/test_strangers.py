@@ -9,8 +9,8 @@ import crane
 import crane.view.page.visuals
 from crane.common.errors import CraneWarning
 from crane.formats import write_urdf_plus
+from crane.formats.check import check
 from crane.formats.visuals.meshes import mesh_file
-from crane.machine.check import check
 
 COUPLER = '    <parent link="crank_arm"/>\n'
 LIMIT = '<limit lower="-1" upper="1" effort="10" velocity="5"/>'

@@ -10,10 +10,10 @@ import pytest
 
 import crane
 from crane.common.errors import CraneWarning
+from crane.formats.check import check
 from crane.formats.visuals import mesh_process, meshes
 from crane.formats.visuals.visuals import PLAIN, Box, Cylinder, Mesh, Sphere, read_drawn
 from crane.formats.xml import XmlFile
-from crane.machine.check import check
 from crane.view.page import report
 from crane.view.page.visuals import read_visuals
 

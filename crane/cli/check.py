@@ -8,7 +8,7 @@ from crane.cli.shared import MachineName, app
 @app.command()
 def check(file: MachineName) -> None:
     """Say all that is wrong with a machine; exit status 0, 1 with warnings only, 2 with errors."""
-    from crane.machine.check import check as check_machine
+    from crane.formats.check import check as check_machine
 
     report = check_machine(file)
     for finding in report.findings:

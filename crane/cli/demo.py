@@ -5,7 +5,7 @@ from pathlib import Path
 from crane.cli.runs import SUMMARY, write_run, write_views
 from crane.common.output import staging
 from crane.control import PI
-from crane.machine import load
+from crane.formats import load
 from crane.motion.trajectories import task_path
 from crane.simulation import Progress, simulate
 

@@ -14,7 +14,8 @@ from crane.common.errors import (
 )
 from crane.common.output import staging
 from crane.description.sources import find, unchanged
-from crane.machine import Machine, recalled
+from crane.formats import recalled
+from crane.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.measured import is_measured, read_measured
 from crane.recordings.recording import Recording

@@ -95,7 +95,7 @@ def by_joint(
 
 def load(name: str, lock: list[str] | None = None, change: list[str] | None = None) -> "Machine":
     """The machine of that name or path, some joints locked, some numbers changed."""
-    from crane.machine import load as load_machine
+    from crane.formats import load as load_machine
 
     changes = by_joint("--set", change, "NAME=VALUE, as in payload.mass=200")
     return load_machine(name, changes, by_joint("--lock", lock))

@@ -9,12 +9,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from crane.common.errors import CraneError
-
-if TYPE_CHECKING:
-    from crane.formats.xml import XmlFile
 
 MOST = 200  # findings in one run: who has more has one cause for most of them
 
@@ -49,7 +46,7 @@ class Findings:
 
     def __init__(self) -> None:
         self.errors: list[CraneError] = []
-        self.files: list[XmlFile] = []
+        self.files: list[Any] = []
         self.usable = True
         self.full = False
         self.harmless = 0  # open blocks whose errors do not keep it from being assembled
@@ -154,7 +151,7 @@ def aside() -> Iterator[None]:
         _current.reset(token)
 
 
-def remember_file(file: "XmlFile") -> None:
+def remember_file(file: object) -> None:
     """Keep a parsed file for further checks."""
     if (found := _current.get()) is not None:
         found.files.append(file)

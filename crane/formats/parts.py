@@ -5,7 +5,6 @@ import math
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from lxml import etree
@@ -14,9 +13,7 @@ from crane.common.errors import CraneWarning
 from crane.description import Coupling
 from crane.description.tree import NO_LIMIT, Joint, Limits, Link
 from crane.formats.visuals.meshes import mesh_file
-
-if TYPE_CHECKING:
-    from crane.machine import Machine
+from crane.machine import Machine
 
 
 def text(values: Sequence[float] | np.ndarray) -> str:
@@ -77,7 +74,7 @@ def add_joint(robot: etree._Element, joint: Joint) -> etree._Element:
     return element
 
 
-def draw(robot: etree._Element, machine: "Machine", chains: Iterable[str] | None = None) -> None:
+def draw(robot: etree._Element, machine: Machine, chains: Iterable[str] | None = None) -> None:
     """Copy what a machine's URDFs draw to the links of the same names."""
     links = {link.get("name"): link for link in robot.iterfind("link")}
     materials: dict[str, etree._Element] = {}
@@ -127,12 +124,12 @@ def finished(robot: etree._Element, comment: str) -> bytes:
     return head.encode() + etree.tostring(robot, encoding="utf-8") + b"\n"
 
 
-def origin_of(machine: "Machine") -> str:
+def origin_of(machine: Machine) -> str:
     """Words on where a written machine comes from."""
     return f"{machine.name}, written by crane; source: {machine.source or machine.path.name}"
 
 
-def left_out(machine: "Machine", what: str, names: Sequence[str] | Iterator[str]) -> None:
+def left_out(machine: Machine, what: str, names: Sequence[str] | Iterator[str]) -> None:
     """Warn of what a format has no place for."""
     if names := list(names):
         warnings.warn(
@@ -143,7 +140,7 @@ def left_out(machine: "Machine", what: str, names: Sequence[str] | Iterator[str]
         )
 
 
-def plain_friction(machine: "Machine") -> list[str]:
+def plain_friction(machine: Machine) -> list[str]:
     """Joints with a friction law of more than Coulomb and viscous friction."""
     return [
         f"the friction law of {joint}"
@@ -154,7 +151,7 @@ def plain_friction(machine: "Machine") -> list[str]:
     ]  # fmt: skip
 
 
-def only_in_machine_files(machine: "Machine") -> list[str]:
+def only_in_machine_files(machine: Machine) -> list[str]:
     """Sections of a machine that no other format has."""
     sections = {
         "gas springs": machine.gas_springs,

@@ -18,8 +18,8 @@ from crane.common.errors import CraneError, CraneWarning, InputError, at, known
 from crane.common.samples import Array, as_count, as_samples, as_seed
 from crane.description import parameters
 from crane.dynamics import Dynamics
-from crane.formats import read
-from crane.machine import Machine, load
+from crane.formats import load, read
+from crane.machine import Machine
 from crane.studies.measures import (
     notes,
     of_strokes,

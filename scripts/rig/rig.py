@@ -18,7 +18,8 @@ from crane.common.errors import (
 from crane.common.samples import Array, as_number, as_seed
 from crane.control import PI, Traced
 from crane.dynamics import Dynamics
-from crane.machine import Machine, load
+from crane.formats import load
+from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.trajectories import Path, beyond_limits
 from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS, Recording

@@ -6,7 +6,7 @@ import shutil
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lxml import etree
 
@@ -17,12 +17,10 @@ from crane.formats.machine_file.read import read
 from crane.formats.parts import add_joint, add_link, draw, finished, origin_of
 from crane.hydraulics import Hydraulics, Valve
 from crane.hydraulics.components import number_names
-
-if TYPE_CHECKING:
-    from crane.machine import Machine
+from crane.machine import Machine
 
 
-def write_machine(machine: "Machine", folder: str | Path) -> Path:
+def write_machine(machine: Machine, folder: str | Path) -> Path:
     """Write a machine as a machine file, with one URDF per sub-chain beside it.
 
     Args:
@@ -66,7 +64,7 @@ class _Chains:
         machine: The machine.
     """
 
-    def __init__(self, machine: "Machine"):
+    def __init__(self, machine: Machine):
         self.machine, self.tree = machine, machine.tree
         self.chains = [chain for chain in machine.chains if chain.name != "payload"]
         self.names = [chain.name for chain in self.chains]
@@ -96,7 +94,7 @@ class _Chains:
         return robot
 
 
-def _content(machine: "Machine", chains: _Chains) -> dict[str, Any]:
+def _content(machine: Machine, chains: _Chains) -> dict[str, Any]:
     """The machine file, without the payload."""
     data: dict[str, Any] = {"name": machine.name}
     if machine.source:
@@ -199,7 +197,7 @@ def _valve(valve: Valve) -> dict[str, Any]:
     return {"type": "compensated", **given, **rest}
 
 
-def _payload(machine: "Machine") -> Path | None:
+def _payload(machine: Machine) -> Path | None:
     """The file of the load that the machine can carry, None where there is none, or it does."""
     if machine.path.suffix.lower() not in (".yaml", ".yml") or "payload.mass" in machine.changes:
         return None

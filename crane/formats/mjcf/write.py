@@ -2,7 +2,6 @@
 
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -21,16 +20,14 @@ from crane.formats.parts import (
     plain_friction,
     text,
 )
-
-if TYPE_CHECKING:
-    from crane.machine import Machine
+from crane.machine import Machine
 
 _LEVER = 0.1  # [m] between the two points that make a hinge
 _SAME = 1e-9  # share of an inertia that counts as rounding
 _LEAST = 1e-14  # [kg m2] moment of inertia that MuJoCo still takes
 
 
-def write_mjcf(machine: "Machine", path: str | Path) -> None:
+def write_mjcf(machine: Machine, path: str | Path) -> None:
     """Write a machine as a MJCF file with equality constraints between sites.
 
     Spherical loops become `connect`, fixed ones `weld`, revolute ones two `connect` at points of
@@ -62,7 +59,7 @@ class _Writer:
         machine: The machine.
     """
 
-    def __init__(self, machine: "Machine"):
+    def __init__(self, machine: Machine):
         self.machine, self.model, self.tree = machine, machine.model, machine.tree
         self.joints = range(1, self.model.njoints)
         moved = [self.tree.joints[name].child for name in machine.joints]

@@ -1,7 +1,6 @@
 """One URDF with the elements of URDF+."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from lxml import etree
 
@@ -22,12 +21,10 @@ from crane.formats.parts import (
     plain_friction,
     text,
 )
-
-if TYPE_CHECKING:
-    from crane.machine import Machine
+from crane.machine import Machine
 
 
-def write_urdf_plus(machine: "Machine", path: str | Path) -> None:
+def write_urdf_plus(machine: Machine, path: str | Path) -> None:
     """Write a machine as one URDF with `<loop>` and `<coupling>` elements.
 
     The home posture, which names the assembly branch, becomes a `<group_state name="home">`, as
@@ -77,7 +74,7 @@ def write_urdf_plus(machine: "Machine", path: str | Path) -> None:
     left_out(machine, "URDF+", lost)
 
 
-def _add_moving(machine: "Machine", robot: etree._Element, name: str) -> None:
+def _add_moving(machine: Machine, robot: etree._Element, name: str) -> None:
     element = add_joint(robot, machine.tree.joints[name])
     element.set("independent", str(name in machine.active).lower())
     law = machine.friction.get(name)
@@ -97,7 +94,7 @@ def _add_loop(tree: Tree, robot: etree._Element, loop: LoopSpec) -> None:
     etree.SubElement(element, "axis", xyz=text(loop.axis))
 
 
-def _add_coupling(machine: "Machine", robot: etree._Element, coupling: Coupling) -> None:
+def _add_coupling(machine: Machine, robot: etree._Element, coupling: Coupling) -> None:
     """A <coupling> where one says the same, else a <mimic>."""
     joints, slopes, offset = linear(coupling)
     mimics = len(joints) <= 2 and coupling.name == f"{joints[0]}_mimic"
@@ -127,7 +124,7 @@ def _add_coupling(machine: "Machine", robot: etree._Element, coupling: Coupling)
 
 
 def _rolling(
-    machine: "Machine", joints: list[str], slopes: list[float]
+    machine: Machine, joints: list[str], slopes: list[float]
 ) -> tuple[str, str, float] | None:
     """Predecessor, successor and ratio with ratio sum_P q = sum_S q, if there are such links.
 
@@ -150,6 +147,6 @@ def _rolling(
     return links[0], links[1], ratios.pop() if ratios else 1.0
 
 
-def _moved(machine: "Machine", joint: int) -> str:
+def _moved(machine: Machine, joint: int) -> str:
     """The link that a joint of the model moves, the root link for the world."""
     return machine.tree.joints[machine.model.names[joint]].child if joint else machine.tree.root

@@ -15,14 +15,14 @@ from crane.common.errors import CraneError, CraneWarning, InputError, OutputErro
 from crane.common.output import replacing, staging
 from crane.description import Chain, Friction, MachineSpec
 from crane.dynamics import Dynamics
-from crane.formats import read
+from crane.formats import load, read
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base import random_samples
 from crane.identification.mechanics.division import divided
 from crane.identification.mechanics.model import PER_BODY
 from crane.identification.mechanics.result import Identification
 from crane.identification.mechanics.urdf import changed_urdf
-from crane.machine import Machine, load
+from crane.machine import Machine
 
 _SAME = 1e-9  # of the largest force, by which the written machine may differ
 _FRICTION = tuple(item.name for item in dataclasses.fields(Friction))

@@ -8,8 +8,8 @@ from types import MappingProxyType
 from crane.common.errors import DescriptionError, InputError
 from crane.description import changed, locked
 from crane.description.sources import WITH, find
-from crane.formats import read
-from crane.machine.ambiguity import warn_of_assemblies
+from crane.formats.ambiguity import warn_of_assemblies
+from crane.formats.machine_file.read import read
 from crane.machine.assemble import assemble, closed, home_guess
 from crane.machine.machine import Machine, fixed
 

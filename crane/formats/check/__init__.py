@@ -1,5 +1,5 @@
 """Everything that is wrong or unusual about a description, at once."""
 
-from crane.machine.check.report import Finding, Report, check
+from crane.formats.check.report import Finding, Report, check
 
 __all__ = ["Finding", "Report", "check"]

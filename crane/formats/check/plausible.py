@@ -14,9 +14,9 @@ from lxml import etree
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
 from crane.description import MachineSpec, inertia_problem
+from crane.formats.check.geometry import Bounds, extents, numbers
 from crane.formats.visuals.visuals import Drawn, Mesh, read_drawn
 from crane.formats.xml import XmlFile
-from crane.machine.check.geometry import Bounds, extents, numbers
 
 _FAR = 50.0  # [m], a length that no part of a machine has
 _TURN = 2 * math.pi

@@ -13,7 +13,7 @@ from crane.common.errors import CraneWarning, DescriptionError, MechanismError
 from crane.common.samples import Array
 from crane.description import MachineSpec
 from crane.description.findings import Findings, flag
-from crane.machine.ambiguity import warn_of_assemblies
+from crane.formats.ambiguity import warn_of_assemblies
 from crane.machine.assemble import assemble, closed, home_guess
 
 _OPEN = 1e-6  # [m], [rad] from which on a loop is said to be open

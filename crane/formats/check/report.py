@@ -10,9 +10,9 @@ from crane.common.errors import CraneWarning
 from crane.description import MachineSpec
 from crane.description.findings import collecting, flag, recoverable
 from crane.description.sources import find
-from crane.formats import read
-from crane.machine.check.mechanism import check_mechanism, massless
-from crane.machine.check.plausible import implausible
+from crane.formats.check.mechanism import check_mechanism, massless
+from crane.formats.check.plausible import implausible
+from crane.formats.machine_file.read import read
 
 # "four_bar.yaml:12: what", or a file that has no line to point at
 _PLACE = re.compile(r"(?P<file>.+?)(?::(?P<line>\d+)|(?<=\.yaml|\.urdf)|(?<=\.xml|\.yml)): ")
