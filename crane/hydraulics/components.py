@@ -8,7 +8,8 @@ from crane.common.errors import InputError
 from crane.common.magnitudes import meant
 from crane.common.samples import as_number
 
-_NOT_NUMBERS = ("joint", "counterbalance_a", "counterbalance_b")
+HOLDING = ("counterbalance_a", "counterbalance_b")  # valves of a cylinder that hold its load
+_NOT_NUMBERS = ("joint", *HOLDING)
 _LEAST = 1e-50  # of what must be positive: one over its square is still a number
 
 
