@@ -14,10 +14,11 @@ from crane.hydraulics.components import Hydraulics
 def _check(item: object, what: str, *positive: str) -> None:
     """Raise for numbers that are not finite, or negative where that has no meaning."""
     for name, value in vars(item).items():
-        if name != "joint":
-            number = as_number(value, f"{name} of {what}", "")
-            if name in positive and number < 0:
-                raise InputError(f"{name} of {what} is {number:g}, it must not be negative")
+        if name == "joint":
+            continue
+        number = as_number(value, f"{name} of {what}", "")
+        if name in positive and number < 0:
+            raise InputError(f"{name} of {what} is {number:g}, it must not be negative")
 
 
 @dataclass(frozen=True)
