@@ -70,14 +70,20 @@ def last_closed(machine: Machine, q: Array, target: Array) -> tuple[Array, bool]
         if cursor is not None:
             able = closure.fast.follow(cursor, way, out) == 1
         else:
-            try:
-                out[0], able = closure.solve(way[0], guess=last), True
-            except ClosureError:
-                able = False
+            able = _solved(machine, way, last, out)
         if able:
             done, last = goal, out[0].copy()
         step = step * 2 if able else step / 2
     return last, done == 1.0
+
+
+def _solved(machine: Machine, targets: Array, guess: Array, out: Array) -> bool:
+    """Close the loops at targets (1, n) into out (1, nq); whether that worked."""
+    try:
+        out[0] = machine.closure.solve(targets[0], guess=guess)
+    except ClosureError:
+        return False
+    return True
 
 
 def fill(
