@@ -136,7 +136,7 @@ def test_titles():
     for machine, name in (
         ("patu655", "patu655"),
         ("patu655 --set payload.mass=200.5 --lock slew=0.0", "patu655"),
-        ("/home/me/machines/log_crane.yaml", "log_crane"),
+        ("/data/machines/log_crane.yaml", "log_crane"),
     ):
         named = crane.Recording(
             [0.0], ("q",), [[0.0]], [[0.0]], [[0.0]], {"q": "rad"}, machine=machine
