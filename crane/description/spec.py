@@ -1,7 +1,7 @@
 """What a user wrote, read and checked, before anything is assembled."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -86,6 +86,12 @@ class Coupling:
     factors: Mapping[str, float]
     offset: float
     where: str
+
+
+def places(loops: Iterable[LoopSpec], couplings: Iterable[Coupling]) -> dict[str, str]:
+    """Where loops and couplings were written, as errors about them look it up."""
+    written: list[LoopSpec | Coupling] = [*loops, *couplings]
+    return {f"loop {item.name}": item.where for item in written}
 
 
 def unit_vector(xyz: Sequence[float]) -> Vector | None:

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from crane.common.errors import DescriptionError, known
-from crane.description.spec import Chain, LoopSpec, MachineSpec
+from crane.description.spec import Chain, LoopSpec, MachineSpec, places
 from crane.description.tree import Joint, Link, Tree
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
@@ -69,9 +69,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
                 f"the motor '{joint}' is {replaced[joint][0]}, drive a joint with one freedom",
             )
         tree.check_joint(joint, top.where("name_mot"))
-    where = {"active": top.where("name_mot")}
-    where |= {f"loop {loop.name}": loop.where for loop in loops}
-    where |= {f"loop {coupling.name}": coupling.where for coupling in urdf.couplings}
+    where = {"active": top.where("name_mot")} | places(loops, urdf.couplings)
     return MachineSpec(
         name=name,
         source=path.name,

@@ -17,6 +17,7 @@ from crane.description.spec import (
     MachineSpec,
     PIGains,
     Task,
+    places,
     unit_vector,
 )
 from crane.formats.machine_file.circuit import check_active, read_hydraulics
@@ -75,7 +76,7 @@ def _read_single(path: Path) -> MachineSpec:
     for loop in urdf.loops:
         with recoverable():
             tree.check_loop(loop)
-    where = _places(urdf.loops, urdf.couplings)
+    where = places(urdf.loops, urdf.couplings)
     where |= {f"home {joint}": place for joint, place in urdf.home_lines.items()}
     active = urdf.independent
     if urdf.loops and not active:
@@ -110,7 +111,7 @@ def _read_machine(path: Path) -> MachineSpec:
             tree.check_joint(joint, top.where("active"))
     if not all(joint in tree.joints for joint in active):
         active = Anything()
-    where = {key: top.where(key) for key in top} | _places(loops, couplings)
+    where = {key: top.where(key) for key in top} | places(loops, couplings)
     home, home_lines = _home(top, tree)
     where |= {f"home {joint}": place for joint, place in home_lines.items()}
     friction |= _part(read_friction, {}, top, tree)
@@ -259,12 +260,6 @@ def _loop(section: Section, tree: TreeBuilder, before: Container[str]) -> LoopSp
     if name in before:
         raise section.fail("name", f"two loops are named '{name}', rename one")
     return loop
-
-
-def _places(loops: tuple[LoopSpec, ...], couplings: tuple[Coupling, ...]) -> dict[str, str]:
-    """Where loops and couplings were written, as errors about them look it up."""
-    places = {f"loop {loop.name}": loop.where for loop in loops}
-    return places | {f"loop {coupling.name}": coupling.where for coupling in couplings}
 
 
 def _couplings(top: Section, tree: TreeBuilder) -> tuple[Coupling, ...]:

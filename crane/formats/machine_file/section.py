@@ -238,13 +238,15 @@ class Section:
             raise self.fail(key, f"'{key}' of {self.title} is {shown}, give a list such as [0, 1]")
         return tuple(self._number(key, item) for item in value)
 
-    def names(self, key: str) -> tuple[str, ...]:
-        """A list of different names."""
+    def _list(self, key: str, wanted: str) -> list[Any]:
         value = self._take(key, _MISSING)
         if not isinstance(value, list):
-            raise self.fail(
-                key, f"'{key}' of {self.title} is {_shown(value)}, give a list such as [q1, q2]"
-            )
+            raise self.fail(key, f"'{key}' of {self.title} is {_shown(value)}, give {wanted}")
+        return value
+
+    def names(self, key: str) -> tuple[str, ...]:
+        """A list of different names."""
+        value = self._list(key, "a list such as [q1, q2]")
         for item in value:
             if not isinstance(item, str):
                 raise self.fail(
@@ -256,11 +258,7 @@ class Section:
 
     def texts(self, key: str) -> tuple[str, ...]:
         """A list of texts, the same ones perhaps several times."""
-        value = self._take(key, _MISSING)
-        if not isinstance(value, list):
-            raise self.fail(
-                key, f"'{key}' of {self.title} is {_shown(value)}, give a list such as [a, b]"
-            )
+        value = self._list(key, "a list such as [a, b]")
         for item in value:
             if not isinstance(item, str) or not item.isprintable():
                 raise self.fail(key, f"'{key}' lists {_shown(item)}, which is no text, quote it")
@@ -268,11 +266,7 @@ class Section:
 
     def pairs(self, key: str) -> list[tuple[str, str]]:
         """A list of pairs of names."""
-        value = self._take(key, _MISSING)
-        if not isinstance(value, list):
-            raise self.fail(
-                key, f"'{key}' of {self.title} is {_shown(value)}, give a list of pairs [[a, b]]"
-            )
+        value = self._list(key, "a list of pairs [[a, b]]")
         for item in value:
             if not (isinstance(item, list) and len(item) == 2):
                 raise self.fail(key, f"'{key}' lists {_shown(item)}, write pairs as [a, b]")
