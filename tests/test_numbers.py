@@ -135,7 +135,7 @@ def test_titles():
     assert subject(run, "arm") == "arm"
     for machine, name in (
         ("patu655", "patu655"),
-        ("patu655 --set payload.mass=200.5 --lock slew=0.0", "patu655"),
+        ('patu655 with {"changes": {"payload.mass": 200.5}, "lock": {"slew": 0.0}}', "patu655"),
         ("/data/machines/log_crane.yaml", "log_crane"),
     ):
         named = crane.Recording(

@@ -32,9 +32,10 @@ Part = TypeVar("Part", Oil, Supply, Counterbalance, Cylinder, Valve, PDGains)
 
 _TOGETHER = ("tank", "relief")  # looked at with other parts
 _KINDS = ("orifice", "compensated")
-_OF_KIND = dict.fromkeys(("c1", "c2", "c3", "c4"), "orifice") | dict.fromkeys(
-    ("flow", "margin", "meter_out"), "compensated"
-)  # keys that only one kind of valve has
+_OF_KIND = {  # keys that only one kind of valve has
+    "c1": "orifice", "c2": "orifice", "c3": "orifice", "c4": "orifice",
+    "flow": "compensated", "margin": "compensated", "meter_out": "compensated",
+}  # fmt: skip
 
 
 def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) -> Hydraulics | None:
