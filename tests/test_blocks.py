@@ -3,8 +3,10 @@
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
+import motions
 import numpy as np
 import pytest
 
@@ -19,27 +21,12 @@ from crane.identification.signals import smoother
 from crane.identification.signals.motion import Motion, filter_rows
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+motion = partial(motions.motion, period=8.0, duration=16.0, step=2e-3, noise=1.0)
 
 
 @pytest.fixture(scope="module")
 def mini():
     return crane.load("mini_forwarder")
-
-
-def motion(machine, duration=16.0, step=2e-3, seed=0):
-    """Five harmonics, the machine's forces and noise on them."""
-    rng = np.random.default_rng(seed)
-    time = np.arange(0, duration, step)
-    w = 2 * np.pi / 8.0 * np.arange(1, 6)
-    a, b = rng.normal(size=(2, 5, 3))
-    phase = time[:, None] * w
-    q = np.sin(phase) @ (a / w[:, None]) - np.cos(phase) @ (b / w[:, None])
-    v = np.cos(phase) @ a + np.sin(phase) @ b
-    acc = -np.sin(phase) @ (a * w[:, None]) + np.cos(phase) @ (b * w[:, None])
-    size = np.array([1.5, 0.013, 0.013]) / np.abs(q).max(axis=0)
-    q, v, acc = np.array([0, 0.015, 0.015]) + q * size, v * size, acc * size
-    tau = crane.Dynamics(machine).inverse(q, v, acc, friction=True)
-    return Motion(time, q, v, acc, tau + rng.normal(size=tau.shape) * [5e-3, 0.5, 0.3])
 
 
 def rows(seed=0, count=3000):
@@ -98,13 +85,13 @@ def test_covariance_is_that_of_all_rows_at_once():
 @pytest.mark.parametrize("bandwidth", [12.0, 200.0])
 def test_a_recording_in_blocks_is_that_as_a_whole(mini, monkeypatch, bandwidth):
     """With a term that depends on the past; none of the blocks is held."""
-    given = motion(mini, 10.0)
+    given = motion(mini, duration=10.0)
     terms = [*default_terms(mini), Presliding(mini, "X1", 1e-3)]
     settings = {"prior": 0.3, "bandwidth": bandwidth, "terms": terms}
-    whole = identify(mini, given, motion(mini, 8.0, seed=1), **settings)
+    whole = identify(mini, given, motion(mini, duration=8.0, seed=1), **settings)
     monkeypatch.setattr(equations, "_BLOCK", 3 << 20)
     monkeypatch.setattr(equations, "_HELD", 0)
-    found = identify(mini, given, motion(mini, 8.0, seed=1), **settings)
+    found = identify(mini, given, motion(mini, duration=8.0, seed=1), **settings)
     for fit in ("training", "validation"):
         for key in ("measured", "modelled"):
             one, other = (getattr(getattr(x, fit), key) for x in (found, whole))
@@ -116,7 +103,7 @@ def test_a_recording_in_blocks_is_that_as_a_whole(mini, monkeypatch, bandwidth):
 def test_the_equations_are_those_of_one_filter(mini, monkeypatch):
     """Against the whole regressor through the filter at once."""
     monkeypatch.setattr(equations, "_BLOCK", 1 << 19)
-    given, model = motion(mini, 8.0), Model(mini)
+    given, model = motion(mini, duration=8.0), Model(mini)
     found, _ = equations_of(model, given, bandwidth=10.0)
     assert len(list(found.blocks())) > 2
     at = model.samples(given.q, given.v, given.a)
@@ -138,7 +125,7 @@ def test_what_is_held_does_not_grow_with_the_recording(mini, monkeypatch):
         return out
 
     monkeypatch.setattr(Equations, "_unfiltered", spied)
-    given = motion(mini, 3.0)
+    given = motion(mini, duration=3.0)
     for copies in (2, 5):
         parts = (np.tile(x, (copies, 1)) for x in (given.q, given.v, given.a, given.tau))
         time = 2e-3 * np.arange(copies * len(given.time))
@@ -156,7 +143,7 @@ from test_blocks import motion
 from crane.identification.mechanics.identify import identify
 from crane.identification.signals.motion import Motion
 machine = crane.load("mini_forwarder")
-one = motion(machine, 10.0, 1e-3)
+one = motion(machine, duration=10.0, step=1e-3)
 parts = [np.tile(x, (30, 1)) for x in (one.q, one.v, one.a, one.tau)]
 given = Motion(1e-3 * np.arange(len(parts[0])), *parts)
 identify(machine, given, bandwidth=200.0)
@@ -185,6 +172,6 @@ def test_smoothing_does_not_depend_on_the_blocks(monkeypatch):
 
 def test_progress_goes_up_to_one(mini):
     told = []
-    identify(mini, motion(mini, 4.0), prior=0.3, progress=told.append)
+    identify(mini, motion(mini, duration=4.0), prior=0.3, progress=told.append)
     assert len(told) > 3 and told[-1] == 1.0
     assert (np.diff(told) >= 0).all()

@@ -2,9 +2,12 @@
 
 import dataclasses
 import warnings
+from functools import partial
 
+import motions
 import numpy as np
 import pytest
+from motions import NOISE, noisy
 
 import crane
 from crane.common.errors import CraneWarning
@@ -15,7 +18,7 @@ from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.possible import thick
 from crane.identification.signals.motion import Motion
 
-NOISE = np.array([5e-3, 0.5, 0.3])  # [N m], [N], [N]
+motion = partial(motions.motion, period=8.0, duration=16.0)
 
 
 @pytest.fixture(scope="module")
@@ -23,26 +26,6 @@ def mini():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         return crane.load("mini_forwarder")
-
-
-def motion(machine, duration=16.0, step=4e-3):
-    """Five harmonics within the strokes, without forces."""
-    rng = np.random.default_rng(0)
-    time = np.arange(0, duration, step)
-    w = 2 * np.pi / 8.0 * np.arange(1, 6)
-    a, b = rng.normal(size=(2, 5, 3))
-    phase = time[:, None] * w
-    q = np.sin(phase) @ (a / w[:, None]) - np.cos(phase) @ (b / w[:, None])
-    v = np.cos(phase) @ a + np.sin(phase) @ b
-    acc = -np.sin(phase) @ (a * w[:, None]) + np.cos(phase) @ (b * w[:, None])
-    size = np.array([1.5, 0.013, 0.013]) / np.abs(q).max(axis=0)
-    q, v, acc = np.array([0, 0.015, 0.015]) + q * size, v * size, acc * size
-    return Motion(time, q, v, acc, crane.Dynamics(machine).inverse(q, v, acc, friction=True))
-
-
-def noisy(given, seed):
-    noise = NOISE * np.random.default_rng(seed).normal(size=given.tau.shape)
-    return dataclasses.replace(given, tau=given.tau + noise)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +55,7 @@ def test_the_direction_that_is_named_hardly_moves_the_forces(mini, plain):
     """By forces that were not learned from: one magnitude along it is below the noise."""
     unit = np.diag(1 / plain.magnitude)
     values, vectors = np.linalg.eigh(unit @ plain.covariance @ unit)
-    other = motion(mini, 4.0)
+    other = motion(mini, duration=4.0)
     W = plain.model.regressor(plain.model.samples(other.q, other.v, other.a))
     W = W[:, :, plain.base.independent] * plain.magnitude
     effect = np.sqrt(np.mean((W @ vectors[:, -1]) ** 2, axis=0)) / NOISE

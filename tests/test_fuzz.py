@@ -5,32 +5,16 @@ the work, that is the same as before exactly if another parser finds the same wo
 the file. In graphs.py it is that whatever is no tree is told, ring by ring, within such a bound.
 """
 
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
+from judge import judge
 
 FORMATS = ("machine", "urdf", "urdf+", "parallel", "mjcf")
 
 
 def run(kind, first, count, program="fuzz.py"):
-    """Judge drawn files in a process of its own, which some of them may end."""
     if kind == "mjcf":
         pytest.importorskip("mujoco")
-    program = Path(__file__).with_name(program)
-    done = subprocess.run(
-        [sys.executable, str(program), kind, str(first), str(count)],
-        capture_output=True, text=True, timeout=1800,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-    )  # fmt: skip
-    lines = [json.loads(line) for line in done.stdout.splitlines()]
-    wrong = [line for line in lines if "wrong" in line]
-    assert not wrong, wrong[:5]
-    assert done.returncode == 0, f"ended at {lines[-1:]}: {done.stderr[-600:]}"
-    assert lines[-1] == {"done": count}
+    assert judge(program, kind, first, count) == count
 
 
 @pytest.mark.parametrize("kind", FORMATS)

@@ -5,11 +5,14 @@ import dataclasses
 import re
 import sys
 import warnings
+from functools import partial
 
+import motions
 import numpy as np
 import pytest
 from broken import DATA
 from lxml import etree
+from motions import NOISE
 from scipy.interpolate import CubicSpline
 
 import crane
@@ -30,29 +33,12 @@ from crane.identification.signals.motion import Motion
 from crane.view.page.identification import write_report
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
-NOISE = np.array([5e-3, 0.5, 0.3])  # [N m], [N], [N]
+motion = partial(motions.motion, duration=20.0, noise=1.0)
 
 
 @pytest.fixture(scope="module")
 def mini():
     return crane.load("mini_forwarder")
-
-
-def motion(machine, seed=0, noise=1.0, duration=20.0, still=()):
-    """Five harmonics within the strokes, and the machine's forces with noise."""
-    rng = np.random.default_rng(seed)
-    time = np.arange(0, duration, 4e-3)
-    w = 2 * np.pi / 10.0 * np.arange(1, 6)
-    a, b = rng.normal(size=(2, 5, 3))
-    phase = time[:, None] * w
-    q = np.sin(phase) @ (a / w[:, None]) - np.cos(phase) @ (b / w[:, None])
-    v = np.cos(phase) @ a + np.sin(phase) @ b
-    acc = -np.sin(phase) @ (a * w[:, None]) + np.cos(phase) @ (b * w[:, None])
-    size = np.array([1.5, 0.013, 0.013]) / np.abs(q).max(axis=0)
-    size[list(still)] = 0.0
-    q, v, acc = np.array([0, 0.015, 0.015]) + q * size, v * size, acc * size
-    tau = crane.Dynamics(machine).inverse(q, v, acc, friction=True)
-    return Motion(time, q, v, acc, tau + noise * NOISE * rng.normal(size=tau.shape))
 
 
 def as_recording(machine, given):

@@ -1,9 +1,12 @@
 """Identification from motions whose truth is known."""
 
 import dataclasses
+from functools import partial
 
+import motions
 import numpy as np
 import pytest
+from motions import NOISE, noisy
 from rig import Rig, Tolerances, default_sensors
 
 import crane
@@ -17,33 +20,12 @@ from crane.identification.mechanics.model import Inertial, Model, friction
 from crane.identification.signals.motion import Motion
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
-NOISE = np.array([5e-3, 0.5, 0.3])  # [N m], [N], [N]
+motion = partial(motions.motion, step=2e-3)
 
 
 @pytest.fixture(scope="module")
 def mini():
     return crane.load("mini_forwarder")
-
-
-def motion(machine, seed=0, period=10.0, duration=30.0, step=2e-3):
-    """Five harmonics within the strokes, and the forces of the machine's own parameters."""
-    rng = np.random.default_rng(seed)
-    time = np.arange(0, duration, step)
-    w = 2 * np.pi / period * np.arange(1, 6)
-    a, b = rng.normal(size=(2, 5, 3))
-    phase = time[:, None] * w
-    q = np.sin(phase) @ (a / w[:, None]) - np.cos(phase) @ (b / w[:, None])
-    v = np.cos(phase) @ a + np.sin(phase) @ b
-    acc = -np.sin(phase) @ (a * w[:, None]) + np.cos(phase) @ (b * w[:, None])
-    size = np.array([1.5, 0.013, 0.013]) / np.abs(q).max(axis=0)
-    q, v, acc = np.array([0, 0.015, 0.015]) + q * size, v * size, acc * size
-    tau = crane.Dynamics(machine).inverse(q, v, acc, friction=True)
-    return Motion(time, q, v, acc, tau)
-
-
-def noisy(given, seed, level=1.0):
-    noise = level * NOISE * np.random.default_rng(seed).normal(size=given.tau.shape)
-    return Motion(given.time, given.q, given.v, given.a, given.tau + noise)
 
 
 def scales(model):

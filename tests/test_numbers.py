@@ -135,8 +135,8 @@ def test_titles():
     assert subject(run, "arm") == "arm"
     for machine, name in (
         ("patu655", "patu655"),
-        ("patu655 --set payload.mass=200.5 --lock slew=0.0", "patu655"),
-        ("/home/me/machines/log_crane.yaml", "log_crane"),
+        ('patu655 with {"changes": {"payload.mass": 200.5}, "lock": {"slew": 0.0}}', "patu655"),
+        ("/data/machines/log_crane.yaml", "log_crane"),
     ):
         named = crane.Recording(
             [0.0], ("q",), [[0.0]], [[0.0]], [[0.0]], {"q": "rad"}, machine=machine

@@ -61,14 +61,12 @@ def circuit(
 
     if model not in MODELS:
         raise InputError(f"model '{model}' is unknown, {known(MODELS, model)}")
-    if model != "orifices":
-        for option, given in (
-            ("--method", method), ("--period", period), ("--validation", validation),
-        ):  # fmt: skip
-            if given is not None:
-                raise InputError(f"{option} is for --model orifices, leave it out")
-        if len(recording) > 1:
-            raise InputError(f"--model {model} takes one recording, {len(recording)} are given")
+    of_orifices = {"--method": method, "--period": period, "--validation": validation}
+    given = [option for option, value in of_orifices.items() if value is not None]
+    if model != "orifices" and given:
+        raise InputError(f"{given[0]} is for --model orifices, leave it out")
+    if model != "orifices" and len(recording) > 1:
+        raise InputError(f"--model {model} takes one recording, {len(recording)} are given")
     if out is not None:
         check_folder(out, force)
     loaded = load(machine, lock, change)

@@ -155,21 +155,26 @@ def write_identification(
         OutputError: The folder or a file cannot be written.
         InputError: A feasible estimate that is no machine.
     """
-    from crane.identification.mechanics.write import write_machine, write_parameters
+    from crane.identification.mechanics.write import write_parameters
     from crane.view.page.identification import write_report
 
     with staging(folder) as part:
         write_report(result, part / "report.html", recording, validation)
         write_parameters(result, part / "parameters.csv")
-        if result.parameters is None:
-            return
-        try:
-            write_machine(result, part / "machine")
-        except InputError as error:
-            if result.feasible:
-                raise
-            text = f"no machine files are written: {error} (on the command line --feasible)"
-            warnings.warn(text, CraneWarning, stacklevel=2)
+        if result.parameters is not None:
+            _write_machine(result, part / "machine")
+
+
+def _write_machine(result: "Identification", folder: Path) -> None:
+    from crane.identification.mechanics.write import write_machine
+
+    try:
+        write_machine(result, folder)
+    except InputError as error:
+        if result.feasible:
+            raise
+        text = f"no machine files are written: {error} (on the command line --feasible)"
+        warnings.warn(text, CraneWarning, stacklevel=3)
 
 
 def read_run(path: Path, machine: Machine | None = None) -> Recording:

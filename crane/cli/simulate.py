@@ -47,9 +47,10 @@ def simulate(
     check_folder(out, force)
     loaded = load(machine, lock, change)
     if inputs is not None:
-        for option, given in (("--task", task), ("--controller", controller)):
-            if given is not None:
-                raise InputError(f"{option} does not go with --inputs, leave one out")
+        named = {"--task": task, "--controller": controller}
+        given = [option for option, value in named.items() if value is not None]
+        if given:
+            raise InputError(f"{given[0]} does not go with --inputs, leave one out")
         if duration is not None:
             raise InputError("--duration does not go with --inputs, the file ends by itself")
         _replay(loaded, inputs, out, step)

@@ -6,6 +6,7 @@ each block is solved anew from starts all over its unknowns, with what was solve
 home; what comes after it follows, from where the guess has it.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -64,17 +65,15 @@ def ambiguities(closure: Closure, guess: Array, named: Indices, most: int) -> li
             is not told.
     """
     search = _Search(closure, guess, named)
-    found = []
+    found: list[Assembly] = []
     for index, (_, columns) in enumerate(closure.structure.blocks):
         block = closure.passive[columns]
         kept = search.within_limits(closure.home, block)
         if kept and search.away(closure.home, search.said(block)) < _CERTAIN:
             continue
-        near = [(search.away(q, block), q) for q in search.others(index, most)]
-        for _, q in sorted(near, key=lambda item: item[0]):
-            if (one := search.judged(q, index)) is not None:
-                found.append(one)
-                break
+        others = sorted(search.others(index, most), key=lambda q: search.away(q, block))
+        told = (one for q in others if (one := search.judged(q, index)) is not None)
+        found += itertools.islice(told, 1)
     return found
 
 
@@ -205,16 +204,21 @@ class _Search:
         jacobian = self.equations.evaluate(q)[1][np.ix_(rows, columns)]
         return float(np.linalg.slogdet(jacobian)[0])
 
+    def _ways(self, q: Array, index: int) -> list[Array]:
+        """Solutions of a block with all else as it is, from where it was guessed and at home."""
+        rows, columns = self._block(index)
+        found = []
+        for start in (self.guess, self.home):
+            begun = q.copy()
+            begun[columns] = start[columns]
+            if (way := self._solved(begun, rows, columns)) is not None:
+                found.append(way)
+        return found
+
     def judged(self, q: Array, index: int) -> Assembly | None:
         """An assembly with a block elsewhere, None where it is none or the guess rules it out."""
         for later in range(index + 1, len(self.blocks)):
-            rows, columns = self._block(later)
-            ways = []
-            for start in (self.guess, self.home):
-                begun = q.copy()
-                begun[columns] = start[columns]
-                if (way := self._solved(begun, rows, columns)) is not None:
-                    ways.append(way)
+            ways, (_, columns) = self._ways(q, later), self._block(later)
             if not ways:
                 return None
             q = min(ways, key=lambda way: self.away(way, columns))

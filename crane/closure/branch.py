@@ -190,26 +190,29 @@ class Branch:
             The posture at the target, or None, and the last posture on the way.
         """
         at, done, step = start, 0.0, 1.0
-        while done < 1.0:
+        while done < 1.0 and step >= _SHORTEST:
             goal = min(1.0, done + step)
             q_a = target if goal == 1.0 else start.q_a + goal * (target - start.q_a)
             move = at.gamma @ (q_a - at.q_a)
-            posture = None
-            if np.abs(move).max(initial=0.0) < 1.0:
-                predicted = at.q.copy()
-                predicted[self._passive] += move
-                # towards a fold Newton only converges linearly
-                posture = self.newton(predicted, q_a, 8 if step > _SHORTEST * 16 else 40)
-                if posture is not None and not self._follows(predicted, posture, move):
-                    posture = None
+            # towards a fold Newton only converges linearly
+            posture = self._moved(at, q_a, move, 8 if step > _SHORTEST * 16 else 40)
             if posture is None:
                 step /= 2
-                if step < _SHORTEST:
-                    return None, at
                 continue
             at, done = posture, goal
             step *= 2
-        return at, at
+        return at if done == 1.0 else None, at
+
+    def _moved(self, at: Posture, q_a: Array, move: Array, iterations: int) -> Posture | None:
+        """The posture at q_A from one beside it, None where it is not on the same branch."""
+        if not np.abs(move).max(initial=0.0) < 1.0:
+            return None
+        predicted = at.q.copy()
+        predicted[self._passive] += move
+        posture = self.newton(predicted, q_a, iterations)
+        if posture is None or not self._follows(predicted, posture, move):
+            return None
+        return posture
 
     def _follows(self, predicted: Array, posture: Posture, move: Array) -> bool:
         """Whether a posture continues the branch it was predicted on."""

@@ -41,6 +41,12 @@ def _cross(a: Array, b: Array) -> Array:
     return out
 
 
+def _columns_to(model: pin.Model, joint: int) -> list[int]:
+    """Columns of the joints that move a joint's body."""
+    supports = [model.joints[i] for i in model.supports[joint] if i > 0]
+    return [column for x in supports for column in range(x.idx_v, x.idx_v + x.nv)]
+
+
 def aligned_axes(loop_type: str) -> list[int]:
     """Axes of the two frames of a loop that point the same way when it is closed."""
     locked = LOOP_TYPES[loop_type][3:]
@@ -88,10 +94,7 @@ class LoopEquations:
             for side, name in ((-1.0, loop.predecessor), (1.0, loop.successor)):
                 frame = model.frames[frame_id(model, name)]
                 self.frames.append((frame.parentJoint, frame.placement * turn))
-                for joint in model.supports[frame.parentJoint]:
-                    if joint > 0:
-                        start = model.joints[joint].idx_v
-                        sign[index, start : start + model.joints[joint].nv] += side
+                sign[index, _columns_to(model, frame.parentJoint)] += side
             locked = LOOP_TYPES[loop.type]
             rows += [(index, True, i, 0) for i in range(3) if locked[i]]
             free = [k for k in range(3) if not locked[3 + k]]

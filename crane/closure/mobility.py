@@ -90,16 +90,15 @@ def surplus_open(
     if len(active) > 1:
         ways += [*np.random.default_rng(2).uniform(-1, 1, (_DIRECTIONS, len(active)))]
     for way in ways:
-        for size in (_STEP, _STEP / 16):
-            q = home.copy()
-            q[active] += size * scale[active] * way
-            moved = _closed(equations, q, rows, held)
-            if moved is None:
-                continue  # near the end of the branch
-            phi = np.abs(equations.evaluate(moved)[0][surplus])
-            if phi.max() > _OPEN:
-                return int(surplus[phi.argmax()]), float(phi.max())
-            break
+        # the smaller step where the branch ends within the larger one
+        starts = [home + held @ (size * scale[active] * way) for size in (_STEP, _STEP / 16)]
+        closed = (_closed(equations, q, rows, held) for q in starts)
+        moved = next((q for q in closed if q is not None), None)
+        if moved is None:
+            continue
+        phi = np.abs(equations.evaluate(moved)[0][surplus])
+        if phi.max() > _OPEN:
+            return int(surplus[phi.argmax()]), float(phi.max())
     return None
 
 

@@ -277,20 +277,21 @@ class Loops:
         determinants = []
         for rows, columns in self._structure.blocks:
             joints = [self.passive_joints[c] for c in columns]
-            matrix, sides = [], []
-            for r in rows:
-                slopes = self.rows[r].slopes
-                matrix.append([slopes.get(joint, 0.0) for joint in joints])
-                side: Vector = [0.0] * (width - 1) + [right[r]]
-                for joint, slope in slopes.items():
-                    # the order of the blocks knows which slopes vanish everywhere
-                    if joint not in joints and joint in x:
-                        side = subtract(side, scale(slope, x[joint]))
-                sides.append(side)
+            matrix = [[self.rows[r].slopes.get(joint, 0.0) for joint in joints] for r in rows]
+            # the order of the blocks knows which slopes vanish everywhere
+            before = {joint: row for joint, row in x.items() if joint not in joints}
+            sides = [self._right_side(r, before, [0.0] * (width - 1) + [right[r]]) for r in rows]
             found, determinant = solve(matrix, sides)
             determinants.append(determinant)
             x |= dict(zip(joints, found, strict=True))
         return x, determinants
+
+    def _right_side(self, row: int, x: dict[int, Vector], side: Vector) -> Vector:
+        """Right side of a row without what the joints in x have to do with it."""
+        for joint, slope in self.rows[row].slopes.items():
+            if joint in x:
+                side = subtract(side, scale(slope, x[joint]))
+        return side
 
     @cached_property
     def _gamma(self) -> tuple[dict[int, Vector], list[Number]]:

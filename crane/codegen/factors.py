@@ -1,5 +1,6 @@
 """Sparse elimination as formulas: what is zero while tracing never becomes an operation."""
 
+import itertools
 from collections.abc import Sequence
 
 from crane.codegen.scalar import Expression, Number, Tape
@@ -21,12 +22,12 @@ def eliminated(matrix: Sequence[Sequence[Number]]) -> Matrix:
     for k in range(size):
         inverse = 1.0 / rows[k][k]
         rows[k][k] = inverse
-        for i in range(k + 1, size):
-            if isinstance(rows[i][k], Expression) or rows[i][k] != 0:
-                factor = rows[i][k] * inverse
-                rows[i][k] = factor
-                for j in range(k + 1, size):
-                    rows[i][j] = rows[i][j] - factor * rows[k][j]
+        for row in rows[k + 1 :]:
+            if not isinstance(row[k], Expression) and row[k] == 0:
+                continue
+            row[k] = factor = row[k] * inverse
+            below = zip(row[k + 1 :], rows[k][k + 1 :], strict=True)
+            row[k + 1 :] = [entry - factor * pivot for entry, pivot in below]
     return rows
 
 
@@ -51,14 +52,9 @@ def stored(matrix: Sequence[Sequence[Number]]) -> list[Number]:
 
 def loaded(matrix: Sequence[Sequence[Number]], tape: Tape, array: int, start: int) -> Matrix:
     """The same matrix, its `stored` entries read from an argument of another function."""
-    count = start
-    out: Matrix = []
-    for row in matrix:
-        out.append([])
-        for entry in row:
-            if isinstance(entry, Expression):
-                out[-1].append(tape.load(array, count))
-                count += 1
-            else:
-                out[-1].append(entry)
-    return out
+    places = itertools.count(start)
+
+    def read(entry: Number) -> Number:
+        return tape.load(array, next(places)) if isinstance(entry, Expression) else entry
+
+    return [[read(entry) for entry in row] for row in matrix]

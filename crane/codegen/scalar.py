@@ -106,11 +106,12 @@ def needed(outputs: Sequence[Number]) -> list[int]:
     indices = [value.index for value in waiting]
     while indices:
         index = indices.pop()
-        if index not in found:
-            found.add(index)
-            kind, *operands = operations[index]
-            if kind != "load":
-                indices += [operand for operand in operands if type(operand) is int]
+        if index in found:
+            continue
+        found.add(index)
+        kind, *operands = operations[index]
+        if kind != "load":
+            indices += [operand for operand in operands if type(operand) is int]
     return sorted(found)
 
 

@@ -30,12 +30,13 @@ _TENSOR = ("xx", "xy", "xz", "yy", "yz", "zz")
 def _numbers(spec: MachineSpec) -> Iterator[tuple[str, Link | Joint, _Way]]:
     """Names of the tree's numbers, with the link or joint that has them, and where."""
     for link in spec.tree.links.values():
-        if link.inertial is not None:
-            yield f"{link.name}.mass", link, ("inertial", "mass")
-            for i, axis in enumerate("xyz"):
-                yield f"{link.name}.com.{axis}", link, ("inertial", "com", i)
-            for i, key in enumerate(_TENSOR):
-                yield f"{link.name}.inertia.{key}", link, ("inertial", "tensor", i)
+        if link.inertial is None:
+            continue
+        yield f"{link.name}.mass", link, ("inertial", "mass")
+        for i, axis in enumerate("xyz"):
+            yield f"{link.name}.com.{axis}", link, ("inertial", "com", i)
+        for i, key in enumerate(_TENSOR):
+            yield f"{link.name}.inertia.{key}", link, ("inertial", "tensor", i)
     attached = {chain.attachment for chain in spec.chains if chain.parent is not None}
     for joint in spec.tree.joints.values():
         if joint.name in attached:
@@ -43,9 +44,9 @@ def _numbers(spec: MachineSpec) -> Iterator[tuple[str, Link | Joint, _Way]]:
         for i, (axis, turn) in enumerate(zip("xyz", _TURNS, strict=True)):
             yield f"{joint.child}.{axis}", joint, ("xyz", i)
             yield f"{joint.child}.{turn}", joint, ("rpy", i)
-        for key in ("lower", "upper"):
-            if joint.moves and math.isfinite(getattr(joint.limits, key)):
-                yield f"{joint.name}.{key}", joint, ("limits", key)
+        ends = ("lower", "upper") if joint.moves else ()
+        for key in [key for key in ends if math.isfinite(getattr(joint.limits, key))]:
+            yield f"{joint.name}.{key}", joint, ("limits", key)
 
 
 def _number(part: Any, way: _Way) -> float:
@@ -238,6 +239,26 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
     )
 
 
+def _lock_followers(couplings: list[Coupling], locked: dict[str, float]) -> bool:
+    """Lock joints that couplings leave no freedom, take out these couplings; whether any was."""
+    before = len(locked)
+    for coupling in tuple(couplings):
+        free = {name: x for name, x in coupling.factors.items() if name not in locked}
+        held = coupling.factors.keys() - free.keys()
+        if len(free) > 1 or not held:
+            continue
+        couplings.remove(coupling)
+        left = coupling.offset - sum(coupling.factors[name] * locked[name] for name in held)
+        if not free and abs(left) > 1e-9:
+            raise InputError(
+                f"coupling '{coupling.name}' does not allow "
+                f"{', '.join(f'{x} = {locked[x]:g}' for x in sorted(held))}, lock one of "
+                "them alone"
+            )
+        locked |= {name: left / factor for name, factor in free.items()}
+    return len(locked) > before
+
+
 def _coupled(
     couplings: tuple[Coupling, ...], lock: Mapping[str, float]
 ) -> tuple[dict[str, float], tuple[Coupling, ...]]:
@@ -247,26 +268,8 @@ def _coupled(
         for name, x in lock.items()
     }
     rest = list(couplings)
-    settled = False
-    while not settled:
-        settled = True
-        for coupling in tuple(rest):
-            free = {name: x for name, x in coupling.factors.items() if name not in locked}
-            held = coupling.factors.keys() - free.keys()
-            left = coupling.offset - sum(coupling.factors[name] * locked[name] for name in held)
-            if len(free) > 1 or not held:
-                continue
-            rest.remove(coupling)
-            if not free:
-                if abs(left) > 1e-9:
-                    raise InputError(
-                        f"coupling '{coupling.name}' does not allow "
-                        f"{', '.join(f'{x} = {locked[x]:g}' for x in sorted(held))}, lock one of "
-                        "them alone"
-                    )
-                continue
-            ((name, factor),) = free.items()
-            locked[name], settled = left / factor, False
+    while _lock_followers(rest, locked):
+        pass  # others may follow those
     return locked, tuple(
         dataclasses.replace(
             coupling,

@@ -1,7 +1,7 @@
 """What a user wrote, read and checked, before anything is assembled."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,10 +14,11 @@ from crane.hydraulics.components import Hydraulics
 def _check(item: object, what: str, *positive: str) -> None:
     """Raise for numbers that are not finite, or negative where that has no meaning."""
     for name, value in vars(item).items():
-        if name != "joint":
-            number = as_number(value, f"{name} of {what}", "")
-            if name in positive and number < 0:
-                raise InputError(f"{name} of {what} is {number:g}, it must not be negative")
+        if name == "joint":
+            continue
+        number = as_number(value, f"{name} of {what}", "")
+        if name in positive and number < 0:
+            raise InputError(f"{name} of {what} is {number:g}, it must not be negative")
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,12 @@ class Coupling:
     factors: Mapping[str, float]
     offset: float
     where: str
+
+
+def places(loops: Iterable[LoopSpec], couplings: Iterable[Coupling]) -> dict[str, str]:
+    """Where loops and couplings were written, as errors about them look it up."""
+    written: list[LoopSpec | Coupling] = [*loops, *couplings]
+    return {f"loop {item.name}": item.where for item in written}
 
 
 def unit_vector(xyz: Sequence[float]) -> Vector | None:

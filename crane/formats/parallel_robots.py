@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from crane.common.errors import DescriptionError, known
-from crane.description.spec import Chain, LoopSpec, MachineSpec
+from crane.description.spec import Chain, LoopSpec, MachineSpec, places
 from crane.description.tree import Joint, Link, Tree
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
@@ -69,9 +69,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
                 f"the motor '{joint}' is {replaced[joint][0]}, drive a joint with one freedom",
             )
         tree.check_joint(joint, top.where("name_mot"))
-    where = {"active": top.where("name_mot")}
-    where |= {f"loop {loop.name}": loop.where for loop in loops}
-    where |= {f"loop {coupling.name}": coupling.where for coupling in urdf.couplings}
+    where = {"active": top.where("name_mot")} | places(loops, urdf.couplings)
     return MachineSpec(
         name=name,
         source=path.name,
@@ -115,9 +113,9 @@ def _replace(xml: XmlFile, replaced: dict[str, tuple[str, str]], top: Section) -
         joint = joints[name]
         if joint.get("type") not in MOVING:
             raise top.fail("joint_name", f"joint '{name}' is {joint.get('type')}, leave it out")
-        for tag in ("limit", "dynamics", "mimic"):  # of the joint that it was
-            for element in joint.findall(tag):
-                joint.remove(element)
+        of_before = [x for x in joint if x.tag in ("limit", "dynamics", "mimic")]
+        for element in of_before:
+            joint.remove(element)
         joint.set("type", kind.lower() if kind in ("SPHERICAL", "FIXED") else "continuous")
         joint.attrib.pop("independent", None)
 
@@ -126,18 +124,25 @@ def _split(urdf: Urdf, name: str, axes: tuple[str, str]) -> Urdf:
     """A universal joint as two about axes of the joint's frame, the first at the parent."""
     parts: list[Link | Joint] = []
     for part in urdf.tree:
-        if not isinstance(part, Joint) or part.name != name:
+        if isinstance(part, Joint) and part.name == name:
+            parts += _universal(part, axes, urdf.tree)
+        else:
             parts.append(part)
-            continue
-        freedoms = [(axis, "revolute", _AXES[axis]) for axis in axes]
-        place, ends = (part.xyz, part.rpy), (part.parent, part.child)
-        for made in series(name, freedoms, place, ends, part.where):
-            taken = urdf.tree.links if isinstance(made, Link) else urdf.tree.joints
-            if made.name in taken:
-                problem = f"joint '{name}' makes '{made.name}', which is there already, rename one"
-                raise DescriptionError(f"{part.where}: {problem}")
-            parts.append(made)
     return dataclasses.replace(urdf, tree=Tree({}, {}).replacing(*parts))
+
+
+def _universal(joint: Joint, axes: tuple[str, str], tree: Tree) -> list[Link | Joint]:
+    """What a joint becomes as a universal one, under names that the tree does not have."""
+    freedoms = [(axis, "revolute", _AXES[axis]) for axis in axes]
+    place, ends = (joint.xyz, joint.rpy), (joint.parent, joint.child)
+    parts = series(joint.name, freedoms, place, ends, joint.where)
+    for made in parts:
+        if made.name in (tree.links if isinstance(made, Link) else tree.joints):
+            raise DescriptionError(
+                f"{joint.where}: joint '{joint.name}' makes '{made.name}', which is there "
+                "already, rename one"
+            )
+    return parts
 
 
 def _loops(top: Section, urdf: Urdf, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
@@ -152,11 +157,10 @@ def _loops(top: Section, urdf: Urdf, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
         if kind.lower() not in _LOOPS:
             raise top.fail("type", f"a closed loop has the type '{kind}', write 3d or 6d")
         links = [name if name in tree.links else below.get(name, "") for name in pair]
-        for name, link in zip(pair, links, strict=True):
-            if not link:
-                raise top.fail(
-                    "closed_loop", f"the frame '{name}' is unknown, {known(tree.links, name)}"
-                )
+        lost = [name for name, link in zip(pair, links, strict=True) if not link]
+        if lost:
+            problem = f"the frame '{lost[0]}' is unknown, {known(tree.links, lost[0])}"
+            raise top.fail("closed_loop", problem)
         name = f"{pair[0]}_{pair[1]}"
         if name in loops:
             raise top.fail(

@@ -3,7 +3,7 @@
 import copy
 import math
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -87,13 +87,20 @@ def draw(robot: etree._Element, machine: Machine, chains: Iterable[str] | None =
         ).getroot()
         for material in source.iterfind("material"):
             materials.setdefault(material.get("name", ""), copy.deepcopy(material))
-        for link in source.iterfind("link"):
-            target = links.get(link.get("name", "").strip())
-            for drawn in (*link.iterfind("visual"), *link.iterfind("collision")):
-                if target is not None:
-                    target.append(_located(drawn, chain.urdf.parent))
+        _copy_shapes(source, links, chain.urdf.parent)
     for material in reversed(materials.values()):
         robot.insert(0, material)
+
+
+def _copy_shapes(
+    source: etree._Element, links: Mapping[str, etree._Element], folder: Path
+) -> None:
+    for link in source.iterfind("link"):
+        target = links.get(link.get("name", "").strip())
+        if target is None:
+            continue
+        for drawn in (*link.iterfind("visual"), *link.iterfind("collision")):
+            target.append(_located(drawn, folder))
 
 
 def _located(drawn: etree._Element, folder: Path) -> etree._Element:

@@ -94,7 +94,19 @@ class XmlFile:
         Raises:
             DescriptionError: There is a slip.
         """
-        allowed = attributes.get(element.tag, set())
+        self._check_attributes(element, attributes.get(element.tag, set()), exact)
+        tags = children.get(element.tag, set())
+        for child in element:
+            if not isinstance(child.tag, str):  # an entity, not expanded
+                continue
+            if child.tag not in tags:
+                self._check_stranger(element, child, children)
+            if child.tag in tags:  # now
+                self.check(child, children, attributes, exact)
+
+    def _check_attributes(
+        self, element: etree._Element, allowed: set[str], exact: set[str]
+    ) -> None:
         for key in element.keys() if allowed else ():
             if key in allowed:
                 continue
@@ -106,22 +118,22 @@ class XmlFile:
                 flag(self.fail(element, problem), harmless=meant)
             if meant:
                 element.set(near[0], element.attrib.pop(key))
+
+    def _check_stranger(
+        self, element: etree._Element, child: etree._Element, children: Mapping[str, set[str]]
+    ) -> None:
+        """A child whose tag its parent does not have: a slip, in a wrong place, or foreign."""
         tags = children.get(element.tag, set())
-        for child in element:
-            if not isinstance(child.tag, str):  # an entity, not expanded
-                continue
-            near = [] if child.tag in tags else get_close_matches(child.tag.lower(), tags, 1, 0.75)
-            if near:
-                hint = known(tags, child.tag.lower())
-                meant = near[0] in _SEVERAL or element.find(near[0]) is None
-                problem = f"unknown <{child.tag}> in <{element.tag}>, {hint}"
-                flag(self.fail(child, problem), harmless=meant)
-                if meant:
-                    child.tag = near[0]
-            elif child.tag not in tags and any(child.tag in x for x in children.values() if tags):
-                flag(self.fail(child, f"<{child.tag}> has no place in <{element.tag}>, move it"))
-            if child.tag in tags:
-                self.check(child, children, attributes, exact)
+        near = get_close_matches(child.tag.lower(), tags, 1, 0.75)
+        if near:
+            hint = known(tags, child.tag.lower())
+            meant = near[0] in _SEVERAL or element.find(near[0]) is None
+            problem = f"unknown <{child.tag}> in <{element.tag}>, {hint}"
+            flag(self.fail(child, problem), harmless=meant)
+            if meant:
+                child.tag = near[0]
+        elif any(child.tag in x for x in children.values() if tags):
+            flag(self.fail(child, f"<{child.tag}> has no place in <{element.tag}>, move it"))
 
     def only(self, element: etree._Element, tag: str, what: str) -> etree._Element | None:
         """The child with a tag, if there is one.

@@ -8,7 +8,8 @@ from crane.common.errors import InputError
 from crane.common.magnitudes import meant
 from crane.common.samples import as_number
 
-_NOT_NUMBERS = ("joint", "counterbalance_a", "counterbalance_b")
+HOLDING = ("counterbalance_a", "counterbalance_b")  # valves of a cylinder that hold its load
+_NOT_NUMBERS = ("joint", *HOLDING)
 _LEAST = 1e-50  # of what must be positive: one over its square is still a number
 
 
@@ -37,15 +38,16 @@ def check_numbers(item: object, what: str) -> None:
     """
     for entry in fields(item):  # type: ignore[arg-type]
         value = getattr(item, entry.name)
-        if isinstance(value, int | float):
-            number = as_number(value, f"{entry.name} of {what}", "")
-            if entry.metadata.get("signed"):
-                continue
-            if number < 0 or (number < _LEAST and entry.metadata.get("positive")):
-                least = "must be positive" if entry.metadata.get("positive") else "must not be < 0"
-                if number > 0:
-                    least = f"must be at least {_LEAST:g}"
-                raise PartError(entry.name, f"{entry.name} of {what} is {number:g}, it {least}")
+        if not isinstance(value, int | float):
+            continue
+        number = as_number(value, f"{entry.name} of {what}", "")
+        positive = bool(entry.metadata.get("positive"))
+        if entry.metadata.get("signed") or number >= (_LEAST if positive else 0.0):
+            continue
+        wanted = "must be positive" if positive else "must not be < 0"
+        if number > 0:
+            wanted = f"must be at least {_LEAST:g}"
+        raise PartError(entry.name, f"{entry.name} of {what} is {number:g}, it {wanted}")
 
 
 def positive() -> float:

@@ -73,20 +73,23 @@ def closed(
     spec = dataclasses.replace(spec, couplings=there)
     try:
         return _closure(spec, model, guess, loops)
-    except MechanismError as error:
-        if spec.active != () and (error.about == "active" or error.about.startswith("loop ")):
+    except MechanismError as refused:
+        error = refused
 
-            def close(changed: MachineSpec, some: Sequence[LoopSpec]) -> object:
-                tree = model if changed.tree is spec.tree else assemble(changed)
-                return _closure(changed, tree, guess, some)
+    def close(changed: MachineSpec, some: Sequence[LoopSpec]) -> object:
+        tree = model if changed.tree is spec.tree else assemble(changed)
+        return _closure(changed, tree, guess, some)
 
-            if (suspect := wrong_axis(spec, model, loops, close)) is not None:
-                raise suspect from None
-        where = spec.where.get(error.about, spec.path.name)
-        hint = ""
-        if spec.active == () and spec.path.suffix.lower() == ".urdf":
-            hint = ', and mark what you choose with independent="true"'
-        raise MechanismError(at(where, error) + hint, error.about) from None
+    if spec.active != () and (error.about == "active" or error.about.startswith("loop ")):
+        suspect = wrong_axis(spec, model, loops, close)
+        if suspect is not None:
+            raise suspect
+    hint = ""
+    if spec.active == () and spec.path.suffix.lower() == ".urdf":
+        hint = ', and mark what you choose with independent="true"'
+    raise MechanismError(
+        at(spec.where.get(error.about, spec.path.name), error) + hint, error.about
+    )
 
 
 def _closure(
@@ -179,9 +182,10 @@ def _check_bodies(spec: MachineSpec, model: pin.Model) -> None:
     for index in range(1, model.njoints):
         joint = spec.tree.joints[model.names[index]]
         link = links[joint.child]
-        if link.between is None and index not in doubtful:
-            with recoverable(harmless=True):
-                _check_body(link, joint.name, model.inertias[index])
+        if link.between is not None or index in doubtful:
+            continue
+        with recoverable(harmless=True):
+            _check_body(link, joint.name, model.inertias[index])
 
 
 def _check_body(link: Link, joint: str, inertia: pin.Inertia) -> None:

@@ -52,24 +52,31 @@ def wrong_axis(
         labels = [*(names[i] for i in ring), f"loop {loop.name}"]
         for odd, normal in _odd_ones(axes, turns):
             column = ring[odd] if odd < len(ring) else None
-            if column is None:
-                link = model.frames[frame_id(model, loop.predecessor)]
-                frame = data.oMi[link.parentJoint].rotation @ link.placement.rotation
-            else:
-                above = data.oMi[model.parents[column + 1]].rotation
-                frame = above @ model.jointPlacements[column + 1].rotation
+            frame = _frame_of(model, data, loop if column is None else column)
             turned = _turned(frame.T @ axes[odd][0], frame.T @ normal, turns[odd])
-            others = [x for k, x in enumerate(labels) if k != odd and turns[k]]
+            changed, some = spec, list(loops)
+            if column is None:
+                some[index] = dataclasses.replace(loop, axis=turned)
+            else:
+                changed = _with_axis(spec, names[column], turned)
             try:
-                if column is None:
-                    right = dataclasses.replace(loop, axis=turned)
-                    close(spec, [right if one is loop else one for one in loops])
-                else:
-                    close(_with_axis(spec, names[column], turned), loops)
+                close(changed, some)
             except CraneError:
                 continue
+            others = [x for k, x in enumerate(labels) if k != odd and turns[k]]
             return _error(spec, labels[odd], axes[odd][0], normal, turned, turns[odd], others)
     return None
+
+
+def _frame_of(model: pin.Model, data: pin.Data, of: LoopSpec | int) -> Array:
+    """Axes (3, 3) of the frame that the axis of a loop is written in, or of a joint's column."""
+    if isinstance(of, LoopSpec):
+        link = model.frames[frame_id(model, of.predecessor)]
+        frame: Array = data.oMi[link.parentJoint].rotation @ link.placement.rotation
+    else:
+        above = data.oMi[model.parents[of + 1]].rotation
+        frame = above @ model.jointPlacements[of + 1].rotation
+    return frame
 
 
 def _odd_ones(axes: list[list[Array]], turns: list[bool]) -> list[tuple[int, Array]]:

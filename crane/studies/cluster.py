@@ -30,7 +30,7 @@ def computed(
         InputError: Dask is not installed, the scheduler does not answer, or workers keep dying.
     """
     try:
-        from distributed import Client, KilledWorker, as_completed
+        from distributed import Client, as_completed
     except ImportError:
         raise InputError(
             "a scheduler needs Dask, which is not installed: pip install 'crane-dynamics[cluster]'"
@@ -59,20 +59,25 @@ def computed(
         futures = client.map(function, jobs, key=keys, pure=False)
         indices = {future.key: index for index, future in enumerate(futures)}
         for future in as_completed(futures, loop=client.loop):
-            index = indices[future.key]
-            if future.status == "finished":
-                yield index, future.result()
-                continue
-            failure = future.exception() if future.status == "error" else None
-            if isinstance(failure, KilledWorker):
-                raise InputError(
-                    f"variant {index} was begun by several workers and all of them died, see "
-                    "their logs: give them more memory or fewer threads"
-                )
-            if isinstance(failure, ImportError | AttributeError):
-                raise InputError(
-                    f"the workers cannot run this version of crane ({failure}), install it there"
-                )
-            if failure is None:
-                raise InputError(f"the scheduler at {scheduler} is gone, start it again")
-            raise failure
+            yield indices[future.key], _result(future, indices[future.key], scheduler)
+
+
+def _result(future: Any, index: int, scheduler: str) -> Any:
+    """What a job that has ended gave, or why it gave nothing."""
+    from distributed import KilledWorker
+
+    if future.status == "finished":
+        return future.result()
+    failure = future.exception() if future.status == "error" else None
+    if isinstance(failure, KilledWorker):
+        raise InputError(
+            f"variant {index} was begun by several workers and all of them died, see "
+            "their logs: give them more memory or fewer threads"
+        )
+    if isinstance(failure, ImportError | AttributeError):
+        raise InputError(
+            f"the workers cannot run this version of crane ({failure}), install it there"
+        )
+    if failure is None:
+        raise InputError(f"the scheduler at {scheduler} is gone, start it again")
+    raise failure

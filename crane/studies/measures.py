@@ -1,7 +1,7 @@
 """What a machine needs for its tasks, and where its strokes take it."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,9 +113,10 @@ def of_strokes(machine: Machine) -> dict[str, float]:
     strokes = np.flatnonzero(coupled)
     for i, joint in enumerate(machine.active):
         found[f"lower_{joint}"], found[f"upper_{joint}"] = float(low[i]), float(high[i])
-        if coupled[i]:
-            for name, sign in (("lower", -1.0), ("upper", 1.0)):
-                found[f"{name}_{joint}"] = _end(machine, postures, strokes, (low, high), i, sign)
+        if not coupled[i]:
+            continue
+        for name, sign in (("lower", -1.0), ("upper", 1.0)):
+            found[f"{name}_{joint}"] = _end(machine, postures, strokes, (low, high), i, sign)
     if machine.tip is not None:
         found["reach"] = _reach(machine, postures, coupled, (low, high))
     return found
@@ -154,6 +155,13 @@ def _ends(machine: Machine, home: Array) -> tuple[Array, Array]:
     )
 
 
+def _next_to(cell: tuple[int, ...], shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+    """The neighbours of a cell along the axes of a grid."""
+    for i, step in itertools.product(range(len(shape)), (-1, 1)):
+        if 0 <= cell[i] + step < shape[i]:
+            yield (*cell[:i], cell[i] + step, *cell[i + 1 :])
+
+
 def _closed(machine: Machine, axes: list[Array]) -> Array:
     """Closed postures (N, nq) of a grid that are connected with home."""
     closure = machine.closure
@@ -175,11 +183,9 @@ def _closed(machine: Machine, axes: list[Array]) -> Array:
         if posture is None:
             continue
         found[cell] = posture
-        for i, step in itertools.product(range(len(shape)), (-1, 1)):
-            near = (*cell[:i], cell[i] + step, *cell[i + 1 :])
-            if 0 <= near[i] < shape[i] and near not in seen:
-                seen.add(near)
-                waiting.append((near, found[cell]))
+        new = [near for near in _next_to(cell, shape) if near not in seen]
+        seen.update(new)
+        waiting += [(near, posture) for near in new]
     return np.array([found[cell] for cell in sorted(found)]).reshape(-1, len(machine.home))
 
 

@@ -135,27 +135,31 @@ def study(
 
 def variant(job: Job) -> tuple[dict[str, float], str]:
     """Columns of one variant, and why some are missing."""
-    found: dict[str, float] = {}
-    reasons = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)  # told of the machine itself
         try:
             machine = load(job.machine, job.changes)
         except CraneError as error:
-            return found, str(error)
-        if machine.closure.compiled:
-            _KEPT.setdefault(id(machine.closure.fast.programs), machine)
-        dynamics, done = Dynamics(machine), []
-        for task in job.tasks:
-            try:
-                done.append(of_task(machine, dynamics, task))
-                found |= {f"{name} {task}": value for name, value in done[-1][1].items()}
-            except CraneError as error:
-                reasons.append(at(f"task '{task}'", error))
-        if done and len(done) == len(job.tasks):
-            found |= together(done)
-        if job.strokes:
-            found |= of_strokes(machine)
+            return {}, str(error)
+        return _measured(machine, job)
+
+
+def _measured(machine: Machine, job: Job) -> tuple[dict[str, float], str]:
+    found: dict[str, float] = {}
+    reasons = []
+    if machine.closure.compiled:
+        _KEPT.setdefault(id(machine.closure.fast.programs), machine)
+    dynamics, done = Dynamics(machine), []
+    for task in job.tasks:
+        try:
+            done.append(of_task(machine, dynamics, task))
+            found |= {f"{name} {task}": value for name, value in done[-1][1].items()}
+        except CraneError as error:
+            reasons.append(at(f"task '{task}'", error))
+    if done and len(done) == len(job.tasks):
+        found |= together(done)
+    if job.strokes:
+        found |= of_strokes(machine)
     return found, "; ".join(reasons)
 
 

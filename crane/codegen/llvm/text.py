@@ -70,9 +70,8 @@ def _formula(formula: Formula, functions: set[tuple[str, int]]) -> str:
     operations = tapes.pop().operations if tapes else []
     for level in _levels(operations, needed(formula.outputs)):
         lines += _at_once([(i, operations[i]) for i in level if _vector(operations[i])], functions)
-        for index in level:
-            if not _vector(operations[index]):
-                lines += _single(index, *operations[index])
+        for index in [i for i in level if not _vector(operations[i])]:
+            lines += _single(index, *operations[index])
     for i, value in enumerate(formula.outputs):
         word = _operand(value.index if isinstance(value, Expression) else float(value))
         lines.append(f"  %q{i} = getelementptr double, ptr %out, i64 {i}")
@@ -107,20 +106,25 @@ def _at_once(calls: list[tuple[int, tuple]], functions: set[tuple[str, int]]) ->
             part = same[start : start + WIDEST]
             width = 1 << (len(part) - 1).bit_length()
             functions.add((name, width))
-            kind, vector = f"<{width} x double>", "poison"
-            for lane in range(width):  # the first once more where there are too few
-                index, operand = part[lane] if lane < len(part) else part[0]
-                word, made = _operand(operand), f"%{name}{part[0][0]}_{lane}"
-                lines.append(
-                    f"  {made} = insertelement {kind} {vector}, double {word}, i32 {lane}"
-                )
-                vector = made
-            result = f"%{name}{part[0][0]}"
-            lines.append(f"  {result} = call {kind} @{name}{width}({kind} {vector})")
-            lines += [
-                f"  %v{index} = extractelement {kind} {result}, i32 {lane}"
-                for lane, (index, _) in enumerate(part)
-            ]
+            lines += _call_at_once(name, width, part)
+    return lines
+
+
+def _call_at_once(name: str, width: int, calls: list[tuple[int, Any]]) -> list[str]:
+    """One call of a function of `width` numbers, of which there may be fewer."""
+    lines = []
+    kind, vector = f"<{width} x double>", "poison"
+    for lane in range(width):  # the first once more where there are too few
+        _, operand = calls[lane] if lane < len(calls) else calls[0]
+        word, made = _operand(operand), f"%{name}{calls[0][0]}_{lane}"
+        lines.append(f"  {made} = insertelement {kind} {vector}, double {word}, i32 {lane}")
+        vector = made
+    result = f"%{name}{calls[0][0]}"
+    lines.append(f"  {result} = call {kind} @{name}{width}({kind} {vector})")
+    lines += [
+        f"  %v{index} = extractelement {kind} {result}, i32 {lane}"
+        for lane, (index, _) in enumerate(calls)
+    ]
     return lines
 
 

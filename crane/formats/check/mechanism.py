@@ -1,7 +1,7 @@
 """Whether the parts make a machine: every loop that does not close or does nothing."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -39,17 +39,18 @@ def check_mechanism(spec: MachineSpec, found: Findings) -> Closure | None:
     while True:
         try:
             closure = closed(spec, model, guess, loops)
-        except MechanismError as error:
-            idle = [loop for loop in loops if error.about == f"loop {loop.name}"]
-            if "locks nothing" in str(error) and idle:
-                flag(error)
-                loops.remove(idle[0])
-                continue
+            break
+        except MechanismError as refused:
+            error = refused
+        idle = [loop for loop in loops if error.about == f"loop {loop.name}"]
+        if "locks nothing" not in str(error) or not idle:
             _note_with_gaps(spec, model, guess, error)
             return None
-        _warn_of_limits(spec, closure)
-        warn_of_assemblies(spec, closure, guess, thorough=True)
-        return closure
+        flag(error)
+        loops.remove(idle[0])
+    _warn_of_limits(spec, closure)
+    warn_of_assemblies(spec, closure, guess, thorough=True)
+    return closure
 
 
 def _note_with_gaps(
@@ -130,14 +131,21 @@ def massless(spec: MachineSpec) -> Iterator[DescriptionError]:
     for joint in joints:
         if not joint.moves or joint.child not in links:
             continue
-        body, waiting = set(), [joint.child]
-        while waiting:
-            link = waiting.pop()
-            if link not in body:
-                body.add(link)
-                waiting += fixed.get(link, ())
-        if not body & heavy:
+        if not _body(joint.child, fixed) & heavy:
             yield DescriptionError(
                 f"{links[joint.child].where}: joint '{joint.name}' moves link '{joint.child}', "
                 "which has no mass, give it an <inertial>"
             )
+
+
+def _body(link: str, fixed: Mapping[str, Sequence[str]]) -> set[str]:
+    """A link, and the links that are fixed to it."""
+    body: set[str] = set()
+    waiting = [link]
+    while waiting:
+        link = waiting.pop()
+        if link in body:
+            continue
+        body.add(link)
+        waiting += fixed.get(link, ())
+    return body

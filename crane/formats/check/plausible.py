@@ -36,13 +36,14 @@ def implausible(files: Sequence[XmlFile], spec: MachineSpec | None) -> None:
         drawn = read_drawn(xml, ("visual", "collision"))
         _warn_drawn(drawn)
         _warn_angles(xml)
-        if not _warn_lengths(xml):  # sizes in other units say nothing about inertias
-            reaches = _reaches(xml)
-            # visuals count; where there are none, what a link collides with
-            bounds = extents(drawn.shapes["collision"]) | extents(drawn.shapes["visual"])
-            for link in xml.root.iterfind("link"):
-                name = link.get("name", "").strip()
-                _warn_body(xml, link, reaches.get(name, 0.0), bounds.get(name))
+        if _warn_lengths(xml):  # sizes in other units say nothing about inertias
+            continue
+        reaches = _reaches(xml)
+        # visuals count; where there are none, what a link collides with
+        bounds = extents(drawn.shapes["collision"]) | extents(drawn.shapes["visual"])
+        for link in xml.root.iterfind("link"):
+            name = link.get("name", "").strip()
+            _warn_body(xml, link, reaches.get(name, 0.0), bounds.get(name))
     if spec is not None:
         _warn_home(spec)
 
@@ -62,29 +63,33 @@ def _warn_first(xml: XmlFile, found: Large, hint: str) -> bool:
 
 def _warn_lengths(xml: XmlFile) -> bool:
     found: Large = []
-    for tag, key, count in (
+    lengths = (
         ("origin", "xyz", 3), ("box", "size", 3), ("cylinder", "length", 1),
         ("cylinder", "radius", 1), ("sphere", "radius", 1),
-    ):  # fmt: skip
-        for element in xml.root.iter(tag):
-            values = numbers(element, key, count)
-            if values is not None and np.abs(values).max() > _FAR:
-                far = values[np.abs(values).argmax()]
-                found.append((element, f"{far:g} m in <{tag}> is a long way for a machine"))
+    )  # fmt: skip
+    given = (
+        (element, numbers(element, key, count))
+        for tag, key, count in lengths
+        for element in xml.root.iter(tag)
+    )
+    for element, values in given:
+        if values is not None and np.abs(values).max() > _FAR:
+            far = values[np.abs(values).argmax()]
+            found.append((element, f"{far:g} m in <{element.tag}> is a long way for a machine"))
     for joint in xml.root.iterfind("joint"):
-        if joint.get("type") == "prismatic" and (limits := _limits(joint)):
-            far = max(limits, key=abs)
-            if _FAR < abs(far) <= _NO_LIMIT:
-                what = f"the limit {far:g} m of joint '{joint.get('name')}' is a long way"
-                found.append((joint.find("limit"), what))
+        far = _largest_limit(joint)
+        if joint.get("type") == "prismatic" and _FAR < abs(far) <= _NO_LIMIT:
+            what = f"the limit {far:g} m of joint '{joint.get('name')}' is a long way"
+            found.append((joint.find("limit"), what))
     found.sort(key=lambda item: item[0].sourceline or 0)
     return _warn_first(xml, found, "write metres if these are millimetres")
 
 
-def _limits(joint: etree._Element) -> list[float]:
+def _largest_limit(joint: etree._Element) -> float:
+    """The end of a joint's range that is farthest from zero; 0 where it has none."""
     limit = joint.find("limit")
     ends = (numbers(limit, key, 1) for key in ("lower", "upper"))
-    return [float(end[0]) for end in ends if end is not None]
+    return max((float(end[0]) for end in ends if end is not None), key=abs, default=0.0)
 
 
 def _warn_angles(xml: XmlFile) -> None:
@@ -96,11 +101,10 @@ def _warn_angles(xml: XmlFile) -> None:
     _warn_first(xml, turned, "write radians if these are degrees")
     wide: Large = []
     for joint in xml.root.iterfind("joint"):
-        if joint.get("type") == "revolute" and (limits := _limits(joint)):
-            far = max(limits, key=abs)
-            if 2 * _TURN < abs(far) <= _NO_LIMIT:
-                what = f"the limit {far:g} rad of joint '{joint.get('name')}' is many turns"
-                wide.append((joint.find("limit"), what))
+        far = _largest_limit(joint)
+        if joint.get("type") == "revolute" and 2 * _TURN < abs(far) <= _NO_LIMIT:
+            what = f"the limit {far:g} rad of joint '{joint.get('name')}' is many turns"
+            wide.append((joint.find("limit"), what))
     _warn_first(xml, wide, "write radians if these are degrees, or make it continuous")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from crane.closure import Closure
 from crane.common.errors import CraneWarning
 from crane.description import MachineSpec
-from crane.description.findings import collecting, flag, recoverable
+from crane.description.findings import Findings, collecting, flag, recoverable
 from crane.description.sources import find
 from crane.formats.check.mechanism import check_mechanism, massless
 from crane.formats.check.plausible import implausible
@@ -97,12 +97,8 @@ def check(name: str | Path) -> Report:
         warnings.simplefilter("always", CraneWarning)
         with recoverable():
             spec = read(path)
-        if spec is not None and found.usable:
-            with recoverable():
-                closure = check_mechanism(spec, found)
-        elif spec is not None:
-            for error in massless(spec):
-                flag(error)
+        if spec is not None:
+            closure = _closed(spec, found)
         implausible(found.files, spec)
     findings = [_finding(str(error), True, path.name) for error in found.errors]
     findings += [
@@ -115,6 +111,17 @@ def check(name: str | Path) -> Report:
         summary = _summary(spec, closure)
     ordered = sorted(set(findings), key=lambda x: (x.file, x.line, not x.error, x.what))
     return Report(tuple(ordered[:_MOST]), summary, found.full or len(ordered) > _MOST)
+
+
+def _closed(spec: MachineSpec, found: Findings) -> Closure | None:
+    """The closure of what was read, None where what is wrong with it forbids one."""
+    if not found.usable:
+        for error in massless(spec):
+            flag(error)
+        return None
+    with recoverable():
+        return check_mechanism(spec, found)
+    return None
 
 
 def _finding(message: str, error: bool, file: str) -> Finding:

@@ -1,5 +1,6 @@
 """The section `hydraulics` of a machine file."""
 
+import itertools
 import math
 import warnings
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from crane.description.findings import FollowUpError, flag, recoverable
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.hydraulics.components import (
+    HOLDING,
     Counterbalance,
     Cylinder,
     Hydraulics,
@@ -30,6 +32,10 @@ Part = TypeVar("Part", Oil, Supply, Counterbalance, Cylinder, Valve, PDGains)
 
 _TOGETHER = ("tank", "relief")  # looked at with other parts
 _KINDS = ("orifice", "compensated")
+_OF_KIND = {  # keys that only one kind of valve has
+    "c1": "orifice", "c2": "orifice", "c3": "orifice", "c4": "orifice",
+    "flow": "compensated", "margin": "compensated", "meter_out": "compensated",
+}  # fmt: skip
 
 
 def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) -> Hydraulics | None:
@@ -61,39 +67,29 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
             _warn_of_unit(supply_section, "tank", supply.tank)
     named: dict[str, list[str]] = {"cylinder": [], "valve": [], "control": []}
     cylinders: dict[str, Cylinder] = {}
-    holding = ("counterbalance_a", "counterbalance_b")
-    keys = (*number_names(Cylinder), *holding)
+    keys = (*number_names(Cylinder), *HOLDING)
     for joint, item in section.mappings("cylinders", "cylinder of", *keys):
         named["cylinder"].append(joint)
         with recoverable():
-            _check_joint(joint, item, active)
-            if lack := tree.unlimited(joint):
-                problem = f"joint '{joint}' {lack}, a cylinder needs the limits of its stroke"
-                flag(item.fail(None, problem))
-            turning = _turns(tree, joint)
-            holds = _holding(item, holding)
-            cylinder = _part(item, Cylinder, turning, joint=joint, **holds)
-            cylinders[joint] = cylinder
-            if supply is not None:
-                _checked(item, check_relief, supply, cylinder)
-                _warn_of_unit(item, "relief", cylinder.relief)
-                _warn_of_relief(item, supply, cylinder)
+            check_active(joint, item, active)
+            cylinders[joint] = _cylinder(joint, item, tree)
+            _check_relief(item, supply, cylinders[joint])
     valves: dict[str, Valve] = {}
     given = (*number_names(Valve), "type", "flow", "meter_out")
     for joint, item in section.mappings("valves", "valve of", *given):
         named["valve"].append(joint)
         with recoverable():
-            _check_joint(joint, item, active)
+            check_active(joint, item, active)
             valves[joint] = _valve(item, joint)
-    for joint in (*named["cylinder"], *named["valve"]):
-        for what in ("cylinder", "valve"):
-            if joint not in named[what]:
-                flag(section.fail(f"{what}s", f"'{joint}' has no {what}, add it"))
+    driven = (*named["cylinder"], *named["valve"])
+    for joint, what in itertools.product(driven, ("cylinder", "valve")):
+        if joint not in named[what]:
+            flag(section.fail(f"{what}s", f"'{joint}' has no {what}, add it"))
     control: dict[str, PDGains] = {}
     for joint, item in section.mappings("control", "control of", *number_names(PDGains)):
         named["control"].append(joint)
         with recoverable():
-            _check_joint(joint, item, active)
+            check_active(joint, item, active)
             control[joint] = _part(item, PDGains)
     if named["control"] and set(named["control"]) != set(named["cylinder"]):
         listed = ", ".join(named["cylinder"])
@@ -112,7 +108,12 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
     )
 
 
-def _check_joint(joint: str, item: Section, active: tuple[str, ...]) -> None:
+def check_active(joint: str, item: Section, active: tuple[str, ...]) -> None:
+    """Raise for an item of a joint that is not active.
+
+    Raises:
+        DescriptionError: With file and line, and the joints that are.
+    """
     if joint not in active:
         raise item.fail(None, f"'{joint}' is not an active joint, {known(active, joint)}")
 
@@ -154,7 +155,12 @@ def _warn_of_unit(section: Section, key: str, value: float, turning: bool = Fals
         warnings.warn(what, CraneWarning, stacklevel=2)
 
 
-def _warn_of_relief(section: Section, supply: Supply, cylinder: Cylinder) -> None:
+def _check_relief(section: Section, supply: Supply | None, cylinder: Cylinder) -> None:
+    """A cylinder's relief beside the supply, which may have been refused."""
+    if supply is None:
+        return
+    _checked(section, check_relief, supply, cylinder)
+    _warn_of_unit(section, "relief", cylinder.relief)
     if 0 < cylinder.relief <= supply.pressure and not doubt("relief", cylinder.relief):
         what = (
             f"{section.where('relief')}: 'relief' of {section.title} is {cylinder.relief:g} Pa, "
@@ -164,9 +170,17 @@ def _warn_of_relief(section: Section, supply: Supply, cylinder: Cylinder) -> Non
         warnings.warn(what, CraneWarning, stacklevel=2)
 
 
-def _holding(item: Section, names: tuple[str, ...]) -> dict[str, Counterbalance]:
+def _cylinder(joint: str, item: Section, tree: TreeBuilder) -> Cylinder:
+    if lack := tree.unlimited(joint):
+        problem = f"joint '{joint}' {lack}, a cylinder needs the limits of its stroke"
+        flag(item.fail(None, problem))
+    turning = _turns(tree, joint)
+    return _part(item, Cylinder, turning, joint=joint, **_holding(item))
+
+
+def _holding(item: Section) -> dict[str, Counterbalance]:
     found = {}
-    for name in names:
+    for name in HOLDING:
         section = item.section(name, f"'{name}'")
         if section is not None:
             section.only(*number_names(Counterbalance))
@@ -178,11 +192,9 @@ def _valve(item: Section, joint: str) -> Valve:
     kind = item.text("type")
     if kind not in _KINDS:
         raise item.fail("type", f"valve type '{kind}' is unknown, {known(_KINDS, kind)}")
-    own = {"orifice": ("c1", "c2", "c3", "c4"), "compensated": ("flow", "margin", "meter_out")}
-    for other, names in own.items():
-        for name in names:
-            if other != kind and name in item:
-                raise item.fail(name, f"'{name}' is for valves of type '{other}', remove it")
+    for name, other in _OF_KIND.items():
+        if other != kind and name in item:
+            raise item.fail(name, f"'{name}' is for valves of type '{other}', remove it")
     if kind == "orifice":
         return _part(item, Valve, joint=joint)
     flow, margin = item.number("flow", minimum=0.0), item.number("margin", minimum=0.0)

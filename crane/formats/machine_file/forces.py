@@ -19,32 +19,34 @@ def read_friction(top: Section, tree: TreeBuilder) -> dict[str, Friction]:
     for joint, item in top.mappings("friction", "friction of", *keys):
         with recoverable():
             tree.check_joint(joint, item.where())
-            stribeck = item.number("stribeck", Friction.stribeck, minimum=0.0)
-            if stribeck == 0:
-                raise item.fail(
-                    "stribeck", f"'stribeck' of friction of '{joint}' is 0, give a velocity"
-                )
-            friction = Friction(
-                coulomb=item.number("coulomb", 0.0, minimum=0.0),
-                coulomb_offset=item.number("coulomb_offset", 0.0),
-                viscous=item.number("viscous", 0.0, minimum=0.0),
-                viscous_offset=item.number("viscous_offset", 0.0),
-                smoothing=item.number("smoothing", Friction.smoothing, minimum=0.0),
-                stiction=item.number("stiction", 0.0, minimum=0.0),
-                stribeck=stribeck,
-            )
-            for kind in ("coulomb", "viscous"):
-                mean, offset = getattr(friction, kind), getattr(friction, f"{kind}_offset")
-                if abs(offset) > mean and not item.is_bundled:
-                    warnings.warn(
-                        f"{item.where()}: friction of '{joint}' drives the joint in one "
-                        f"direction (|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), "
-                        "a constant force may hide in it",
-                        CraneWarning,
-                        stacklevel=2,
-                    )
-            found[joint] = friction
+            found[joint] = _friction(joint, item)
     return found
+
+
+def _friction(joint: str, item: Section) -> Friction:
+    stribeck = item.number("stribeck", Friction.stribeck, minimum=0.0)
+    if stribeck == 0:
+        raise item.fail("stribeck", f"'stribeck' of friction of '{joint}' is 0, give a velocity")
+    friction = Friction(
+        coulomb=item.number("coulomb", 0.0, minimum=0.0),
+        coulomb_offset=item.number("coulomb_offset", 0.0),
+        viscous=item.number("viscous", 0.0, minimum=0.0),
+        viscous_offset=item.number("viscous_offset", 0.0),
+        smoothing=item.number("smoothing", Friction.smoothing, minimum=0.0),
+        stiction=item.number("stiction", 0.0, minimum=0.0),
+        stribeck=stribeck,
+    )
+    for kind in ("coulomb", "viscous"):
+        mean, offset = getattr(friction, kind), getattr(friction, f"{kind}_offset")
+        if abs(offset) > mean and not item.is_bundled:
+            warnings.warn(
+                f"{item.where()}: friction of '{joint}' drives the joint in one direction "
+                f"(|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), a constant force may hide "
+                "in it",
+                CraneWarning,
+                stacklevel=3,
+            )
+    return friction
 
 
 def read_forces(top: Section, tree: TreeBuilder) -> tuple[ForceElement, ...]:
@@ -53,21 +55,22 @@ def read_forces(top: Section, tree: TreeBuilder) -> tuple[ForceElement, ...]:
     keys = ("joint", "stiffness", "rest", "damping", "force")
     for item in top.sections("forces", "force element of", *keys):
         with recoverable():
-            element = ForceElement(
-                tree.joint(item),
-                stiffness=item.number("stiffness", 0.0, minimum=0.0),
-                rest=item.number("rest", 0.0),
-                damping=item.number("damping", 0.0, minimum=0.0),
-                force=item.number("force", 0.0),
-            )
-            if not (element.stiffness or element.damping or element.force):
-                raise item.fail(
-                    None,
-                    f"the element on '{element.joint}' does nothing, give it stiffness, damping "
-                    "or force",
-                )
-            forces.append(element)
+            forces.append(_force_element(tree.joint(item), item))
     return tuple(forces)
+
+
+def _force_element(joint: str, item: Section) -> ForceElement:
+    element = ForceElement(
+        joint,
+        stiffness=item.number("stiffness", 0.0, minimum=0.0),
+        rest=item.number("rest", 0.0),
+        damping=item.number("damping", 0.0, minimum=0.0),
+        force=item.number("force", 0.0),
+    )
+    if not (element.stiffness or element.damping or element.force):
+        problem = f"the element on '{joint}' does nothing, give it stiffness, damping or force"
+        raise item.fail(None, problem)
+    return element
 
 
 def read_gas_springs(top: Section, tree: TreeBuilder) -> tuple[GasSpring, ...]:
@@ -77,15 +80,19 @@ def read_gas_springs(top: Section, tree: TreeBuilder) -> tuple[GasSpring, ...]:
     for joint, item in top.mappings("gas_springs", "gas spring of", *keys):
         with recoverable():
             tree.check_joint(joint, item.where())
-            area = item.number("area")
-            volume = item.number("volume", minimum=0.0)
-            exponent = item.number("exponent", GasSpring.exponent, minimum=0.0)
-            for key, value in (("area", area), ("volume", volume), ("exponent", exponent)):
-                if value == 0:
-                    raise item.fail(key, f"'{key}' of gas spring of '{joint}' is 0, give one")
-            pressure, rest = item.number("pressure", minimum=0.0), item.number("rest", 0.0)
-            springs.append(GasSpring(joint, area, pressure, volume, rest, exponent))
+            springs.append(_gas_spring(joint, item))
     return tuple(springs)
+
+
+def _gas_spring(joint: str, item: Section) -> GasSpring:
+    area = item.number("area")
+    volume = item.number("volume", minimum=0.0)
+    exponent = item.number("exponent", GasSpring.exponent, minimum=0.0)
+    for key, value in (("area", area), ("volume", volume), ("exponent", exponent)):
+        if value == 0:
+            raise item.fail(key, f"'{key}' of gas spring of '{joint}' is 0, give one")
+    pressure, rest = item.number("pressure", minimum=0.0), item.number("rest", 0.0)
+    return GasSpring(joint, area, pressure, volume, rest, exponent)
 
 
 def read_end_stops(top: Section, tree: TreeBuilder) -> tuple[EndStop, ...]:
@@ -94,13 +101,15 @@ def read_end_stops(top: Section, tree: TreeBuilder) -> tuple[EndStop, ...]:
     for joint, item in top.mappings("end_stops", "end stop of", "stiffness", "damping"):
         with recoverable():
             tree.check_joint(joint, item.where())
-            if lack := tree.unlimited(joint):
-                hint = "make it revolute" if lack == "is continuous" else "give it both"
-                raise item.fail(None, f"joint '{joint}' {lack}, a stop needs limits: {hint}")
-            stiffness = item.number("stiffness", minimum=0.0)
-            if stiffness == 0:
-                raise item.fail(
-                    "stiffness", f"the end stop of '{joint}' has no stiffness, give one"
-                )
-            stops.append(EndStop(joint, stiffness, item.number("damping", 0.0, minimum=0.0)))
+            stops.append(_end_stop(joint, item, tree))
     return tuple(stops)
+
+
+def _end_stop(joint: str, item: Section, tree: TreeBuilder) -> EndStop:
+    if lack := tree.unlimited(joint):
+        hint = "make it revolute" if lack == "is continuous" else "give it both"
+        raise item.fail(None, f"joint '{joint}' {lack}, a stop needs limits: {hint}")
+    stiffness = item.number("stiffness", minimum=0.0)
+    if stiffness == 0:
+        raise item.fail("stiffness", f"the end stop of '{joint}' has no stiffness, give one")
+    return EndStop(joint, stiffness, item.number("damping", 0.0, minimum=0.0))

@@ -10,6 +10,7 @@ import math
 import re
 import warnings
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from crane.common.errors import CraneWarning
 from crane.description.rigid import se3
 from crane.description.spec import MachineSpec
 from crane.description.tree import Joint, Tree
+
+if TYPE_CHECKING:
+    import pinocchio as pin
 
 _END = re.compile(r"((?:closing_|closed?_?loop|loop_?clos).*?)_?([12AB])", re.IGNORECASE)
 _SIDES = ({"1", "2"}, {"A", "B"})
@@ -86,19 +90,26 @@ def _gap(above: Mapping[str, Joint], one: str, two: str) -> str:
     """How far two frames are apart with all joints at zero, in words."""
     import pinocchio as pin
 
-    places = []
-    for link in (one, two):
-        place, seen = pin.SE3.Identity(), {link}
-        while link in above:
-            joint = above[link]
-            if not np.isfinite((*joint.xyz, *joint.rpy)).all():  # which has been told
-                return ""
-            place, link = se3(joint.xyz, joint.rpy) * place, joint.parent
-            if link in seen:
-                return ""
-            seen.add(link)
-        places.append(place)
-    between = places[0].actInv(places[1])
+    place, other = _place_at_zero(above, one), _place_at_zero(above, two)
+    if place is None or other is None:
+        return ""
+    between = place.actInv(other)
     distance = float(np.linalg.norm(between.translation))
     angle = math.degrees(float(np.linalg.norm(pin.log3(between.rotation))))
     return f" ({1e3 * distance:.3g} mm and {angle:.3g} deg apart at zero)"
+
+
+def _place_at_zero(above: Mapping[str, Joint], link: str) -> "pin.SE3 | None":
+    """Where a link is with all joints at zero, None where that cannot be said."""
+    import pinocchio as pin
+
+    place, seen = pin.SE3.Identity(), {link}
+    while link in above:
+        joint = above[link]
+        if not np.isfinite((*joint.xyz, *joint.rpy)).all():  # which has been told
+            return None
+        place, link = se3(joint.xyz, joint.rpy) * place, joint.parent
+        if link in seen:
+            return None
+        seen.add(link)
+    return place

@@ -1,6 +1,6 @@
 """Machine files and single URDFs, read and checked into a `MachineSpec`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,9 +17,10 @@ from crane.description.spec import (
     MachineSpec,
     PIGains,
     Task,
+    places,
     unit_vector,
 )
-from crane.formats.machine_file.circuit import read_hydraulics
+from crane.formats.machine_file.circuit import check_active, read_hydraulics
 from crane.formats.machine_file.forces import (
     read_end_stops,
     read_forces,
@@ -31,7 +32,7 @@ from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tasks import read_tasks
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.parallel_robots import is_parallel_robot, read_parallel_robot
-from crane.formats.urdf.read import is_urdf, read_urdf
+from crane.formats.urdf.read import Urdf, is_urdf, read_urdf
 
 Part = TypeVar("Part")
 
@@ -75,7 +76,7 @@ def _read_single(path: Path) -> MachineSpec:
     for loop in urdf.loops:
         with recoverable():
             tree.check_loop(loop)
-    where = _places(urdf.loops, urdf.couplings)
+    where = places(urdf.loops, urdf.couplings)
     where |= {f"home {joint}": place for joint, place in urdf.home_lines.items()}
     active = urdf.independent
     if urdf.loops and not active:
@@ -110,27 +111,14 @@ def _read_machine(path: Path) -> MachineSpec:
             tree.check_joint(joint, top.where("active"))
     if not all(joint in tree.joints for joint in active):
         active = Anything()
-    where = {key: top.where(key) for key in top} | _places(loops, couplings)
-    home = {}
-    section = None
-    with recoverable():
-        section = top.section("home", "'home'")
-    for joint in section or ():
-        assert section is not None
-        with recoverable():
-            tree.check_joint(joint, section.where(joint))
-            home[joint] = section.number(joint)
-            where[f"home {joint}"] = section.where(joint)
+    where = {key: top.where(key) for key in top} | places(loops, couplings)
+    home, home_lines = _home(top, tree)
+    where |= {f"home {joint}": place for joint, place in home_lines.items()}
     friction |= _part(read_friction, {}, top, tree)
     forces = _part(read_forces, (), top, tree)
     gas_springs = _part(read_gas_springs, (), top, tree)
     end_stops = _part(read_end_stops, (), top, tree)
-    tip = top.text("tip", None)
-    with recoverable(harmless=True):
-        if tip is not None:
-            tree.check_link(tip, top.where("tip"), "the tip frame")
-            if not tree.moves(tip):
-                raise top.fail("tip", f"the tip frame '{tip}' does not move, choose another")
+    tip = _tip(top, tree)
     payload = _part(_payload, None, top, tree, tip)
     # a machine whose active joints are not named is not driven either: `load` proposes some
     hydraulics = None
@@ -138,10 +126,9 @@ def _read_machine(path: Path) -> MachineSpec:
     control: dict[str, PIGains] = {}
     if active:
         valves: tuple[str, ...] = Anything() if "hydraulics" in top else ()
-        with recoverable(harmless=True):
-            hydraulics = read_hydraulics(top, tree, active)
-            if hydraulics is not None and not isinstance(active, Anything):
-                valves = hydraulics.joints
+        hydraulics = _part(read_hydraulics, None, top, tree, active)
+        if hydraulics is not None and not isinstance(active, Anything):
+            valves = hydraulics.joints
         tasks = _part(read_tasks, tasks, top, active, tip, valves)
         control = _part(_control, control, top, active)
     return MachineSpec(
@@ -157,6 +144,33 @@ def _part(read: Callable[..., Part], nothing: Any, *arguments: object) -> Part:
     return nothing
 
 
+def _home(top: Section, tree: TreeBuilder) -> tuple[dict[str, float], dict[str, str]]:
+    """Coordinates of the home posture, and where each was written."""
+    home, where = {}, {}
+    section = None
+    with recoverable():
+        section = top.section("home", "'home'")
+    for joint in section or ():
+        assert section is not None
+        with recoverable():
+            tree.check_joint(joint, section.where(joint))
+            home[joint] = section.number(joint)
+            where[joint] = section.where(joint)
+    return home, where
+
+
+def _tip(top: Section, tree: TreeBuilder) -> str | None:
+    """The name of the tip frame, also where it has been noted as wrong."""
+    tip = top.text("tip", None)
+    if tip is None:
+        return None
+    with recoverable(harmless=True):
+        tree.check_link(tip, top.where("tip"), "the tip frame")
+        if not tree.moves(tip):
+            raise top.fail("tip", f"the tip frame '{tip}' does not move, choose another")
+    return tip
+
+
 def _chains(
     top: Section, path: Path
 ) -> tuple[tuple[Chain, ...], TreeBuilder, dict[str, Friction], tuple[Coupling, ...]]:
@@ -169,22 +183,7 @@ def _chains(
         so_far = tree.complete
         tree.complete = False
         with recoverable():
-            name, parent = item.text("name"), item.text("parent", None)
-            file = item.file("urdf")
-            if any(chain.name == name for chain in chains):
-                flag(item.fail("name", f"two chains are named '{name}', rename one"))
-            elif (chains or not so_far) and parent is None:
-                problem = f"chain '{name}' has no 'parent', name the frame it hangs from"
-                flag(item.fail(None, problem))
-            elif not chains and so_far and parent is not None:
-                problem = f"chain '{name}' is first and stands on the world, remove its 'parent'"
-                flag(item.fail("parent", problem))
-                parent = None
-            urdf = read_urdf(file)
-            chain = Chain(name, file, parent, item.where("parent"), urdf.moving)
-            for loop in urdf.loops[:1]:
-                problem = f"a sub-chain has no <loop>, write it under 'loops' of {path.name}"
-                flag(DescriptionError(f"{loop.where}: {problem}"))
+            chain, urdf = _chain(item, chains, so_far, path)
             tree.complete = so_far
             tree.add(chain, urdf)
             chains.append(chain)
@@ -199,18 +198,43 @@ def _chains(
     return tuple(chains), tree, friction, couplings
 
 
+def _chain(item: Section, before: list[Chain], all_read: bool, path: Path) -> tuple[Chain, Urdf]:
+    """A chain and its file.
+
+    Args:
+        item: Where it is written.
+        before: The chains before it.
+        all_read: Whether these are all that were written before it.
+        path: The machine file.
+    """
+    name, parent = item.text("name"), item.text("parent", None)
+    file = item.file("urdf")
+    if any(chain.name == name for chain in before):
+        flag(item.fail("name", f"two chains are named '{name}', rename one"))
+    elif (before or not all_read) and parent is None:
+        problem = f"chain '{name}' has no 'parent', name the frame it hangs from"
+        flag(item.fail(None, problem))
+    elif not before and all_read and parent is not None:
+        problem = f"chain '{name}' is first and stands on the world, remove its 'parent'"
+        flag(item.fail("parent", problem))
+        parent = None
+    urdf = read_urdf(file)
+    for loop in urdf.loops[:1]:
+        problem = f"a sub-chain has no <loop>, write it under 'loops' of {path.name}"
+        flag(DescriptionError(f"{loop.where}: {problem}"))
+    return Chain(name, file, parent, item.where("parent"), urdf.moving), urdf
+
+
 def _loops(top: Section, tree: TreeBuilder) -> tuple[LoopSpec, ...]:
     loops: dict[str, LoopSpec] = {}
     for item in top.sections("loops", "loop", "name", "type", "predecessor", "successor", "axis"):
         with recoverable():
-            loop = _loop(item, tree)
-            if loop.name in loops:
-                raise item.fail("name", f"two loops are named '{loop.name}', rename one")
+            loop = _loop(item, tree, loops)
             loops[loop.name] = loop
     return tuple(loops.values())
 
 
-def _loop(section: Section, tree: TreeBuilder) -> LoopSpec:
+def _loop(section: Section, tree: TreeBuilder, before: Container[str]) -> LoopSpec:
     name, kind = section.text("name"), section.text("type")
     what = f"loop '{name}'" if name else "a loop"
     if kind and kind not in LOOP_TYPES:
@@ -233,35 +257,39 @@ def _loop(section: Section, tree: TreeBuilder) -> LoopSpec:
         raise FollowUpError(f"{what} is not complete")
     loop = LoopSpec(name, kind, ends[0], ends[1], axis, section.where())
     tree.check_loop(loop)
+    if name in before:
+        raise section.fail("name", f"two loops are named '{name}', rename one")
     return loop
-
-
-def _places(loops: tuple[LoopSpec, ...], couplings: tuple[Coupling, ...]) -> dict[str, str]:
-    """Where loops and couplings were written, as errors about them look it up."""
-    places = {f"loop {loop.name}": loop.where for loop in loops}
-    return places | {f"loop {coupling.name}": coupling.where for coupling in couplings}
 
 
 def _couplings(top: Section, tree: TreeBuilder) -> tuple[Coupling, ...]:
     found: dict[str, Coupling] = {}
     for item in top.sections("couplings", "coupling", "name", "joints", "offset"):
         with recoverable():
-            name, joints = item.text("name"), item.section("joints", "'joints'")
-            if name in found:
-                raise item.fail("name", f"two couplings are named '{name}', rename one")
-            if joints is None or len(list(joints)) < 2:
-                problem = f"coupling '{name}' joins less than two joints, add some"
-                raise item.fail("joints", problem)
-            factors = {}
-            for joint in joints:
-                with recoverable():
-                    tree.check_joint(joint, joints.where(joint))
-                    factors[joint] = joints.number(joint)
-                    if factors[joint] == 0:
-                        problem = f"the factor of '{joint}' is 0, leave it out"
-                        raise joints.fail(joint, problem)
-            found[name] = Coupling(name, factors, item.number("offset", 0.0), item.where())
+            coupling = _coupling(item, tree, found)
+            found[coupling.name] = coupling
     return tuple(found.values())
+
+
+def _coupling(item: Section, tree: TreeBuilder, before: Container[str]) -> Coupling:
+    name, joints = item.text("name"), item.section("joints", "'joints'")
+    if name in before:
+        raise item.fail("name", f"two couplings are named '{name}', rename one")
+    if joints is None or len(list(joints)) < 2:
+        raise item.fail("joints", f"coupling '{name}' joins less than two joints, add some")
+    factors = {}
+    for joint in joints:
+        with recoverable():
+            tree.check_joint(joint, joints.where(joint))
+            factors[joint] = _factor(joints, joint)
+    return Coupling(name, factors, item.number("offset", 0.0), item.where())
+
+
+def _factor(joints: Section, joint: str) -> float:
+    factor = joints.number(joint)
+    if factor == 0:
+        flag(joints.fail(joint, f"the factor of '{joint}' is 0, leave it out"))
+    return factor
 
 
 def _payload(top: Section, tree: TreeBuilder, tip: str | None) -> Load | None:
@@ -294,8 +322,7 @@ def _control(top: Section, active: tuple[str, ...]) -> dict[str, PIGains]:
     for joint, item in top.mappings("control", "control of", "kp", "ki"):
         named.append(joint)
         with recoverable():
-            if joint not in active:
-                raise item.fail(None, f"'{joint}' is not an active joint, {known(active, joint)}")
+            check_active(joint, item, active)
         with recoverable():
             kp, ki = (item.number(key, minimum=0.0) for key in ("kp", "ki"))
             gains[joint] = PIGains(kp, ki)

@@ -77,6 +77,16 @@ def _shown(value: Any) -> str:
     return text if len(text) < 60 else f"{text[:60]}..."
 
 
+def _as_float(value: Any) -> float:
+    """What a value is as a number, NaN where it is none; PyYAML reads 2e5 as text."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return math.nan
+    try:
+        return float(value)
+    except (ValueError, OverflowError):
+        return math.nan
+
+
 class Section:
     """A mapping of a machine file.
 
@@ -210,19 +220,14 @@ class Section:
             return math.nan
 
     def _number(self, key: str, value: Any) -> float:
+        number = _as_float(value)
+        if math.isfinite(number):
+            return number
         hint = "give a number"
-        # PyYAML reads 2e5 as text
-        if isinstance(value, int | float | str) and not isinstance(value, bool):
-            try:
-                number = float(value)
-            except (ValueError, OverflowError):
-                number = math.nan
-                if isinstance(value, str) and "," in value:
-                    hint = "give a number with a decimal point"
-            if math.isfinite(number):
-                return number
-            if isinstance(value, float):
-                hint = "give a finite number"
+        if isinstance(value, float):
+            hint = "give a finite number"
+        elif isinstance(value, str) and "," in value:
+            hint = "give a number with a decimal point"
         raise self.fail(key, f"'{key}' of {self.title} is {_shown(value)}, {hint}")
 
     def numbers(self, key: str, default: Any = _MISSING) -> tuple[float, ...]:
@@ -233,13 +238,15 @@ class Section:
             raise self.fail(key, f"'{key}' of {self.title} is {shown}, give a list such as [0, 1]")
         return tuple(self._number(key, item) for item in value)
 
-    def names(self, key: str) -> tuple[str, ...]:
-        """A list of different names."""
+    def _list(self, key: str, wanted: str) -> list[Any]:
         value = self._take(key, _MISSING)
         if not isinstance(value, list):
-            raise self.fail(
-                key, f"'{key}' of {self.title} is {_shown(value)}, give a list such as [q1, q2]"
-            )
+            raise self.fail(key, f"'{key}' of {self.title} is {_shown(value)}, give {wanted}")
+        return value
+
+    def names(self, key: str) -> tuple[str, ...]:
+        """A list of different names."""
+        value = self._list(key, "a list such as [q1, q2]")
         for item in value:
             if not isinstance(item, str):
                 raise self.fail(
@@ -251,11 +258,7 @@ class Section:
 
     def texts(self, key: str) -> tuple[str, ...]:
         """A list of texts, the same ones perhaps several times."""
-        value = self._take(key, _MISSING)
-        if not isinstance(value, list):
-            raise self.fail(
-                key, f"'{key}' of {self.title} is {_shown(value)}, give a list such as [a, b]"
-            )
+        value = self._list(key, "a list such as [a, b]")
         for item in value:
             if not isinstance(item, str) or not item.isprintable():
                 raise self.fail(key, f"'{key}' lists {_shown(item)}, which is no text, quote it")
@@ -263,19 +266,14 @@ class Section:
 
     def pairs(self, key: str) -> list[tuple[str, str]]:
         """A list of pairs of names."""
-        value = self._take(key, _MISSING)
-        if not isinstance(value, list):
-            raise self.fail(
-                key, f"'{key}' of {self.title} is {_shown(value)}, give a list of pairs [[a, b]]"
-            )
+        value = self._list(key, "a list of pairs [[a, b]]")
         for item in value:
             if not (isinstance(item, list) and len(item) == 2):
                 raise self.fail(key, f"'{key}' lists {_shown(item)}, write pairs as [a, b]")
-            for name in item:
-                if not isinstance(name, str) or not name.isprintable():
-                    raise self.fail(
-                        key, f"'{key}' lists {_shown(name)}, which is not a name, quote it"
-                    )
+            strange = [x for x in item if not isinstance(x, str) or not x.isprintable()]
+            if strange:
+                problem = f"'{key}' lists {_shown(strange[0])}, which is not a name, quote it"
+                raise self.fail(key, problem)
         return [(one, two) for one, two in value]
 
     def file(self, key: str) -> Path:
@@ -312,15 +310,17 @@ class Section:
             assert outer is not None
             inner = None
             with recoverable():
-                inner = outer.section(name, f"{title} '{name}'")
-                if inner is None or not inner._data:
-                    inner = None
-                    raise outer.fail(
-                        name, f"{title} '{name}' is empty, its keys are {', '.join(keys)}"
-                    )
+                inner = outer._filled(name, f"{title} '{name}'", keys)
             if inner is not None:
                 inner.only(*keys)
                 yield name, inner
+
+    def _filled(self, key: str, title: str, keys: Iterable[str]) -> "Section":
+        """A mapping that is not empty."""
+        section = self.section(key, title)
+        if section is None or not section._data:
+            raise self.fail(key, f"{title} is empty, its keys are {', '.join(keys)}")
+        return section
 
     def sections(self, key: str, title: str, *keys: str) -> "Iterator[Section]":
         """The mappings of a list, with these keys; none where the list is absent."""

@@ -17,39 +17,51 @@ def read_tasks(
     keys = ("description", "duration", "tip", "active", "joystick")
     for name, item in top.mappings("tasks", "task", *keys):
         with recoverable():
-            duration = item.number("duration", minimum=0.0)
-            if duration == 0:
-                flag(item.fail("duration", f"task '{name}' takes no time, give a duration"))
             spaces = {"tip": ("x", "y", "z"), "active": active, "joystick": valves}
-            given = [
-                (space, section)
-                for space in spaces
-                if (section := item.section(space, f"'{space}' of task '{name}'")) is not None
-            ]
-            if len(given) != 1:
-                count = "more than one" if given else "none"
-                raise item.fail(
-                    None, f"task '{name}' has {count} of 'tip', 'active', 'joystick', give one"
-                )
-            space, polynomials = given[0]
-            if space == "tip" and tip is None:
-                raise item.fail("tip", f"task '{name}' moves the tip, name its frame under 'tip:'")
-            if not isinstance(spaces[space], Anything):
-                polynomials.only(*spaces[space])
-            description = item.text("description", "")
-            if space == "joystick":
-                levers = {}
-                for joint in polynomials:
-                    with recoverable():
-                        levers[joint] = _lever(polynomials, joint, duration)
-                tasks[name] = Task(name, description, duration, space, {}, levers)
-                continue
-            coefficients = {}
-            for key in spaces[space]:
-                with recoverable():
-                    coefficients[key] = polynomials.numbers(key)
-            tasks[name] = Task(name, description, duration, space, coefficients)
+            tasks[name] = _task(name, item, spaces, tip)
     return tasks
+
+
+def _task(name: str, item: Section, spaces: dict[str, tuple[str, ...]], tip: str | None) -> Task:
+    """A task of one of the spaces, each of which is given with the names of its coordinates."""
+    duration = item.number("duration", minimum=0.0)
+    if duration == 0:
+        flag(item.fail("duration", f"task '{name}' takes no time, give a duration"))
+    given = [
+        (space, section)
+        for space in spaces
+        if (section := item.section(space, f"'{space}' of task '{name}'")) is not None
+    ]
+    if len(given) != 1:
+        count = "more than one" if given else "none"
+        raise item.fail(
+            None, f"task '{name}' has {count} of 'tip', 'active', 'joystick', give one"
+        )
+    space, motion = given[0]
+    if space == "tip" and tip is None:
+        raise item.fail("tip", f"task '{name}' moves the tip, name its frame under 'tip:'")
+    if not isinstance(spaces[space], Anything):
+        motion.only(*spaces[space])
+    description = item.text("description", "")
+    if space == "joystick":
+        return Task(name, description, duration, space, {}, _levers(motion, duration))
+    return Task(name, description, duration, space, _polynomials(motion, spaces[space]))
+
+
+def _polynomials(section: Section, names: tuple[str, ...]) -> dict[str, tuple[float, ...]]:
+    found = {}
+    for name in names:
+        with recoverable():
+            found[name] = section.numbers(name)
+    return found
+
+
+def _levers(section: Section, duration: float) -> dict[str, tuple[tuple[float, float], ...]]:
+    found = {}
+    for joint in section:
+        with recoverable():
+            found[joint] = _lever(section, joint, duration)
+    return found
 
 
 def _lever(section: Section, joint: str, duration: float) -> tuple[tuple[float, float], ...]:

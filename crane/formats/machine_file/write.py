@@ -15,8 +15,8 @@ from crane.common.output import file_name, staging
 from crane.description import Task
 from crane.formats.machine_file.read import read
 from crane.formats.parts import add_joint, add_link, draw, finished, origin_of
-from crane.hydraulics import Hydraulics, Valve
-from crane.hydraulics.components import number_names
+from crane.hydraulics import Cylinder, Hydraulics, Valve
+from crane.hydraulics.components import HOLDING, number_names
 from crane.machine import Machine
 
 
@@ -158,24 +158,24 @@ def _task(task: Task) -> dict[str, Any]:
 
 
 def _hydraulics(circuit: Hydraulics) -> dict[str, Any]:
-    def numbers(part: Any) -> dict[str, Any]:
-        return {name: getattr(part, name) for name in number_names(type(part))}
-
-    cylinders = {}
-    for joint, cylinder in circuit.cylinders.items():
-        cylinders[joint] = numbers(cylinder)
-        for key in ("counterbalance_a", "counterbalance_b"):
-            if (holding := getattr(cylinder, key)) is not None:
-                cylinders[joint][key] = numbers(holding)
     data = {
-        "supply": numbers(circuit.supply),
-        "oil": numbers(circuit.oil),
-        "cylinders": cylinders,
+        "supply": _all_numbers(circuit.supply),
+        "oil": _all_numbers(circuit.oil),
+        "cylinders": {joint: _cylinder(item) for joint, item in circuit.cylinders.items()},
         "valves": {joint: _valve(valve) for joint, valve in circuit.valves.items()},
     }
     if circuit.control:
-        data["control"] = {joint: numbers(gains) for joint, gains in circuit.control.items()}
+        data["control"] = {joint: _all_numbers(gains) for joint, gains in circuit.control.items()}
     return data
+
+
+def _all_numbers(part: Any) -> dict[str, Any]:
+    return {name: getattr(part, name) for name in number_names(type(part))}
+
+
+def _cylinder(cylinder: Cylinder) -> dict[str, Any]:
+    fitted = {key: getattr(cylinder, key) for key in HOLDING if getattr(cylinder, key) is not None}
+    return _all_numbers(cylinder) | {key: _all_numbers(valve) for key, valve in fitted.items()}
 
 
 def _valve(valve: Valve) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """What a MJCF file declares, counted before MuJoCo makes it: a few letters can ask for days."""
 
+import math
 from collections.abc import Mapping
 
 from lxml import etree
@@ -75,21 +76,19 @@ def _too_many(xml: XmlFile, element: etree._Element, count: float) -> Descriptio
 
 def _check(xml: XmlFile, element: etree._Element) -> None:
     keys, most = _SIZES.get(element.tag, ((), 0))
-    product = 1.0
-    for key in keys:
-        for number in _numbers(element, key):
-            product *= max(abs(number), 1.0)
+    product = math.prod(max(abs(x), 1.0) for key in keys for x in _numbers(element, key))
     if keys and product > most:
         given = " ".join(f'{key}="{element.get(key)[:20]}"' for key in keys if element.get(key))
         raise xml.fail(element, f"{given} of <{element.tag}> is too large, make it at most {most}")
-    if element.tag in _EACH and (element.tag == "size" or element.get("builtin")):
-        for key in ("params",) if element.tag == "mesh" else element.keys():
-            if key not in _KEPT and any(x > _EACH[element.tag] for x in _numbers(element, key)):
-                raise xml.fail(
-                    element,
-                    f'{key}="{element.get(key)[:20]}" of <{element.tag}> is too large, make it at '
-                    f"most {_EACH[element.tag]}",
-                )
+    if element.tag not in _EACH or (element.tag != "size" and not element.get("builtin")):
+        return
+    for key in ("params",) if element.tag == "mesh" else element.keys():
+        if key not in _KEPT and any(x > _EACH[element.tag] for x in _numbers(element, key)):
+            raise xml.fail(
+                element,
+                f'{key}="{element.get(key)[:20]}" of <{element.tag}> is too large, make it at '
+                f"most {_EACH[element.tag]}",
+            )
 
 
 def _numbers(element: etree._Element, key: str) -> list[float]:

@@ -129,11 +129,13 @@ class MujocoFile:
 
     def where(self, name: str, *tags: str) -> str:
         """File and line of the element with a name, as far as it can be found."""
-        for xml in self._files:
-            for element in xml.root.iter(*tags):
-                if name and element.get("name") == name:
-                    return xml.where(element)
-        return self.file.name
+        places = (
+            xml.where(element)
+            for xml in self._files
+            for element in xml.root.iter(*tags)
+            if name and element.get("name") == name
+        )
+        return next(places, self.file.name)
 
     def where_equality(self, index: int) -> str:
         """File and line of an equality constraint by its number."""

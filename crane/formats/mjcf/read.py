@@ -8,7 +8,7 @@ import pinocchio as pin
 
 from crane.common.errors import DescriptionError
 from crane.description.rigid import inertial, placement, vector
-from crane.description.spec import Chain, ForceElement, Friction, MachineSpec
+from crane.description.spec import Chain, ForceElement, Friction, MachineSpec, places
 from crane.description.tree import Inertial, Joint, Limits, Link, Tree, limit
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.mjcf.equality import Frames, read_equality
@@ -80,9 +80,7 @@ class _Reader:
         if active is None and (loops or couplings):
             active = ()
         home = self._home()
-        places = {f"loop {loop.name}": loop.where for loop in loops}
-        places |= {f"loop {coupling.name}": coupling.where for coupling in couplings}
-        places |= {f"home {joint}": self.joints[joint].where for joint in home}
+        homes = {f"home {joint}": self.joints[joint].where for joint in home}
         return MachineSpec(
             name=self._custom("name") or mjcf.file.stem,
             source=self._custom("source") or mjcf.file.name,
@@ -96,7 +94,7 @@ class _Reader:
             forces=tuple(self.forces),
             tip=self._tip(tree),
             couplings=couplings,
-            where=places,
+            where=places(loops, couplings) | homes,
             motors=active or (),
         )
 

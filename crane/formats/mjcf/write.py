@@ -125,18 +125,23 @@ class _Writer:
         waiting = [(joint, self.bodies[0]) for joint in reversed(self._above(0))]
         while waiting:
             joint, parent = waiting.pop()
-            series = [joint]
-            while not self.model.inertias[series[-1]].mass:
-                last = series[-1]
-                above = self._above(last)
-                if len(above) != 1 or any(frame.parentJoint == last for frame in self.frames):
-                    raise InputError(
-                        f"link '{self.links[last]}' has no mass, which MuJoCo asks of every body "
-                        "with frames or several joints on it: give it some, or write URDF+"
-                    )
-                series += above
+            series = self._series(joint)
             body = self.bodies[series[-1]] = self._body(series, parent)
             waiting += [(i, body) for i in reversed(self._above(series[-1]))]
+
+    def _series(self, joint: int) -> list[int]:
+        """Joints that move one body: a joint, and those above it as long as there is no mass."""
+        series = [joint]
+        while not self.model.inertias[series[-1]].mass:
+            last = series[-1]
+            above = self._above(last)
+            if len(above) != 1 or any(frame.parentJoint == last for frame in self.frames):
+                raise InputError(
+                    f"link '{self.links[last]}' has no mass, which MuJoCo asks of every body "
+                    "with frames or several joints on it: give it some, or write URDF+"
+                )
+            series += above
+        return series
 
     def _body(self, series: list[int], parent: etree._Element) -> etree._Element:
         """A body with the series of joints that moves it."""

@@ -103,6 +103,16 @@ def read_several(
     return series(name, parts_of(kind, axis), place, ends, xml.where(element))
 
 
+def _most(xml: XmlFile, element: etree._Element, key: str, what: str) -> float:
+    """The effort or velocity that a `<limit>` allows, infinite where it has none."""
+    if element.get(key) is None:
+        return math.inf
+    value: float = xml.number(element, key, f"the limit of {what}")
+    if value < 0:
+        raise xml.fail(element, f"the {key} limit of {what} is negative, make it positive")
+    return limit(value) if math.isfinite(value) else math.inf
+
+
 def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
     """Limits of a joint that moves.
 
@@ -118,13 +128,7 @@ def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
     found: dict[str, float] = {}
     for key in ("effort", "velocity"):
         with recoverable(harmless=True):
-            if element.get(key) is not None:
-                value = xml.number(element, key, f"the limit of {what}")
-                if value < 0:
-                    problem = f"the {key} limit of {what} is negative, make it positive"
-                    raise xml.fail(element, problem)
-                if math.isfinite(value):
-                    found[key] = limit(value)
+            found[key] = _most(xml, element, key, what)
     limits = Limits(**found, where=xml.where(element))
     if kind == "continuous":
         return limits

@@ -1,12 +1,12 @@
 """Links and joints of a URDF as a graph: every ring and every second parent is told and cut."""
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from difflib import get_close_matches
 
 from lxml import etree
 
 from crane.common.errors import known
-from crane.description.findings import flag, recoverable
+from crane.description.findings import flag
 from crane.formats.series import SEVERAL
 from crane.formats.urdf.loops import unknown_link
 from crane.formats.xml import XmlFile
@@ -72,8 +72,7 @@ def _ends(
         if not link:
             flag(xml.fail(joint, f'{what} has no {end} link, add <{end} link="..."/>'))
         elif link not in links:
-            with recoverable():
-                raise unknown_link(xml, tag, f"{what} has the unknown {end}", link, links)
+            flag(unknown_link(xml, tag, f"{what} has the unknown {end}", link, links))
             link = ""
         ends.append(link)
     if ends[0] and ends[0] == ends[1]:
@@ -107,24 +106,20 @@ def _root(
     joined = len(above)
     passed = {""}  # links whose ancestors have been looked at
     for name in links:
-        seen, at = {name}, name
-        while at in above and at not in passed:
-            at = above[at][0]
-            if at in seen:
-                last = above[at][1]
-                ring = _ring(above, at)
-                flag(
-                    xml.fail(
-                        joints[last],
-                        f"link '{at}' is its own ancestor: cut the ring of joints {ring} at "
-                        f"'{last}' and close it as a loop",
-                    )
-                )
-                cut.add(last)
-                del above[at]
-                break
-            seen.add(at)
+        seen, at = _ancestors(above, name, passed)
         passed |= seen
+        if at is None:
+            continue
+        last, ring = above[at][1], _ring(above, at)
+        flag(
+            xml.fail(
+                joints[last],
+                f"link '{at}' is its own ancestor: cut the ring of joints {ring} at '{last}' and "
+                "close it as a loop",
+            )
+        )
+        cut.add(last)
+        del above[at]
     lost = len(xml.root.findall("joint")) - joined  # joints that may have had a root as child
     if len(roots) - lost > 1:
         listed = ", ".join(roots[:4]) + (", ..." if len(roots) > 4 else "")
@@ -134,6 +129,19 @@ def _root(
             )
         )
     return roots[0] if roots else next(iter(links))
+
+
+def _ancestors(
+    above: Mapping[str, tuple[str, str]], link: str, passed: Container[str]
+) -> tuple[set[str], str | None]:
+    """A link with its ancestors up to one that has been passed, and who is its own, if any."""
+    seen = {link}
+    while link in above and link not in passed:
+        link = above[link][0]
+        if link in seen:
+            return seen, link
+        seen.add(link)
+    return seen, None
 
 
 def _ring(above: Mapping[str, tuple[str, str]], link: str) -> str:

@@ -23,15 +23,16 @@ def read_home(xml: XmlFile, joints: Container[str]) -> tuple[dict[str, float], d
     """
     home: dict[str, float] = {}
     where: dict[str, str] = {}
-    for state in xml.root.iterfind("group_state"):
-        if state.get("name", "").strip() != _HOME:
-            continue
-        for joint in state.iterfind("joint"):
-            with recoverable():
-                name, value = _coordinate(xml, joint, joints)
-                if name in home:
-                    raise xml.fail(joint, f"home of '{name}' is there twice, keep one")
-                home[name], where[name] = value, xml.where(joint)
+    given = [
+        joint
+        for state in xml.root.iterfind("group_state")
+        if state.get("name", "").strip() == _HOME
+        for joint in state.iterfind("joint")
+    ]
+    for joint in given:
+        with recoverable():
+            name, value = _coordinate(xml, joint, joints, home)
+            home[name], where[name] = value, xml.where(joint)
     return home, where
 
 
@@ -45,21 +46,24 @@ def read_tip(xml: XmlFile, links: Mapping[str, etree._Element]) -> str | None:
     Raises:
         DescriptionError: The link is unknown.
     """
-    for element in xml.root.iterfind("end_effector"):
-        if element.get("name", "").strip() == _TIP:
-            link: str = element.get("parent_link", "").strip()
-            if link not in links:
-                raise xml.fail(
-                    element, f"the tip is the unknown link '{link}', {known(links, link)}"
-                )
-            return link
-    return None
+    tips = [x for x in xml.root.iterfind("end_effector") if x.get("name", "").strip() == _TIP]
+    if not tips:
+        return None
+    link: str = tips[0].get("parent_link", "").strip()
+    if link not in links:
+        raise xml.fail(tips[0], f"the tip is the unknown link '{link}', {known(links, link)}")
+    return link
 
 
-def _coordinate(xml: XmlFile, joint: etree._Element, joints: Container[str]) -> tuple[str, float]:
+def _coordinate(
+    xml: XmlFile, joint: etree._Element, joints: Container[str], before: Container[str]
+) -> tuple[str, float]:
     name = joint.get("name", "").strip()
     if name not in joints:
         what = f"home names the joint '{name}', which is unknown or does not move, correct it"
         error: DescriptionError = xml.fail(joint, what)
         raise error
-    return name, xml.number(joint, "value", f"home of '{name}'")
+    value = xml.number(joint, "value", f"home of '{name}'")
+    if name in before:
+        raise xml.fail(joint, f"home of '{name}' is there twice, keep one")
+    return name, value

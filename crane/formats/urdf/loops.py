@@ -56,8 +56,7 @@ def _loop(
             flag(xml.fail(element, f'{what} has no {end}, add <{end} link="..."/>'))
             continue
         if link not in links:
-            with recoverable():
-                raise unknown_link(xml, tag, f"{what} has the unknown {end}", link, links)
+            flag(unknown_link(xml, tag, f"{what} has the unknown {end}", link, links))
         if f"{name}_{end}" in links:
             named = links[f"{name}_{end}"]
             problem = f"link '{name}_{end}' has the name of a frame of {what}, rename one"

@@ -139,27 +139,14 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
     for name, link in links.items():
         with recoverable():
             parts.append(read_link(xml, name, link, name in moved))
-    friction = {}
+    friction: dict[str, Friction | None] = {}
     for name, joint in joints.items():
         if joint.get("type") in SEVERAL:
-            with recoverable():
-                for part in read_several(xml, name, joint, ends[name]):
-                    kind, taken = ("link", links) if isinstance(part, Link) else ("joint", joints)
-                    if part.name in taken:
-                        problem = f"its {kind} '{part.name}' is there already, rename one"
-                        flag(xml.fail(joint, problem))
-                    else:
-                        parts.append(part)
+            parts += _series(xml, name, ends[name], links, joints)
             continue
-        with recoverable():
-            read = dataclasses.replace(read_joint(xml, name, joint, ends[name]), cut=name in cut)
-            parts.append(read)
-            if read.moves:
-                limits = read_limits(xml, name, joint)
-                parts[-1] = dataclasses.replace(read, limits=limits)
+        parts += _single(xml, name, joint, ends[name], name in cut)
         with recoverable(harmless=True):
-            if (found := read_friction(xml, name, joint)) is not None:
-                friction[name] = found
+            friction[name] = read_friction(xml, name, joint)
     driven = independent(xml, joints)
     loops, frames = read_loops(xml, _named(xml, "loop"), links)
     for frame in frames:
@@ -181,13 +168,48 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         root,
         loops,
         driven,
-        friction,
+        {name: found for name, found in friction.items() if found is not None},
         couplings,
         home,
         home_lines,
         read_tip(xml, links),
         complete=not xml.nameless,
     )
+
+
+def _single(
+    xml: XmlFile, name: str, joint: etree._Element, ends: tuple[str, str], cut: bool
+) -> list[Link | Joint]:
+    """A joint with one freedom, or none; without limits where they are wrong."""
+    found: list[Link | Joint] = []
+    with recoverable():
+        read = dataclasses.replace(read_joint(xml, name, joint, ends), cut=cut)
+        found = [read]
+        if read.moves:
+            found = [dataclasses.replace(read, limits=read_limits(xml, name, joint))]
+    return found
+
+
+def _series(
+    xml: XmlFile,
+    name: str,
+    ends: tuple[str, str],
+    links: Mapping[str, etree._Element],
+    joints: Mapping[str, etree._Element],
+) -> list[Link | Joint]:
+    """What a joint with several freedoms becomes, without parts whose names are taken."""
+    made: list[Link | Joint] = []
+    with recoverable():
+        made = read_several(xml, name, joints[name], ends)
+    found = []
+    for part in made:
+        kind, taken = ("link", links) if isinstance(part, Link) else ("joint", joints)
+        if part.name in taken:
+            problem = f"its {kind} '{part.name}' is there already, rename one"
+            flag(xml.fail(joints[name], problem))
+        else:
+            found.append(part)
+    return found
 
 
 def _mimics(

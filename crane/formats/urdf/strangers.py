@@ -51,16 +51,19 @@ def warn_of_strangers(
     """
     found: dict[tuple[str, str], list[etree._Element]] = {}
     elsewhere = set().union(*children.values())  # what has a place is an error in another
-    for parent in children:
-        for element in [xml.root] if parent == xml.root.tag else xml.root.iter(parent):
-            if not _is_read(element, children):
-                continue
-            for child in element:
-                tag = child.tag
-                if not isinstance(tag, str) or tag in elsewhere or tag in _FOREIGN.get(parent, ()):
-                    continue
-                if not tag.startswith("{"):
-                    found.setdefault((parent, tag), []).append(child)
+    inside = [
+        (parent, child)
+        for parent in children
+        for element in ([xml.root] if parent == xml.root.tag else xml.root.iter(parent))
+        if _is_read(element, children)
+        for child in element
+    ]
+    for parent, child in inside:
+        tag = child.tag
+        if not isinstance(tag, str) or tag in elsewhere or tag in _FOREIGN.get(parent, ()):
+            continue
+        if not tag.startswith("{"):
+            found.setdefault((parent, tag), []).append(child)
     told = [
         (elements, f"unknown <{tag}> in <{parent}>", _meant(tag, children[parent], attributes))
         for (parent, tag), elements in found.items()

@@ -5,9 +5,10 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -51,14 +52,11 @@ def mesh_file(name: str, folder: Path) -> Path | None:
     if separated and scheme == "package":
         parts = [part for part in path.parts if part != "/"]
         ends = [Path(*parts[1:]), Path(*parts)] if len(parts) > 1 else [Path(*parts)]
-    for end in ends:
-        for above in (folder, *folder.absolute().parents):
-            try:
-                if (above / end).is_file():
-                    return above / end
-            except OSError:  # a name that cannot be a file's
-                return None
-    return None
+    places = [above / end for end in ends for above in (folder, *folder.absolute().parents)]
+    try:
+        return next((place for place in places if place.is_file()), None)
+    except OSError:  # a name that cannot be a file's
+        return None
 
 
 def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[Part, ...] | str]:
@@ -112,15 +110,24 @@ def _parsed(said: bytes) -> list[tuple[Part, ...] | str]:
         if "wrong" in head:
             told.append(head["wrong"])
             continue
-        parts = []
-        for part in head["parts"]:
-            v, f = 3 * part["vertices"], 3 * part["faces"]
-            if at + 8 * (v + f) > len(said):
-                return told
-            vertices = np.frombuffer(said, np.float64, v, at).reshape(-1, 3)
-            faces = np.frombuffer(said, np.int64, f, at + 8 * v).reshape(-1, 3)
-            at += 8 * (v + f)
-            colour = part["colour"] and tuple(part["colour"])
-            parts.append(Part(vertices, faces, colour))
-        told.append(tuple(parts))
+        size = sum(_bytes(part) for part in head["parts"])
+        if at + size > len(said):
+            break
+        told.append(tuple(_parts(head["parts"], said, at)))
+        at += size
     return told
+
+
+def _bytes(part: dict[str, Any]) -> int:
+    """How many bytes the triangles of a part take."""
+    return 8 * 3 * int(part["vertices"] + part["faces"])
+
+
+def _parts(heads: list[dict[str, Any]], said: bytes, at: int) -> Iterator[Part]:
+    """The parts that stand one after the other in an answer from a byte on."""
+    for part in heads:
+        v, f = 3 * part["vertices"], 3 * part["faces"]
+        vertices = np.frombuffer(said, np.float64, v, at).reshape(-1, 3)
+        faces = np.frombuffer(said, np.int64, f, at + 8 * v).reshape(-1, 3)
+        yield Part(vertices, faces, part["colour"] and tuple(part["colour"]))
+        at += _bytes(part)

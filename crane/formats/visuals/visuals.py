@@ -176,17 +176,15 @@ class _Reader:
     def read(self, tag: str) -> list[_Drawn]:
         """Shapes of elements with a tag."""
         found: list[_Drawn] = []
-        for link in self.xml.root.iterfind("link"):
-            name = link.get("name", "").strip()
-            for element in link.iterfind(tag):
-                what = f"a {tag} of link '{name}'"
-                with aside():
-                    try:
-                        found += self._drawn(element, name, what)
-                    except DescriptionError as error:
-                        self.problems.append(f"{error}; it is not drawn")
+        for element in self.xml.root.iterfind(f"link/{tag}"):
+            link = element.getparent().get("name", "").strip()
+            try:
+                found += self._drawn(element, link, f"a {tag} of link '{link}'")
+            except DescriptionError as error:
+                self.problems.append(f"{error}; it is not drawn")
         return found
 
+    @aside()
     def _drawn(self, element: etree._Element, link: str, what: str) -> list[_Drawn]:
         xyz, rpy = self.xml.placement(element, what)
         self._check_near(element, what, xyz)

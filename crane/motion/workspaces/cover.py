@@ -4,7 +4,7 @@ import numpy as np
 
 from crane.common.samples import Array
 from crane.motion.workspaces.curves import MOST, Edge, edges_around
-from crane.motion.workspaces.patch import Patch, last_closed
+from crane.motion.workspaces.patch import Node, Patch, last_closed
 from crane.motion.workspaces.probe import Probe
 
 _LONGEST = 4.0  # side of a cell that is fine, in shares of the extent per step of the grid
@@ -82,6 +82,19 @@ def _divided(probe: Probe, ring: list[Corner], longest: float, halvings: int) ->
     return out
 
 
+def _closed_part(patch: Patch, corners: Array, ends: dict[Edge, Array], cell: Node) -> list[Array]:
+    """Places (2,) around the closed part of a cell: closed corners, and ends of the branch."""
+    i, j = cell
+    ring = []
+    nodes = ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1))
+    for node, edge in zip(nodes, edges_around(i, j), strict=True):
+        if patch.closed[node]:
+            ring.append(corners[node])
+        if edge in ends:
+            ring.append(ends[edge])
+    return ring
+
+
 def _cut_cells(patch: Patch, corners: Array, ends: dict[Edge, Array], longest: float) -> Array:
     """Fans of triangles (N, 3, 2) over the closed parts of cells with open corners."""
     out = []
@@ -94,13 +107,7 @@ def _cut_cells(patch: Patch, corners: Array, ends: dict[Edge, Array], longest: f
     for i, j in sorted(cells):
         if not (0 <= i < a - 1 and 0 <= j < b - 1):
             continue
-        ring: list[Array] = []
-        nodes = ((i, j), (i + 1, j), (i + 1, j + 1), (i, j + 1))
-        for node, edge in zip(nodes, edges_around(i, j), strict=True):
-            if patch.closed[node]:
-                ring.append(corners[node])
-            if edge in ends:
-                ring.append(ends[edge])
+        ring = _closed_part(patch, corners, ends, (i, j))
         if not _long(ring, 2 * longest):
             out += [[ring[0], ring[k], ring[k + 1]] for k in range(1, len(ring) - 1)]
     return np.array(out).reshape(-1, 3, 2)

@@ -1,5 +1,6 @@
 """Singular curves of a workspace."""
 
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -93,11 +94,10 @@ def _crossings(patch: Patch, crossing: Callable[[Node, Node], Array | None]) -> 
     """What crosses the edges of the grid."""
     a, b = patch.closed.shape
     found: dict[Edge, Array] = {}
-    for i in range(a):
-        for j in range(b):
-            for side, near in enumerate(((i + 1, j), (i, j + 1))):
-                if near[0] < a and near[1] < b and (q := crossing((i, j), near)) is not None:
-                    found[i, j, side] = q
+    for i, j, side in itertools.product(range(a), range(b), (0, 1)):
+        near = (i + 1, j) if side == 0 else (i, j + 1)
+        if near[0] < a and near[1] < b and (q := crossing((i, j), near)) is not None:
+            found[i, j, side] = q
     return found
 
 
@@ -110,12 +110,11 @@ def polylines(patch: Patch, points: dict[Edge, Array]) -> list[Array]:
     """Points (nq,) on edges joined within cells, then end to end, to lines (k, nq)."""
     a, b = patch.closed.shape
     links: dict[Edge, list[Edge]] = {key: [] for key in points}
-    for i in range(a - 1):
-        for j in range(b - 1):
-            there = [key for key in edges_around(i, j) if key in points]
-            for one, two in zip(there[::2], there[1::2], strict=False):
-                links[one].append(two)
-                links[two].append(one)
+    for i, j in itertools.product(range(a - 1), range(b - 1)):
+        there = [key for key in edges_around(i, j) if key in points]
+        for one, two in zip(there[::2], there[1::2], strict=False):
+            links[one].append(two)
+            links[two].append(one)
     lines, left = [], dict.fromkeys(points)
     while left:
         ends = [key for key in left if len([k for k in links[key] if k in left]) < 2]

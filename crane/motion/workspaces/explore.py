@@ -1,6 +1,8 @@
 """Exploring a workspace: patches over the strokes, and what is measured on them."""
 
 import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +27,22 @@ _MAP = 81  # values of each stroke of the map
 _SLICES = 9  # values of the third of three strokes
 _DRAWN = 16  # values of both strokes of a patch that is drawn
 _INNER = 0.5  # share of patches of many joints that do not lie on limits
+
+
+class _Planned(NamedTuple):
+    """A patch to be filled; see `Patch`.
+
+    Attributes:
+        pair: Indices of both strokes.
+        base: (n,) where the others are held.
+        size: Values of each stroke.
+        counts: Whether it counts for the share of the box that closes.
+    """
+
+    pair: tuple[int, int]
+    base: Array
+    size: int
+    counts: bool
 
 
 def workspace(
@@ -154,55 +172,61 @@ def _patches(
 ) -> tuple[list[Patch], list[int]]:
     """Patches over the strokes, and which of them count for the share of the box that closes."""
     home = machine.home[machine.closure.active]
-
-    def values(joint: int, count: int) -> Array:
-        return np.linspace(low[joint], high[joint], count)
-
-    planned: list[tuple[tuple[int, int], Array, int]] = []
-    counted: list[int] = []
     if len(strokes) == 1:
-        patch = fill(
-            machine, home.copy(), (strokes[0], strokes[0]),
-            (values(strokes[0], min(samples, 2001)), home[strokes]),
-        )  # fmt: skip
+        axis = np.linspace(low[strokes[0]], high[strokes[0]], min(samples, 2001))
+        patch = fill(machine, home.copy(), (strokes[0], strokes[0]), (axis, home[strokes]))
         assert patch is not None, "home itself closes"
         return [patch], [0]
     if len(strokes) == 2:
-        planned, counted = [((strokes[0], strokes[1]), home.copy(), int(samples**0.5))], [0]
+        planned = [_Planned((strokes[0], strokes[1]), home.copy(), int(samples**0.5), True)]
     elif len(strokes) == _FULL:
-        count = max(5, round((samples / _SLICES) ** 0.5))
-        for pair in itertools.combinations(strokes, 2):
-            (other,) = set(strokes) - set(pair)
-            for value in values(other, _SLICES):
-                base = home.copy()
-                base[other] = value
-                if pair == (strokes[0], strokes[1]):
-                    counted.append(len(planned))
-                planned.append((pair, base, count))
+        planned = list(_sliced(home, strokes, low, high, samples))
     else:
-        pairs = list(itertools.combinations(strokes, 2))
-        planned = [(pair, home.copy(), _DRAWN) for pair in pairs]
-        for k in range(max(len(pairs), 4 * samples // _DRAWN**2)):
-            base, drawn = home.copy(), random.uniform(low, high)
-            if random.random() < _INNER:
-                counted.append(len(planned))
-            else:
-                drawn = np.where(random.random(len(low)) < 0.5, low, high)
-            base[strokes] = drawn[strokes]
-            planned.append((pairs[k % len(pairs)], base, _DRAWN))
+        planned = list(_drawn(home, strokes, low, high, samples, random))
     patches: list[Patch] = []
-    kept: list[int] = []
-    for k, (pair, base, count) in enumerate(planned):
-        axes = (values(pair[0], count), values(pair[1], count))
-        patch = fill(machine, base, pair, axes)
+    for pair, base, size, _ in planned:
+        first, second = (np.linspace(low[joint], high[joint], size) for joint in pair)
+        patch = fill(machine, base, pair, (first, second))
         if patch is None:
-            nothing: NDArray[np.bool_] = np.zeros((count, count), dtype=bool)
-            q = np.full((count, count, machine.model.nq), np.nan)
-            patch = Patch(pair, base, axes, nothing, q)
-        if k in counted:
-            kept.append(len(patches))
+            nothing: NDArray[np.bool_] = np.zeros((size, size), dtype=bool)
+            q = np.full((size, size, machine.model.nq), np.nan)
+            patch = Patch(pair, base, (first, second), nothing, q)
         patches.append(patch)
-    return patches, kept
+    return patches, [k for k, plan in enumerate(planned) if plan.counts]
+
+
+def _sliced(
+    home: Array, strokes: list[int], low: Array, high: Array, samples: int
+) -> Iterator[_Planned]:
+    """Every pair of three strokes, at values of the third all over its range."""
+    count = max(5, round((samples / _SLICES) ** 0.5))
+    for pair in itertools.combinations(strokes, 2):
+        (other,) = set(strokes) - set(pair)
+        for value in np.linspace(low[other], high[other], _SLICES):
+            base = home.copy()
+            base[other] = value
+            yield _Planned(pair, base, count, pair == (strokes[0], strokes[1]))
+
+
+def _drawn(
+    home: Array,
+    strokes: list[int],
+    low: Array,
+    high: Array,
+    samples: int,
+    random: np.random.Generator,
+) -> Iterator[_Planned]:
+    """Pairs of many strokes through home, then with the others drawn: inside, or at limits."""
+    pairs = list(itertools.combinations(strokes, 2))
+    for pair in pairs:
+        yield _Planned(pair, home.copy(), _DRAWN, False)
+    for k in range(max(len(pairs), 4 * samples // _DRAWN**2)):
+        base, drawn = home.copy(), random.uniform(low, high)
+        inside = random.random() < _INNER
+        if not inside:
+            drawn = np.where(random.random(len(low)) < 0.5, low, high)
+        base[strokes] = drawn[strokes]
+        yield _Planned(pairs[k % len(pairs)], base, _DRAWN, inside)
 
 
 def _share(patches: list[Patch], in_order: bool) -> float:
@@ -210,15 +234,18 @@ def _share(patches: list[Patch], in_order: bool) -> float:
     closed = whole = 0.0
     for k, patch in enumerate(patches):
         ends = in_order and k in (0, len(patches) - 1)
-        weights = np.ones(patch.closed.shape)
-        for axis, values in enumerate(patch.axes):
-            if len(values) > 1:
-                edge = np.ones(len(values))
-                edge[[0, -1]] = 0.5
-                weights *= edge[:, None] if axis == 0 else edge
-        weights *= 0.5 if ends else 1.0
+        along, across = (_weights(len(values)) for values in patch.axes)
+        weights = np.outer(along, across) * (0.5 if ends else 1.0)
         closed, whole = closed + float(weights[patch.closed].sum()), whole + float(weights.sum())
     return closed / whole if whole else 0.0
+
+
+def _weights(count: int) -> Array:
+    """Shares (count,) of the nodes along an axis: half at both ends, one if there is one node."""
+    weights = np.ones(count)
+    if count > 1:
+        weights[[0, -1]] = 0.5
+    return weights
 
 
 def _split(patches: list[Patch], rows: Array) -> list[Array]:

@@ -1,5 +1,6 @@
 """How far a workspace reaches."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -36,23 +37,23 @@ def extremes(
     """
     active = probe.machine.closure.active
     found = []
-    for axis, name in enumerate(probe.section.names):
-        for sign, word in ((1.0, "least"), (-1.0, "largest")):
+    names, words = enumerate(probe.section.names), ((1.0, "least"), (-1.0, "largest"))
+    for (axis, name), (sign, word) in itertools.product(names, words):
 
-            def goal(posture: Array, axis: int = axis, sign: float = sign) -> tuple[float, Array]:
-                tips = probe.tips(posture[None])
-                tree = probe.kinematics.tree_jacobian(posture)[None]
-                slopes = probe.section.slopes(tips, tree)[0, axis]
-                return -sign * float(probe.section.coordinates(tips)[0, axis]), -sign * slopes
+        def goal(posture: Array, axis: int = axis, sign: float = sign) -> tuple[float, Array]:
+            tips = probe.tips(posture[None])
+            tree = probe.kinematics.tree_jacobian(posture)[None]
+            slopes = probe.section.slopes(tips, tree)[0, axis]
+            return -sign * float(probe.section.coordinates(tips)[0, axis]), -sign * slopes
 
-            best = int((sign * places[:, axis]).argmin())
-            value, posture = farthest(probe.machine, q[best], probe.strokes, ends, goal)
-            value, q_a = -sign * value, posture[active]
-            for curve in curves:
-                k = int((sign * curve.places[:, axis]).argmin())
-                if sign * curve.places[k, axis] < sign * value:
-                    value, q_a = float(curve.places[k, axis]), curve.q_a[k]
-            found.append(Extreme(f"{word} {name}", value, q_a))
+        best = int((sign * places[:, axis]).argmin())
+        value, posture = farthest(probe.machine, q[best], probe.strokes, ends, goal)
+        value, q_a = -sign * value, posture[active]
+        for curve in curves:
+            k = int((sign * curve.places[:, axis]).argmin())
+            if sign * curve.places[k, axis] < sign * value:
+                value, q_a = float(curve.places[k, axis]), curve.q_a[k]
+        found.append(Extreme(f"{word} {name}", value, q_a))
     return tuple(found)
 
 

@@ -10,6 +10,7 @@ from crane.common.samples import Array, Brief
 from crane.machine import Machine
 
 Node = tuple[int, int]
+_SIDES: tuple[Node, ...] = ((1, 0), (-1, 0), (0, 1), (0, -1))
 
 _STEPS = 16  # from one posture of the grid to the next, where one step fails
 _EDGE = 2.0**-30  # share of a way to which its last closed posture is found
@@ -69,14 +70,20 @@ def last_closed(machine: Machine, q: Array, target: Array) -> tuple[Array, bool]
         if cursor is not None:
             able = closure.fast.follow(cursor, way, out) == 1
         else:
-            try:
-                out[0], able = closure.solve(way[0], guess=last), True
-            except ClosureError:
-                able = False
+            able = _solved(machine, way, last, out)
         if able:
             done, last = goal, out[0].copy()
         step = step * 2 if able else step / 2
     return last, done == 1.0
+
+
+def _solved(machine: Machine, targets: Array, guess: Array, out: Array) -> bool:
+    """Close the loops at targets (1, n) into out (1, nq); whether that worked."""
+    try:
+        out[0] = machine.closure.solve(targets[0], guess=guess)
+    except ClosureError:
+        return False
+    return True
 
 
 def fill(
@@ -98,56 +105,71 @@ def fill(
         return None
     start = (first[0], first[1])
     patch.closed[start], patch.q[start] = True, q
-    if closure.compiled:
-        _flood(machine, patch, start)
-        return patch
     waiting = [start]
     while waiting:
         at = waiting.pop()
-        for near in _beside(at, shape):
-            if not patch.closed[near]:
-                q, able = last_closed(machine, patch.q[at], patch.target(near))
-                if able:
-                    patch.closed[near], patch.q[near] = True, q
-                    waiting.append(near)
+        if closure.compiled:
+            waiting += _close_rows(machine, patch, at)
+        else:
+            waiting += _close_beside(machine, patch, at)
     return patch
 
 
-def _flood(machine: Machine, patch: Patch, start: tuple[int, int]) -> None:
-    """Close all nodes connected with one that is closed: rows of nodes at once."""
-    fast, (a, b) = machine.closure.fast, patch.closed.shape
-    waiting = [start]
-    tried = np.zeros((a, b, 4), dtype=bool)
-    while waiting:
-        at = waiting.pop()
-        for side, (di, dj) in enumerate(((1, 0), (-1, 0), (0, 1), (0, -1))):
-            row, i, j = [], at[0] + di, at[1] + dj
-            while 0 <= i < a and 0 <= j < b and not patch.closed[i, j]:
-                row.append((i, j))
-                i, j = i + di, j + dj
-            if not row or tried[(*at, side)]:
-                continue
-            tried[(*at, side)] = True
-            cursor = fast.cursor()
-            if not fast.start_near(cursor, patch.q[at]):
-                continue
-            targets = np.array([patch.target(node) for node in row])
-            out = np.empty((len(row), patch.q.shape[2]))
-            count = fast.follow(cursor, targets, out)
-            for node, q in zip(row[:count], out[:count], strict=True):
-                patch.closed[node], patch.q[node] = True, q
-                waiting.append(node)
-            if count < len(row):  # perhaps in smaller steps
-                before = patch.q[row[count - 1]] if count else patch.q[at]
-                from_a = before[machine.closure.active]
-                way = from_a + np.linspace(0, 1, _STEPS + 1)[1:, None] * (targets[count] - from_a)
-                steps = np.empty((_STEPS, patch.q.shape[2]))
-                if fast.start_near(cursor, before) and fast.follow(cursor, way, steps) == _STEPS:
-                    patch.closed[row[count]], patch.q[row[count]] = True, steps[-1]
-                    waiting.append(row[count])
+def _close_beside(machine: Machine, patch: Patch, at: Node) -> list[Node]:
+    """Close the neighbours of a closed node; those that now are."""
+    found = []
+    for near in _beside(at, patch.closed.shape):
+        if patch.closed[near]:
+            continue
+        q, able = last_closed(machine, patch.q[at], patch.target(near))
+        if able:
+            patch.closed[near], patch.q[near] = True, q
+            found.append(near)
+    return found
 
 
-def _beside(at: tuple[int, int], shape: tuple[int, int]) -> list[tuple[int, int]]:
-    i, j = at
-    near = ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1))
+def _close_rows(machine: Machine, patch: Patch, at: Node) -> list[Node]:
+    """Close rows of nodes at once, on all sides of a closed node; those that now are closed."""
+    fast, cursor = machine.closure.fast, machine.closure.fast.cursor()
+    found = []
+    for way in _SIDES:
+        row = _open_row(patch, at, way)
+        if not row or not fast.start_near(cursor, patch.q[at]):
+            continue
+        targets = np.array([patch.target(node) for node in row])
+        out = np.empty((len(row), patch.q.shape[2]))
+        count = fast.follow(cursor, targets, out)
+        for node, q in zip(row[:count], out[:count], strict=True):
+            patch.closed[node], patch.q[node] = True, q
+        found += row[:count]
+        before = row[count - 1] if count else at
+        if count < len(row) and _close_in_steps(machine, patch, before, row[count]):
+            found.append(row[count])
+    return found
+
+
+def _open_row(patch: Patch, at: Node, way: Node) -> list[Node]:
+    """The open nodes from a node on along one way, up to a closed one."""
+    (a, b), row = patch.closed.shape, []
+    i, j = at[0] + way[0], at[1] + way[1]
+    while 0 <= i < a and 0 <= j < b and not patch.closed[i, j]:
+        row.append((i, j))
+        i, j = i + way[0], j + way[1]
+    return row
+
+
+def _close_in_steps(machine: Machine, patch: Patch, at: Node, near: Node) -> bool:
+    """Close a node from a closed one beside it in small steps; whether that worked."""
+    fast, q = machine.closure.fast, patch.q[at]
+    from_a = q[machine.closure.active]
+    way = from_a + np.linspace(0, 1, _STEPS + 1)[1:, None] * (patch.target(near) - from_a)
+    steps, cursor = np.empty((_STEPS, len(q))), fast.cursor()
+    able = fast.start_near(cursor, q) and fast.follow(cursor, way, steps) == _STEPS
+    if able:
+        patch.closed[near], patch.q[near] = True, steps[-1]
+    return bool(able)
+
+
+def _beside(at: Node, shape: Node) -> list[Node]:
+    near = [(at[0] + i, at[1] + j) for i, j in _SIDES]
     return [(k, m) for k, m in near if 0 <= k < shape[0] and 0 <= m < shape[1]]

@@ -220,15 +220,10 @@ class Workspace:
         lines += ["", "| stroke | reaches | of its limits |", "| --- | --- | --- |"]
         for joint in self.strokes:
             i = machine.active.index(joint)
-            reached = [self.q_a[:, i].min(), self.q_a[:, i].max()]
-            for curve in self.curves:
-                if curve.kind == "branch":
-                    reached = [
-                        min(reached[0], curve.q_a[:, i].min()),
-                        max(reached[1], curve.q_a[:, i].max()),
-                    ]
+            edges = [curve.q_a[:, i] for curve in self.curves if curve.kind == "branch"]
+            reached = np.concatenate([self.q_a[:, i], *edges])
             limits = f"{self.low[i]:.5g} to {self.high[i]:.5g} {machine.unit(joint)}"
-            lines.append(f"| {joint} | {reached[0]:.5g} to {reached[1]:.5g} | {limits} |")
+            lines.append(f"| {joint} | {reached.min():.5g} to {reached.max():.5g} | {limits} |")
         lines.append("")
         for kind, words in KINDS.items():
             count = sum(curve.kind == kind for curve in self.curves)

@@ -144,12 +144,8 @@ class Page:
         with self._server.atomic():
             self._stage.show()
             for joint, value in zip(machine.active, posture.q_a, strict=True):
-                slider = self._sliders[f"joint {joint}"]
-                shown = float(
-                    np.clip(READING_UNITS[machine.unit(joint)][1] * value, slider.min, slider.max)
-                )
-                if abs(slider.value - shown) > 1e-6 * (slider.max - slider.min):
-                    slider.value = shown
+                _, scale = READING_UNITS[machine.unit(joint)]
+                _set(self._sliders[f"joint {joint}"], scale * value)
             if self._playback is not None:
                 self._play.label = "Pause" if self._playing else "Play"
             self._warning.content = warning(posture.refused)
@@ -188,3 +184,10 @@ class Page:
     def _path(self, playback: Playback) -> Array:
         """(k, 3) where the tip goes [m], every so many samples."""
         return self._session.tips(playback.q[:: max(len(playback.q) // 2000, 1)])
+
+
+def _set(slider: Any, value: float) -> None:
+    """Put a slider at the value in its range that is nearest, if it is not there."""
+    shown = float(np.clip(value, slider.min, slider.max))
+    if abs(slider.value - shown) > 1e-6 * (slider.max - slider.min):
+        slider.value = shown

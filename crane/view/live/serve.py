@@ -44,12 +44,17 @@ def serve(
             page = Page(server, session, playback, requests)
             shown = f"[{host}]" if ":" in host else host
             print(f"live view at http://{shown}:{server.get_port()} (Ctrl+C ends it)", flush=True)
-            while (notes := _take(requests, page.playing)) is not None:
-                page.work(notes)
-                if page.playing:
-                    page.advance()
+            _work(page, requests)
         finally:
             stop(server)
+
+
+def _work(page: Page, requests: Requests) -> None:
+    """Do what is asked for, and play, until the end."""
+    while (notes := _take(requests, page.playing)) is not None:
+        page.work(notes)
+        if page.playing:
+            page.advance()
 
 
 def start(host: str, port: int | None) -> Any:

@@ -5,6 +5,7 @@ each of many spans of time, so that no peak is lost, and the samples at the fram
 values at the cursor.
 """
 
+import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -106,6 +107,16 @@ class Grid:
         }
 
 
+def _series(column: Column, grid: Grid, scale: float) -> dict[str, Any]:
+    """The values of a column, of its reference and its limits."""
+    found: dict[str, Any] = {"series": grid.series(scale * column.values)}
+    if column.reference is not None:
+        found["reference"] = grid.series(scale * column.reference)
+    if column.limits is not None:
+        found["limits"] = [scale * x if np.isfinite(x) else None for x in column.limits]
+    return found
+
+
 def groups(
     machine: Machine,
     recording: "Recording",
@@ -138,12 +149,8 @@ def groups(
                 "hue": hue,
                 "shade": shade,
                 "shown": index < SHOWN,
-                "series": grid.series(scale * column.values),
+                **_series(column, grid, scale),
             }
-            if column.reference is not None:
-                line["reference"] = grid.series(scale * column.reference)
-            if column.limits is not None:
-                line["limits"] = [scale * x if np.isfinite(x) else None for x in column.limits]
             there = second.get(column.name)
             if other is not None and there is not None and there.unit == unit:
                 line["other"] = other[1].series(scale * there.values)
@@ -235,16 +242,13 @@ def _coloured(machine: Machine, members: list[Column]) -> Iterator[tuple[Column,
     """Each column with a hue, the same for one joint everywhere, and a shade of it."""
     hues: Mapping[str, int] = {joint: i for i, joint in enumerate(machine.active)}
     taken: dict[int, int] = {}
-    free = 0
     for column in members:
         # the longest name is meant: X_ext is no part of X_extra
         joints = [x for x in hues if f"_{x}_" in f"_{column.name}_"]
         if joints:
             hue = hues[max(joints, key=len)]
         else:
-            while free in taken:
-                free += 1
-            hue = free
+            hue = next(free for free in itertools.count() if free not in taken)
         shade = taken.get(hue, 0)
         taken[hue] = shade + 1
         yield column, hue, shade

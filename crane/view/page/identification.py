@@ -156,16 +156,16 @@ def _unit(result: Identification, joint: str) -> str:
 
 
 def _fit(result: Identification) -> str:
+    fits = [fit for fit in (result.training, result.validation) if fit is not None]
     rows = []
     for i, joint in enumerate(result.training.joints):
         row = [escape(joint)]
-        for fit in (result.training, result.validation):
-            if fit is not None:
-                row += [
-                    f"{fit.rmse[i]:.4g} {_unit(result, joint)}",
-                    f"{100 * fit.relative[i]:.3g} %",
-                    f"{fit.percentage_error[i]:.3g} %",
-                ]
+        for fit in fits:
+            row += [
+                f"{fit.rmse[i]:.4g} {_unit(result, joint)}",
+                f"{100 * fit.relative[i]:.3g} %",
+                f"{fit.percentage_error[i]:.3g} %",
+            ]
         rows.append(row)
     head = ["drive*", "RMS error", "relative", "squared"]
     words = "Of rows away from standstill: root mean square of measured less modelled force, its "

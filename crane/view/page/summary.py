@@ -50,10 +50,11 @@ def run_summary(machine: Machine, recording: "Recording | None") -> dict[str, An
         facts.append(("actuators' work", text))
     channels = recording.channels
     for name, words in (("dissipated", "lost to friction"), ("pump_work", "pump's work")):
-        if count > 1 and recording.channel_units.get(name) == "J":
-            change = float(channels[name][-1] - channels[name][0])
-            if _number(change) != "0":
-                facts.append((words, _quantity(change, "J")))
+        if count < 2 or recording.channel_units.get(name) != "J":
+            continue
+        change = float(channels[name][-1] - channels[name][0])
+        if _number(change) != "0":
+            facts.append((words, _quantity(change, "J")))
     if summary.tip_rms_error is not None and summary.tip_peak_error is not None:
         peak, rms = 1e3 * summary.tip_peak_error, 1e3 * summary.tip_rms_error
         facts.append(("tip to reference", f"{rms:.3g} mm RMS, {peak:.3g} mm peak"))
@@ -90,16 +91,13 @@ def limits_hit(machine: Machine, recording: "Recording") -> list[str]:
         low, high = machine.lower[i], machine.upper[i]
         slack = _REACHED * (high - low) if np.isfinite(high - low) else 0.0
         unit, scale = READING_UNITS[machine.unit(joint)]
-        for there, end, limit in (
-            (q <= low + slack, "lower", low),
-            (q >= high - slack, "upper", high),
-        ):
-            if there.any():
-                first = recording.time[int(np.argmax(there))]
-                found.append(
-                    f"{joint} reaches its {end} limit of {_number(scale * limit)} {unit} "
-                    f"at {first:.4g} s ({_percent(there.mean())} of the samples)"
-                )
+        ends = ((q <= low + slack, "lower", low), (q >= high - slack, "upper", high))
+        for there, end, limit in [x for x in ends if x[0].any()]:
+            first = recording.time[int(np.argmax(there))]
+            found.append(
+                f"{joint} reaches its {end} limit of {_number(scale * limit)} {unit} "
+                f"at {first:.4g} s ({_percent(there.mean())} of the samples)"
+            )
     if len(found) > _SENTENCES:
         found[_SENTENCES:] = [f"and {len(found) - _SENTENCES} more limits are reached"]
     return found

@@ -1,12 +1,15 @@
 """A reference for identification as one figure: strokes, velocities, forces, and their limits."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from crane.common.output import replacing
+from crane.common.samples import Array
 from crane.identification.excitation.excite import Excitation
 from crane.recordings.recording import FORCE_UNITS
 from crane.recordings.summary import READING_UNITS
@@ -22,33 +25,41 @@ def plot_excitation(excitation: Excitation, path: str | Path) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    machine, reference, bounds = excitation.machine, excitation.path, excitation.limits
-    columns = excitation.motion()
-    time, q, v, _, tau = (x[:: -(-len(x) // _MOST)] for x in columns)
+    count = len(excitation.machine.active)
+    columns = tuple(x[:: -(-len(x) // _MOST)] for x in excitation.motion())
     with mpl.rc_context(STYLE), replacing(path) as part:
-        count = len(machine.active)
         figure = Figure(figsize=(2.4 * count + 0.6, 6.0), layout="constrained")
         grid = figure.subplots(3, count, sharex=True, squeeze=False)
-        for i, joint in enumerate(machine.active):
-            unit, scale = READING_UNITS[machine.unit(joint)]
-            middle, half = bounds.middle[i], bounds.half[i]
-            force = FORCE_UNITS[machine.unit(joint)]
-            rows = (
-                ("stroke", unit, scale, q, (middle - half, middle + half)),
-                ("velocity", f"{unit}/s", scale, v, (-bounds.velocity[i], bounds.velocity[i])),
-                ("force", force, 1.0, tau, (-bounds.force[i], bounds.force[i])),
-            )
-            for axes, (what, label, factor, values, ends) in zip(grid[:, i], rows, strict=True):
-                axes.plot(time, factor * values[:, i], color=RECORDED)
-                for end in ends:
-                    if np.isfinite(end):
-                        axes.axhline(factor * end, **DASHED)
-                axes.axvspan(0, reference.lead, color=FAINT, alpha=0.5)
-                axes.axvspan(
-                    reference.duration - reference.lead, reference.duration, color=FAINT, alpha=0.5
-                )
-                axes.set_ylabel(f"{what} [{label}]")
-                axes.margins(x=0.0)
-            grid[0, i].set_title(plain(joint))
-            grid[2, i].set_xlabel("time [s]")
+        for i in range(count):
+            _draw_joint(list(grid[:, i]), excitation, columns, i)
         figure.savefig(part, format="png", dpi=200)
+
+
+def _draw_joint(
+    column: Sequence[Axes], excitation: Excitation, motion: tuple[Array, ...], i: int
+) -> None:
+    """Stroke, velocity and force of an active joint below each other."""
+    machine, reference, bounds = excitation.machine, excitation.path, excitation.limits
+    time, q, v, _, tau = motion
+    joint = machine.active[i]
+    unit, scale = READING_UNITS[machine.unit(joint)]
+    middle, half = bounds.middle[i], bounds.half[i]
+    force = FORCE_UNITS[machine.unit(joint)]
+    rows = (
+        ("stroke", unit, scale, q, (middle - half, middle + half)),
+        ("velocity", f"{unit}/s", scale, v, (-bounds.velocity[i], bounds.velocity[i])),
+        ("force", force, 1.0, tau, (-bounds.force[i], bounds.force[i])),
+    )
+    for axes, (what, label, factor, values, ends) in zip(column, rows, strict=True):
+        axes.plot(time, factor * values[:, i], color=RECORDED)
+        for end in [end for end in ends if np.isfinite(end)]:
+            axes.axhline(factor * end, **DASHED)
+        for way in (
+            (0, reference.lead),
+            (reference.duration - reference.lead, reference.duration),
+        ):
+            axes.axvspan(*way, color=FAINT, alpha=0.5)
+        axes.set_ylabel(f"{what} [{label}]")
+        axes.margins(x=0.0)
+    column[0].set_title(plain(joint))
+    column[-1].set_xlabel("time [s]")

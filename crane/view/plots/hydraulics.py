@@ -3,7 +3,7 @@
 Equations are those of the electro-hydraulic forwarder paper (IROS 2012).
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import matplotlib as mpl
@@ -52,12 +52,17 @@ def sides_figure(runs: Mapping[str, Sides], unit: str = "m") -> Figure:
     return figure
 
 
-def valve_figure(curve: ValveCurve, unit: str = "m") -> Figure:
-    """Steady speeds over the signal, and the curve through them."""
+def _figure(draw: Callable[..., None], *shown: object) -> Figure:
+    """A figure of one drawing alone."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(4.6, 3.4), layout="constrained")
-        draw_valve(figure.subplots(), curve, unit)
+        draw(figure.subplots(), *shown)
     return figure
+
+
+def valve_figure(curve: ValveCurve, unit: str = "m") -> Figure:
+    """Steady speeds over the signal, and the curve through them."""
+    return _figure(draw_valve, curve, unit)
 
 
 def draw_valve(axes: Axes, curve: ValveCurve, unit: str = "m") -> None:
@@ -77,10 +82,7 @@ def draw_valve(axes: Axes, curve: ValveCurve, unit: str = "m") -> None:
 
 def friction_figure(found: CylinderFriction, unit: str = "m") -> Figure:
     """Measured friction over speed, and the law through it."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(4.6, 3.4), layout="constrained")
-        draw_friction(figure.subplots(), found, unit)
-    return figure
+    return _figure(draw_friction, found, unit)
 
 
 def draw_friction(axes: Axes, found: CylinderFriction, unit: str = "m") -> None:

@@ -12,6 +12,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.gridspec import GridSpec, SubplotSpec
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FixedLocator, MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D
@@ -125,8 +126,9 @@ def recording_figure(recording: Recording) -> Figure:
     distance from it.
     """
     tip, joints = points(recording, "tip"), recording.joints
-    panels = [_panels(recording, index) for index in range(len(joints))]
-    kept = [row for row in range(len(panels[0])) if any(column[row].lines for column in panels)]
+    by_joint = [_panels(recording, index) for index in range(len(joints))]
+    kept = [i for i in range(len(by_joint[0])) if any(x[i].lines for x in by_joint)]
+    panels = [[column[row] for column in by_joint] for row in kept]
     rows = len(kept)
     with mpl.rc_context(STYLE):
         bands = -(-len(joints) // MOST_COLUMNS)
@@ -140,31 +142,10 @@ def recording_figure(recording: Recording) -> Figure:
         letters = iter(ascii_lowercase)
         for band, row in itertools.product(range(bands), range(rows)):
             beside = range(band * columns, min((band + 1) * columns, len(joints)))
-            scales = _scales([column[kept[row]] for column in panels])
-            for index in beside:
-                panel = panels[index][kept[row]]
-                if not panel.lines:
-                    continue
-                axes = figure.add_subplot(grid[rows * band + row, index - beside.start])
-                _draw_panel(axes, recording.time, panel, *scales[panel.unit])
-                _letter(axes, letters)
-                if row == 0:
-                    axes.set_title(joint_symbol(joints[index]))
-                if not any(panels[index][below].lines for below in kept[row + 1 :]):
-                    axes.set_xlabel("time [s]")
-                else:
-                    axes.tick_params(labelbottom=False)
+            places = {i: grid[rows * band + row, i - beside.start] for i in beside}
+            _draw_row(figure, places, recording, panels, row, letters)
         if tip is not None:
-            reference = points(recording, "reference_tip")
-            tall = slice(3) if reference is None else slice(2)
-            space = figure.add_subplot(grid[tall, -1], projection="3d")
-            _draw_path(space, tip, reference)
-            _letter(space, letters)
-            if reference is not None:
-                axes = figure.add_subplot(grid[2, -1])
-                _draw_panel(axes, recording.time, _tip_error(tip, reference), "mm", 1e3)
-                _letter(axes, letters)
-                axes.set_xlabel("time [s]")
+            _draw_tip(figure, grid, recording, tip, letters)
         _caption(figure, recording)
     return figure
 
@@ -220,6 +201,48 @@ def _draw_panel(axes: Axes, time: Array, panel: _Panel, unit: str, scale: float)
         axes.set_ylim(low - lacking / 2, high + lacking / 2)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 2.5, 5, 10]))
+
+
+def _draw_row(
+    figure: Figure,
+    places: Mapping[int, SubplotSpec],
+    recording: Recording,
+    panels: Sequence[Sequence[_Panel]],
+    row: int,
+    letters: Iterator[str],
+) -> None:
+    """A row of panels at the places of some joints; `panels` has those of all, row by row."""
+    scales = _scales(panels[row])
+    for index, place in places.items():
+        panel = panels[row][index]
+        if not panel.lines:
+            continue
+        axes = figure.add_subplot(place)
+        _draw_panel(axes, recording.time, panel, *scales[panel.unit])
+        _letter(axes, letters)
+        if row == 0:
+            axes.set_title(joint_symbol(recording.joints[index]))
+        if not any(below[index].lines for below in panels[row + 1 :]):
+            axes.set_xlabel("time [s]")
+        else:
+            axes.tick_params(labelbottom=False)
+
+
+def _draw_tip(
+    figure: Figure, grid: GridSpec, recording: Recording, tip: Array, letters: Iterator[str]
+) -> None:
+    """The path of the tip in the last column, and its distance from a reference below it."""
+    reference = points(recording, "reference_tip")
+    tall = slice(3) if reference is None else slice(2)
+    space = figure.add_subplot(grid[tall, -1], projection="3d")
+    _draw_path(space, tip, reference)
+    _letter(space, letters)
+    if reference is None:
+        return
+    axes = figure.add_subplot(grid[2, -1])
+    _draw_panel(axes, recording.time, _tip_error(tip, reference), "mm", 1e3)
+    _letter(axes, letters)
+    axes.set_xlabel("time [s]")
 
 
 def _draw_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:

@@ -1,5 +1,6 @@
 """A design study as one picture: curves, maps, or scatter plots with rank correlations."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -149,6 +150,18 @@ def _map(figure: Figure, axes: Axes, study: Study, name: str) -> None:
     axes.set_ylabel(_label(study, study.parameters[1]))
 
 
+def _draw_cloud(axes: Axes, x: Array, values: Array, best: Sequence[int]) -> None:
+    """A measure over a parameter, ticks where it is missing, and how well their ranks agree."""
+    able = np.isfinite(values)
+    axes.plot(x[able], values[able], "o", ms=3, color=RECORDED, alpha=0.7)
+    axes.plot(x[best], values[best], "*", ms=11, color=DASHED["color"])
+    for at in x[~able]:
+        axes.axvline(at, ymax=0.04, color="#909090", lw=0.8)
+    if able.sum() > 2:
+        r = np.corrcoef(rankdata(x[able]), rankdata(values[able]))[0, 1]
+        axes.set_title(f"rank correlation {r:+.2f}", fontsize=7.5, loc="right")
+
+
 def _scatter(study: Study, shown: list[str]) -> Figure:
     """Measures over parameters, all other parameters varying too."""
     size = (2.5 * len(study.parameters) + 0.8, 2.0 * len(shown) + 0.6)
@@ -158,17 +171,10 @@ def _scatter(study: Study, shown: list[str]) -> Figure:
     )
     for row, name in zip(panels, shown, strict=True):
         values = study.columns[name]
-        able = np.isfinite(values)
         best = study.order(name)[:1]
         for axes, parameter in zip(row, study.parameters, strict=True):
             x = study.columns[parameter]
-            axes.plot(x[able], values[able], "o", ms=3, color=RECORDED, alpha=0.7)
-            axes.plot(x[best], values[best], "*", ms=11, color=DASHED["color"])
-            for at in x[~able]:
-                axes.axvline(at, ymax=0.04, color="#909090", lw=0.8)
-            if able.sum() > 2:
-                r = np.corrcoef(rankdata(x[able]), rankdata(values[able]))[0, 1]
-                axes.set_title(f"rank correlation {r:+.2f}", fontsize=7.5, loc="right")
+            _draw_cloud(axes, x, values, best)
         row[0].set_ylabel(_label(study, name))
     for axes, parameter in zip(panels[-1], study.parameters, strict=True):
         axes.set_xlabel(_label(study, parameter))

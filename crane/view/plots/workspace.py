@@ -149,12 +149,12 @@ def _skeleton(space: Workspace) -> Array:
     for joint in range(1, model.njoints):
         if model.parents[joint] > 0:
             ends.append((data.oMi[model.parents[joint]].translation, data.oMi[joint].translation))
-    for loop in machine.closure.equations.loops:
-        for name in (loop.predecessor, loop.successor):
-            frame = machine.frame(name)
-            parent = model.frames[frame].parentJoint
-            if parent > 0:
-                ends.append((data.oMi[parent].translation, data.oMf[frame].translation))
+    loops = machine.closure.equations.loops
+    for name in [name for loop in loops for name in (loop.predecessor, loop.successor)]:
+        frame = machine.frame(name)
+        parent = model.frames[frame].parentJoint
+        if parent > 0:
+            ends.append((data.oMi[parent].translation, data.oMf[frame].translation))
     frame = machine.frame(space.frame)
     parent = model.frames[frame].parentJoint
     ends.append((data.oMi[parent].translation, data.oMf[frame].translation))

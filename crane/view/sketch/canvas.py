@@ -11,6 +11,8 @@ from matplotlib.path import Path
 from crane.common.samples import Array
 from crane.view.plots.recording import INK
 
+Corner = tuple[float, ...]
+
 GREY = "#8a8a8a"
 JOINT: Any = {"marker": "o", "markersize": 6.5, "markerfacecolor": "white"}
 RING: Any = {"marker": "o", "markersize": 10.0, "markerfacecolor": "white"}
@@ -163,15 +165,16 @@ def hull(points: Array) -> Array:
     """Corners (k, 2) of the convex hull of points (n, 2), counterclockwise."""
     ordered = sorted(map(tuple, points.tolist()))
 
-    def half(row: Sequence[tuple[float, ...]]) -> list[tuple[float, ...]]:
-        chain: list[tuple[float, ...]] = []
-        for x, y in row:
-            while len(chain) > 1:
-                (a, b), (c, d) = chain[-2:]
-                if (c - a) * (y - b) - (d - b) * (x - a) > 0:
-                    break
+    def turns_left(one: Corner, two: Corner, three: Corner) -> bool:
+        (a, b), (c, d), (x, y) = one, two, three
+        return (c - a) * (y - b) - (d - b) * (x - a) > 0
+
+    def half(row: Sequence[Corner]) -> list[Corner]:
+        chain: list[Corner] = []
+        for corner in row:
+            while len(chain) > 1 and not turns_left(chain[-2], chain[-1], corner):
                 chain.pop()
-            chain.append((x, y))
+            chain.append(corner)
         return chain[:-1]
 
     return np.array(half(ordered) + half(ordered[::-1]) or ordered)

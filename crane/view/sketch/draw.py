@@ -86,16 +86,10 @@ def sketch_figure(
         for item in mechanism.collars:
             canvas.collar(item.name, item.at, item.along)
         if com:
-            for body in mechanism.bodies:
-                if body.chain >= 0:
-                    canvas.centre_of_mass(body.com)
+            _draw_centres(canvas, mechanism)
         if mechanism.tip is not None:
             canvas.tip(mechanism.tip)
-        for shown in mechanism.pins:
-            if shown.loop:
-                canvas.loop(shown.name, shown.at, shown.mate)
-            else:
-                canvas.joint(shown.name, shown.at)
+        _draw_pins(canvas, mechanism)
         _number_regions(canvas, mechanism)
         place_labels(canvas, _labels(mechanism))
     return figure
@@ -142,6 +136,20 @@ def _gap(mechanism: Mechanism, at: Array, down: Array) -> float | None:
         return None
     beside = any(np.abs(item.at - at).max() < 1e-9 for item in mechanism.collars)
     return 7.0 if beside else 0.0
+
+
+def _draw_centres(canvas: Canvas, mechanism: Mechanism) -> None:
+    for body in mechanism.bodies:
+        if body.chain >= 0:
+            canvas.centre_of_mass(body.com)
+
+
+def _draw_pins(canvas: Canvas, mechanism: Mechanism) -> None:
+    for shown in mechanism.pins:
+        if shown.loop:
+            canvas.loop(shown.name, shown.at, shown.mate)
+        else:
+            canvas.joint(shown.name, shown.at)
 
 
 def _draw_body(canvas: Canvas, body: Body) -> None:

@@ -109,6 +109,14 @@ def _cost(canvas: Canvas, label: Label, boxes: Array, gaps: Array) -> Array:
     return cost + np.where(outside, 500.0, 0)
 
 
+def _beside(others: Sequence[Array], boxes: Array, cost: Array, point: float) -> Array:
+    """Costs (k,) of the boxes (k, 2, 2) of a label with other labels in their boxes (2, 2)."""
+    for low, high in others:
+        gap = np.maximum(boxes[:, 0] - high, low - boxes[:, 1]).max(axis=1)
+        cost = cost + np.where(gap < 4 * point, 1000.0, 0)
+    return cost
+
+
 def _choose(boxes: Sequence[Array], costs: Sequence[Array], point: float) -> list[int]:
     """Index of the candidate of each label."""
     order = sorted(range(len(boxes)), key=lambda i: -float(costs[i].min()))
@@ -116,13 +124,8 @@ def _choose(boxes: Sequence[Array], costs: Sequence[Array], point: float) -> lis
     for sweep in range(_SWEEPS):
         before = dict(chosen)
         for i in order:
-            total = costs[i].copy()
-            for j, best in chosen.items():
-                if j != i:
-                    low, high = boxes[j][best]
-                    gap = np.maximum(boxes[i][:, 0] - high, low - boxes[i][:, 1]).max(axis=1)
-                    total += np.where(gap < 4 * point, 1000.0, 0)
-            chosen[i] = int(total.argmin())
+            others = [boxes[j][best] for j, best in chosen.items() if j != i]
+            chosen[i] = int(_beside(others, boxes[i], costs[i], point).argmin())
         if sweep and chosen == before:
             break
     return [chosen[i] for i in range(len(boxes))]
