@@ -32,10 +32,10 @@ def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Arr
     Per body mass, COM (3), inertia about it (xx, xy, xz, yy, yz, zz) in the body's directions of
     the geometry; per joint the 19 numbers of `JointForces.table`; gravity (3).
     """
-    bodies = []
+    bodies, upper = [], np.triu_indices(3)
     for turn, inertia in zip(geometry.turns[1:], list(machine.model.inertias)[1:], strict=True):
         tensor = turn.T @ inertia.inertia @ turn
-        bodies.append([inertia.mass, *(turn.T @ inertia.lever), *tensor[np.triu_indices(3)]])
+        bodies.append([inertia.mass, *(turn.T @ inertia.lever), *tensor[upper]])
     gravity = machine.model.gravity.linear
     return np.concatenate([np.ravel(bodies), np.ravel(forces.table), gravity])
 

@@ -4,6 +4,7 @@ import dataclasses
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 
@@ -157,7 +158,7 @@ class Machine:
         words += [word for x, value in self.locks.items() for word in ("--lock", f"{x}={value!r}")]
         return shlex.join(words) if len(words) > 1 else words[0]
 
-    @property
+    @cached_property
     def joints(self) -> tuple[str, ...]:
         """Names of all joints of the tree, in the order of q."""
         return tuple(self.model.names)[1:]
@@ -170,7 +171,7 @@ class Machine:
         """
         if joint not in self.joints:
             raise InputError(f"joint '{joint}' is unknown, {known(self.joints, joint)}")
-        return int(self.model.joints[self.model.getJointId(joint)].idx_v)
+        return self.joints.index(joint)
 
     def unit(self, joint: str) -> str:
         """Unit of a joint's coordinate, "m" or "rad"."""
@@ -183,8 +184,8 @@ class Machine:
         Raises:
             InputError: There is no such link.
         """
-        links = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
-        if link not in links:
+        if not self.model.existFrame(link, pin.FrameType.BODY):
+            links = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
             raise InputError(f"frame '{link}' is unknown, {known(links, link)}")
         return frame_id(self.model, link)
 

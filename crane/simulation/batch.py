@@ -13,9 +13,14 @@ from crane.common.samples import Array, Brief
 from crane.control import Controller
 from crane.dynamics import Dynamics
 from crane.machine import Machine
-from crane.motion.trajectories import beyond_limits
 from crane.simulation.recorded import imbalance
-from crane.simulation.run import Progress, trajectory
+from crane.simulation.run import (
+    Progress,
+    as_controller,
+    count_steps,
+    reference_beyond,
+    trajectory,
+)
 
 _Result = tuple[Array, Array, Array, Array, Array, str]
 
@@ -92,12 +97,11 @@ def simulate_batch(
 
     def run(i: int) -> _Result:
         machine = machines[i]
-        control = None if controller is None else controller(machine)
-        path = getattr(control, "path", None)
-        if path is not None:
-            text = beyond_limits(machine, path, np.inf if duration is None else duration)
-            beyond.update({i: text} if text else {})
-        time, rows = trajectory(Dynamics(machine), control, starts[i], duration, step)
+        control = as_controller(None if controller is None else controller(machine), machine)
+        steps = count_steps(control, duration, step)
+        if text := reference_beyond(machine, control, steps * step):
+            beyond[i] = text
+        time, rows = trajectory(Dynamics(machine), control, starts[i], steps, step)
         energy = np.hstack([rows.kinetic, rows.potential, rows.work, rows.lost])
         q_a = rows.q[:, machine.closure.active]
         return time, q_a, rows.v_a, rows.tau, energy, imbalance(rows, step)

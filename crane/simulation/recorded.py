@@ -7,7 +7,7 @@ import numpy as np
 from crane.codegen import Parts
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
-from crane.control import Controller, Free, Signals, StiffController, ValveDrive
+from crane.control import Controller, Free, Signals, ValveDrive, path_of
 from crane.hydraulics.circuit import BALANCES
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
@@ -28,7 +28,7 @@ def recorded(
         rows: See `trajectory`.
         task: Name to put into it.
     """
-    path = control.path
+    path = path_of(control)
     q_a = rows.q[:, machine.closure.active]
     _warn_of_limits(machine, time, q_a)
     channels: dict[str, Array] = {}
@@ -44,20 +44,20 @@ def recorded(
         for axis, values in zip("xyz", Kinematics(machine).positions(rows.q).T, strict=True):
             add(f"tip_{axis}", values, "m")
     if path is not None:
-        reference, reference_rate, _ = path(time)
+        reference, reference_rate = path.position(time), path.velocity(time)
         for i, joint in enumerate(machine.active):
             add(f"reference_{joint}", reference[:, i], machine.unit(joint))
             rate_unit = machine.unit(joint) + "/s"
             add(f"reference_velocity_{joint}", reference_rate[:, i], rate_unit)
         if path.tip is not None:
-            for axis, values in zip("xyz", path.tip(time)[0].T, strict=True):
+            for axis, values in zip("xyz", path.tip.position(time).T, strict=True):
                 add(f"reference_tip_{axis}", values, "m")
     for i, joint in enumerate(machine.active):
         add(f"friction_{joint}", rows.friction[:, i], "N" if machine.unit(joint) == "m" else "N m")
     names = {"kinetic": "kinetic", "potential": "potential", "work": "work", "dissipated": "lost"}
     for name, part in names.items():
         add(name, getattr(rows, part)[:, 0], "J")
-    if isinstance(control, StiffController):
+    if isinstance(control, ValveDrive):
         for (name, unit), values in zip(control.channels, rows.channels.T, strict=True):
             add(name, values, unit)
         integrals = rows.own[:, -len(BALANCES) :]
@@ -75,6 +75,7 @@ def recorded(
         machine=machine.call,
         task=task,
         controller=_name_of(control),
+        copy=False,
     )
 
 

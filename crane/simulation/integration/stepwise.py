@@ -6,7 +6,7 @@ import numpy as np
 
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
-from crane.control import Controller, StiffController
+from crane.control import Controller, ValveDrive
 from crane.dynamics import Dynamics
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.state import state_layout
@@ -42,8 +42,10 @@ class PythonStepper:
         at = self.layout.view(state)
         seen = self._dynamics.at("observation", at.q, at.v_a, tau)
         more: Array = np.zeros(0)
-        if isinstance(self._control, StiffController):
-            more = self._control.observe(time, at.q[self._active], at.v_a, at.own)
+        if isinstance(self._control, ValveDrive):
+            control = self._control
+            where = control.at(time, at.q[self._active], at.v_a, at.own)
+            more = np.array(control.look(where), dtype=np.float64)
         return rate, np.concatenate([tau, seen, more])
 
     def advance(self, time: float, state: Array, first: Array, step: float) -> Array:
