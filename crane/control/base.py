@@ -95,7 +95,7 @@ class Law:
         """Active forces (n,) [N], [N m], and the rates (k,) of the law's states."""
         raise NotImplementedError
 
-    def begin(self, at: At) -> Sequence[float]:
+    def begin(self, at: At) -> Sequence[Number]:
         """The law's own states (k,) at the start, seen in numbers and at rest; none yet."""
         return ()
 
@@ -144,7 +144,8 @@ class Law:
     def _numbers(self, time: float, q_a: Array, v_a: Array, state: Array, inverse: Inverse) -> At:
         reference = self.references(np.array([time]))[0]
         vectors = (q_a, v_a, state, self.settings, reference)
-        return At(*(vector.tolist() for vector in vectors), inverse)
+        own: list[list[Number]] = [vector.tolist() for vector in vectors]
+        return At(own[0], own[1], own[2], own[3], own[4], inverse)
 
     @cached_property
     def _dynamics(self) -> Dynamics:

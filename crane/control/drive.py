@@ -63,7 +63,7 @@ class ValveDrive(Law):
         pairs = np.array([state[start : start + 2] for start in self.circuit.starts])
         self.command.update(time, q, v_a, vapour + np.maximum(pairs, 0.0))
 
-    def begin(self, at: At) -> Sequence[float]:
+    def begin(self, at: At) -> Sequence[Number]:
         """See `Law`."""
         weight = np.array(at.inverse([0.0] * len(at.q_a), friction=False))[self._which]
         x = np.array(at.q_a)[self._which] - self._lower
@@ -74,12 +74,9 @@ class ValveDrive(Law):
             signals = self.command.signals(at._replace(settings=self.command.settings.tolist()))
         supply, tank = hydraulics.supply.pressure, hydraulics.supply.tank
         if self.command.measured:
-            supply, tank = map(float, at.reference[-2:])
+            supply, tank = np.array(at.reference[-2:], dtype=np.float64).tolist()
         levels = np.array(signals, dtype=np.float64)
-        found: list[float] = self.circuit.start(
-            x, weight, self._pressures, levels, supply, tank
-        ).tolist()
-        return found
+        return list(self.circuit.start(x, weight, self._pressures, levels, supply, tank))
 
     def references(self, times: Array) -> Array:
         """See `TracedController`."""

@@ -56,15 +56,15 @@ class PI(Law):
         numbers = [[gains[joint].kp for joint in names], [gains[joint].ki for joint in names]]
         self.settings = np.array(numbers, dtype=np.float64).ravel()
 
-    def begin(self, at: At) -> Sequence[float]:
+    def begin(self, at: At) -> Sequence[Number]:
         """See `Law`."""
         if self._integral is not None:
-            return self._integral.tolist()
-        weight = at.inverse([0.0] * len(at.q_a), friction=True)
-        return [
-            (w - kp * e) / ki if ki > 0 else 0.0
-            for w, kp, ki, e in zip(weight, *self._gains(at), self._error(at), strict=True)
-        ]
+            return list(self._integral)
+        weight = np.array(at.inverse([0.0] * len(at.q_a), friction=True))
+        kp, ki = np.array(self._gains(at))
+        able = ki > 0
+        held = np.where(able, weight - kp * np.array(self._error(at)), 0.0)
+        return list(held / np.where(able, ki, 1.0))
 
     def references(self, times: Array) -> Array:
         """See `TracedController`."""

@@ -40,6 +40,7 @@ class Command(Protocol):
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """Think about the next period, given (nq,), (n,), (m, 2) [Pa]."""
+        return
 
     def references(self, times: Array) -> Array:
         """All that depends on time alone, (N, c) at times (N,) [s]."""

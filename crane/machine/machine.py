@@ -138,7 +138,7 @@ class Machine:
             if joint not in driven and not (np.isfinite(effort) and effort > 0)
         )
 
-    @property
+    @cached_property
     def reference(self) -> str:
         """What `load` takes to load it again: the bundled name, or the path."""
         known_as = self.path.stem

@@ -141,7 +141,7 @@ def trajectory(
 
     try:
         integration.run(times[:-1], state, step, rows, report)
-        integration.last(times[-1], state, step, rows[-1])
+        rows[-1] = integration.last(times[-1], state)
     except HaltedError as halt:
         finer, done = integration.finer(times[:-1], rows, step), integration.done
         q_a = layout.view(rows[:done]).q[:, machine.closure.active]
@@ -182,9 +182,7 @@ def _integration(
     raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")
 
 
-def as_controller(
-    controller: Controller | Command | Force | None, machine: Machine
-) -> Controller:
+def as_controller(controller: Controller | Command | Force | None, machine: Machine) -> Controller:
     """What drives a machine, from what `simulate` takes.
 
     Raises:

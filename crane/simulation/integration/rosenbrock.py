@@ -70,7 +70,7 @@ class StiffStepper:
         self._state = state_layout(machine, len(control.scales))
         self._seen = seen_layout(machine, control)
         self._stiff = int(np.isfinite(control.scales).sum())
-        form = form_of(control, len(machine.active), len(control.scales), fold=True)
+        form = form_of(control, self._columns, len(machine.active), len(control.scales), fold=True)
         key = ("stiff", form, self._stiff, folded(self._numbers), dynamics.carriers)
         if key not in self._fast.programs:
             self._fast.programs[key] = self._compile()
@@ -98,6 +98,15 @@ class StiffStepper:
             )  # fmt: skip
 
         return in_blocks(call, self._control, times, step, rows)
+
+    def observe(self, time: float, state: Array) -> Array:
+        """See `CompiledStepper.observe`."""
+        settings = np.ascontiguousarray(self._control.settings)
+        reference = np.ascontiguousarray(self._control.references(np.array([time])))
+        seen = np.empty(self._seen.size)
+        machine = self._fast.geometry.numbers, self._numbers
+        self._program.call("observe", *machine, settings, reference, state, seen)
+        return seen
 
     def _trace(self, tape: Tape, state: int, theta: int | None) -> tuple[Sweep, At]:
         """The machine at a state, its references between three rows or in one."""

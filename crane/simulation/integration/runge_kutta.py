@@ -31,7 +31,7 @@ class CompiledStepper:
         self._dynamics, self._control = dynamics, control
         self._columns = columns_of(control)
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
-        form = form_of(control, len(machine.active), states, fold=False)
+        form = form_of(control, self._columns, len(machine.active), states, fold=False)
         key = ("rk4", form, states, folded(self._numbers), dynamics.carriers)
         if key not in self._fast.programs:
             self._fast.programs[key] = self._compile()
@@ -112,6 +112,17 @@ class CompiledStepper:
             )  # fmt: skip
 
         return in_blocks(call, self._control, times, step, rows)
+
+    def observe(self, time: float, state: Array) -> Array:
+        """What is seen (.,) at a time [s] and a state."""
+        settings = np.ascontiguousarray(self._control.settings)
+        reference = np.ascontiguousarray(self._control.references(np.array([time])))
+        layout = self._program.outputs("observe")
+        out = np.empty(layout.size)
+        machine = self._fast.geometry.numbers, self._numbers
+        self._program.call("observe", *machine, settings, reference, state, out)
+        seen: Array = out[layout["seen"]]
+        return seen
 
     def _add_sums(self, program: Program) -> None:
         """blend(s, k, h) = s + h k; finish(s, k1, k2, k3, k4, h) = s + h/6 (...), largest move."""

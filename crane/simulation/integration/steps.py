@@ -71,22 +71,19 @@ class Steps:
         carefully(len(times), quick if fast else None, careful, _CHUNK, progress)
         self.done = len(times)
 
-    def last(self, time: float, state: Array, step: float, row: Array) -> None:
-        """Observe without a step after it.
+    def last(self, time: float, state: Array) -> Array:
+        """A row without a step after it.
 
         Args:
             time: [s].
-            state: There, left as it is.
-            step: [s], as of the run.
-            row: (.,), filled like one of the run's.
+            state: There.
 
         Raises:
             HaltedError: It cannot be observed.
         """
-        if self._fast is None:
-            row[:] = [*state, *self.slow.observe(time, state)[1]]
-        else:  # the row is filled before the step, whether or not that succeeds
-            self._fast.run(np.array([time]), state.copy(), step, row[None])
+        fast = self._fast
+        seen = fast.observe(time, state) if fast else self.slow.observe(time, state)[1]
+        return np.concatenate([state, seen])
 
     def finer(self, times: Array, rows: Array, step: float) -> float:
         """A step [s] with which the motion goes on where it halted; 0 if none was found.

@@ -31,11 +31,12 @@ def machine_at(
     return sweep, [q[i] for i in closure.active], parts
 
 
-def form_of(control: TracedController, n: int, states: int, fold: bool) -> Hashable:
+def form_of(control: TracedController, columns: int, n: int, states: int, fold: bool) -> Hashable:
     """All that a controller's formulas are, so that equal ones share their machine code.
 
-    They are traced by themselves: for n active joints and so many states, what the machine makes
-    of accelerations left open. With `fold`, zeros and ones of the settings become part of them.
+    They are traced by themselves, for rows of so many references, n active joints and so many
+    states, what the machine makes of accelerations left open. With `fold`, zeros and ones of the
+    settings become part of them.
     """
     tape = Tape()
     asked: list[Number] = []
@@ -45,9 +46,9 @@ def form_of(control: TracedController, n: int, states: int, fold: bool) -> Hasha
         asked.extend([*a_a, float(friction)])
         return answer
 
-    settings = settings_of(control, tape, 3, fold)
-    motion = (tape.loads(array, 0, size) for array, size in enumerate((n, n, states)))
-    at = At(*motion, settings, tape.loads(4, 0, columns_of(control)), inverse)
+    q_a, v_a, own = tape.loads(0, 0, n), tape.loads(1, 0, n), tape.loads(2, 0, states)
+    settings, reference = settings_of(control, tape, 3, fold), tape.loads(4, 0, columns)
+    at = At(q_a, v_a, own, settings, reference, inverse)
     tau, rates = control.trace(at)
     seen = control.look(at) if isinstance(control, ValveDrive) else []
     outputs = [
@@ -55,7 +56,7 @@ def form_of(control: TracedController, n: int, states: int, fold: bool) -> Hasha
         for part in (tau, rates, seen, asked)
     ]
     # as text, in which the constant 2.0 and operation number 2 differ
-    return repr((columns_of(control), len(control.settings), tape.operations, outputs))
+    return repr((columns, len(control.settings), tape.operations, outputs))
 
 
 def settings_of(control: TracedController, tape: Tape, array: int, fold: bool) -> list[Number]:
