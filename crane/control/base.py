@@ -132,7 +132,7 @@ class Law:
         return self.law(at)
 
     def at(self, time: float, q_a: Array, v_a: Array, state: Array) -> At:
-        """What the law sees at a time [s], (n,), (n,), (k,), in numbers."""
+        """What the law sees at a time [s] with (n,), (n,), (k,), in numbers."""
 
         def inverse(a_a: Sequence[Number], friction: bool) -> list[Number]:
             wanted = np.array(a_a, dtype=np.float64)

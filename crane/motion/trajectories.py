@@ -50,14 +50,12 @@ class Path:
     def bounds(self) -> tuple[Array, Array]:
         """Two vectors (n,) between which the coordinates stay, which may be farther apart.
 
-        A polynomial sum a_i u^i of 0 <= u <= h is at most a_0 + sum max(a_i h^i, 0).
+        A polynomial sum a_i u^i is no farther than sum |a_i| h^i, i > 0, from a_0 in 0 <= u <= h.
         """
         curve = self._curves[0]
         powers = np.vander(np.diff(curve.x), len(curve.c))[:, :-1]
-        terms = curve.c[:-1] * powers.T[:, :, None]
-        least = curve.c[-1] + np.minimum(terms, 0.0).sum(axis=0)
-        most = curve.c[-1] + np.maximum(terms, 0.0).sum(axis=0)
-        return least.min(axis=0), most.max(axis=0)
+        reach = np.einsum("imj,mi->mj", np.abs(curve.c[:-1]), powers)
+        return (curve.c[-1] - reach).min(axis=0), (curve.c[-1] + reach).max(axis=0)
 
     def turns(self) -> Array:
         """Times (k,) [s] at which a coordinate may be largest or least: knots, and rests."""

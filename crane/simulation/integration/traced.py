@@ -6,6 +6,7 @@ import numpy as np
 
 from crane.closure.traced import Constants
 from crane.codegen import Expression, Layout, Number, Parts, Tape
+from crane.common.errors import InputError
 from crane.control import At, TracedController, ValveDrive
 from crane.dynamics import Dynamics
 from crane.dynamics.traced import Sweep
@@ -37,6 +38,9 @@ def form_of(control: TracedController, columns: int, n: int, states: int, fold: 
     They are traced by themselves, for rows of so many references, n active joints and so many
     states, what the machine makes of accelerations left open. With `fold`, zeros and ones of the
     settings become part of them.
+
+    Raises:
+        InputError: There are too few or too many of them.
     """
     tape = Tape()
     asked: list[Number] = []
@@ -50,6 +54,11 @@ def form_of(control: TracedController, columns: int, n: int, states: int, fold: 
     settings, reference = settings_of(control, tape, 3, fold), tape.loads(4, 0, columns)
     at = At(q_a, v_a, own, settings, reference, inverse)
     tau, rates = control.trace(at)
+    if (len(tau), len(rates)) != (n, states):
+        raise InputError(
+            f"the law of {type(control).__name__} gives {len(tau)} forces and {len(rates)} rates, "
+            f"give {n} and {states}: one per active joint, one per state"
+        )
     seen = control.look(at) if isinstance(control, ValveDrive) else []
     outputs = [
         [x.index if isinstance(x, Expression) else float(x) for x in part]
