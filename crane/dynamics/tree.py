@@ -45,9 +45,6 @@ class _Part:
     def __init__(self, whole: pin.Model, bodies: Sequence[int]):
         self.columns = np.array(bodies) - 1
         self.base = whole.parents[bodies[0]]
-        if len(bodies) == whole.njoints - 1:  # nothing is carried by another
-            self.model, self.data = whole, whole.createData()
-            return
         self.model, place = pin.Model(), {self.base: 0}
         for body in bodies:
             place[body] = self.model.addJoint(

@@ -162,24 +162,27 @@ def _integration(
     dynamics: Dynamics, control: Controller, own: int, method: str | None
 ) -> Steps | StiffSteps | AdaptiveSteps:
     """What integrates by a method, or by that which the controller asks for."""
-    if method is None:
-        method = "rosenbrock" if isinstance(control, ValveDrive) else "rk4"
-    if method == "rosenbrock" and isinstance(control, ValveDrive):
-        if dynamics.path == "compiled":
-            with suppress(TooLongError):
-                return StiffSteps(dynamics, control)
-        if control.period:
-            raise InputError("a program with a period runs on the compiled path alone")
-        return AdaptiveSteps(dynamics, control, own, "BDF")
+    if isinstance(control, ValveDrive) and method in (None, "rosenbrock"):
+        return _stiff(dynamics, control, own)
     if isinstance(control, ValveDrive) and control.period:
         raise InputError(
             f"method '{method}' does not call the valves' program, leave the method out"
         )
-    if method == "rk4":
+    if method in (None, "rk4"):
         return Steps(dynamics, control, own)
     if method in ADAPTIVE:
         return AdaptiveSteps(dynamics, control, own, method)
     raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")
+
+
+def _stiff(dynamics: Dynamics, control: ValveDrive, own: int) -> StiffSteps | AdaptiveSteps:
+    """What integrates a circuit: machine code, or scipy where there is none."""
+    if dynamics.path == "compiled":
+        with suppress(TooLongError):
+            return StiffSteps(dynamics, control)
+    if control.period:
+        raise InputError("a program with a period runs on the compiled path alone")
+    return AdaptiveSteps(dynamics, control, own, "BDF")
 
 
 def as_controller(controller: Controller | Command | Force | None, machine: Machine) -> Controller:
