@@ -1,5 +1,7 @@
 """Single evaluations and steps of the benchmark, and that all engines agree."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pinocchio as pin
 from measuring import Call, measure, microseconds, table
@@ -7,7 +9,7 @@ from peers import INTEGRATORS, ConstraintDynamics, MuJoCo
 from subject import START, FormulaLoop, Runner, along
 
 import crane
-from crane.control import PI, Free
+from crane.control import PI, ComputedTorque, Free, Law, ValveDrive, ValvePD
 from crane.motion.trajectories import task_path
 
 
@@ -117,17 +119,30 @@ def one_step(mini: crane.Machine, bare: crane.Machine, rounds: int) -> str:
 
 
 def task(mini: crane.Machine, rounds: int) -> str:
-    """Ten seconds of the controlled lift at 1 ms."""
-    path = task_path(mini, "lift")
-    runner = Runner(mini, PI(mini, path), *path(0.0)[:2])
-    times = measure(
-        {
-            "the loop in machine code alone": lambda: runner.run(1e-3, 10_000),
-            "`crane.simulate`, from call to recording": lambda: crane.simulate(
-                mini, PI(mini, path)
-            ),
-        },
-        rounds,
-    )
-    rows = [(name, f"{t:.3f}", f"{10 / t:.0f}") for name, t in times.items()]
-    return table(("10 s of lifting, PI control and friction", "time [s]", "times real time"), rows)
+    """Ten seconds of tasks at 1 ms: from call to recording, over the loop in machine code."""
+    valves = crane.load("patu655")
+    lift, push = task_path(mini, "lift"), task_path(valves, "push")
+
+    def driven() -> ValveDrive:
+        return ValveDrive(valves, ValvePD(valves, push))
+
+    cases: dict[str, tuple[crane.Machine, Callable[[], Law], crane.Path]] = {
+        "`mini_forwarder` lifts, `PI`": (mini, lambda: PI(mini, lift), lift),
+        "the same, `ComputedTorque`": (mini, lambda: ComputedTorque(mini, lift), lift),
+        "`patu655` pushes on its valves, `ValvePD`": (valves, driven, push),
+    }
+    rows = []
+    for name, (machine, control, path) in cases.items():
+        q_a = path.position(0.0)
+        runner = Runner(machine, control(), q_a, np.zeros_like(q_a))
+        calls: dict[str, Call] = {
+            "loop": lambda runner=runner: runner.run(1e-3, 10_000),
+            "all": lambda machine=machine, control=control: crane.simulate(machine, control()),
+        }
+        times = measure(calls, rounds)
+        loop, whole = times["loop"], times["all"]
+        rows.append(
+            (name, f"{loop:.3f}", f"{whole:.3f}", f"{whole / loop:.2f}", f"{10 / whole:.0f}")
+        )
+    head = ("10 s at 1 ms, with friction", "the loop [s]", "`crane.simulate` [s]", "ratio")
+    return table((*head, "times real time"), rows)

@@ -7,8 +7,8 @@ import pinocchio as pin
 
 import crane
 from crane.codegen import Program
-from crane.control import TracedController
-from crane.simulation.integration import CompiledStepper
+from crane.control import Law, ValveDrive
+from crane.simulation.integration import CompiledStepper, StiffStepper, row_layout
 
 Array = np.ndarray
 
@@ -56,11 +56,15 @@ class Runner:
         v_a: (n,).
     """
 
-    def __init__(self, machine: crane.Machine, control: TracedController, q_a: Array, v_a: Array):
+    def __init__(self, machine: crane.Machine, control: Law, q_a: Array, v_a: Array):
         own = control.start(q_a)
         self._start = np.concatenate([machine.closure.solve(q_a), v_a, own, np.zeros(2)])
-        self._stepper = CompiledStepper(crane.Dynamics(machine), control, len(own))
-        self._columns = len(self._start) + 2 * len(v_a) + 2
+        self._stepper = (
+            StiffStepper(crane.Dynamics(machine), control)
+            if isinstance(control, ValveDrive)
+            else CompiledStepper(crane.Dynamics(machine), control, len(own))
+        )
+        self._columns = row_layout(machine, control, len(own)).size
 
     def run(self, step: float, steps: int) -> Array:
         """The state after so many steps."""

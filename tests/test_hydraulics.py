@@ -225,20 +225,14 @@ def test_a_void_is_as_large_as_what_was_pulled_and_fills_again(tmp_path):
     class Pulled(ValveDrive):
         """The load is pulled from outside."""
 
-        columns = 1
-
         def references(self, times):
-            return force(np.asarray(times))[:, None]
+            return np.column_stack([super().references(times), force(np.asarray(times))])
 
-        def _forces(self, instant):
-            return [instant.forces[0] + self.pull]
-
-        def _at(self, q_a, v_a, state, settings, reference):
-            self.pull = reference[0]
-            return super()._at(q_a, v_a, state, settings, [0.0])
+        def law(self, at):
+            forces, rates = super().law(at)
+            return [forces[0] + at.reference[-1]], rates
 
     drive = Pulled(machine, Signals(machine, [0.0], {}), {"x": (2e5, 2e5 * AREA_A / AREA_B)})
-    drive.columns = 1
     recording = crane.simulate(machine, drive, duration=3.0)
     p = recording.channels["pressure_x_a"]
     vapour = machine.hydraulics.oil.vapour_pressure

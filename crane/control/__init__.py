@@ -1,13 +1,6 @@
 """Controllers: forces of the active joints, or signals of valves, from time and motion."""
 
-from crane.control.base import (
-    Controller,
-    Feedback,
-    Free,
-    StiffController,
-    Traced,
-    TracedController,
-)
+from crane.control.base import At, Controller, Feedback, Free, Law, TracedController, path_of
 from crane.control.drive import ValveDrive
 from crane.control.forces import PI, ComputedTorque
 from crane.control.names import CONTROLLERS, controller, usual
@@ -15,7 +8,7 @@ from crane.control.tip import TipVelocity
 from crane.control.valves import Command, Sampled, Signals, ValvePD, joystick
 
 __all__ = [
-    "CONTROLLERS", "PI", "Command", "ComputedTorque", "Controller", "Feedback", "Free", "Sampled",
-    "Signals", "StiffController", "TipVelocity", "Traced", "TracedController", "ValveDrive",
-    "ValvePD", "controller", "joystick", "usual",
+    "CONTROLLERS", "PI", "At", "Command", "ComputedTorque", "Controller", "Feedback", "Free",
+    "Law", "Sampled", "Signals", "TipVelocity", "TracedController", "ValveDrive", "ValvePD",
+    "controller", "joystick", "path_of", "usual",
 ]  # fmt: skip

@@ -1,13 +1,14 @@
-"""What a controller is, and the plainest ones."""
+"""What a controller is: a function, a class with states, or a law that becomes machine code."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from crane.codegen import Number
 from crane.common.samples import Array, as_sample
-from crane.dynamics.traced import Sweep
+from crane.dynamics import Dynamics
 from crane.machine import Machine
 from crane.motion.trajectories import Path
 
@@ -15,110 +16,148 @@ from crane.motion.trajectories import Path
 class Controller(Protocol):
     """What `simulate` asks of a controller; a plain function (t, q_a, v_a) -> tau_a serves too.
 
-    Attributes:
-        path: The reference motion, or None.
+    It may have a `path`, the reference motion, which gives `simulate` start and duration.
     """
-
-    path: Path | None
 
     def start(self, q_a: Array) -> Array:
         """The controller's own states (k,) at the start, integrated with the machine's."""
 
     def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
-        """Active forces (n,) [N], [N m], and the rate of the controller's states."""
+        """Active forces (n,) [N], [N m], and the rate (k,) of the controller's states."""
 
 
-class Traced(NamedTuple):
-    """What a controller sees while it becomes part of the machine code.
+class Inverse(Protocol):
+    """Inverse dynamics at an instant."""
+
+    def __call__(self, a_a: Sequence[Number], friction: bool) -> list[Number]:
+        """Active forces (n,) [N], [N m] of accelerations (n,), see `Dynamics.inverse`."""
+
+
+class At(NamedTuple):
+    """What a law sees at an instant: floats, or formulas while it becomes machine code.
 
     Attributes:
-        sweep: The machine's dynamics at this instant.
-        q: (nq,) coordinates of all joints.
-        v_a: (n,) active velocities.
-        state: (k,) the controller's own states.
+        q_a: (n,) active coordinates [m], [rad].
+        v_a: (n,) their velocities [m/s], [rad/s].
+        state: (k,) the law's own states.
         settings: (s,) its `settings`.
-        reference: (c,) its row of references.
+        reference: (c,) its row of `references`.
+        inverse: The machine's inverse dynamics here.
     """
 
-    sweep: Sweep
-    q: list[Number]
+    q_a: list[Number]
     v_a: list[Number]
     state: list[Number]
     settings: list[Number]
     reference: list[Number]
+    inverse: Inverse
 
 
 @runtime_checkable
 class TracedController(Controller, Protocol):
-    """A controller that can become part of the simulation's machine code.
+    """A controller that can become part of the simulation's machine code; `Law` makes one.
 
     Attributes:
         settings: (s,) its numbers.
-        columns: Length c of a row of references.
     """
 
     settings: Array
-    columns: int
 
     def references(self, times: Array) -> Array:
-        """What it follows, (N, c) at times (N,) [s]."""
+        """All that depends on time alone, (N, c) at times (N,) [s]."""
 
-    def trace(self, at: Traced) -> tuple[list[Number], list[Number]]:
+    def trace(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
         """`__call__` as formulas."""
 
 
-@runtime_checkable
-class StiffController(TracedController, Protocol):
-    """A controller whose own states ask for an implicit method.
+class Law:
+    """A controller whose law is written once, and called in numbers as well as traced.
+
+    A law writes `law`, and `begin`, `references`, `settings`, `path` where it has states, depends
+    on time, has numbers that change from one to the next, follows a motion. The rest follows.
+
+    Args:
+        machine: The machine.
 
     Attributes:
-        scales: (k,) accuracy that matters in each of its states, infinite for integrals, which
-            come last and which nothing depends on.
-        channels: Names and units of what else is recorded.
-        form: What its formulas depend on beside the zeros and ones of its settings.
-        period: Time between calls of `update` [s]; 0 if it wants none.
+        path: The reference motion, or None.
+        settings: (s,) numbers that machine code is not made anew for when they change. All other
+            numbers of a law become part of the code.
     """
 
-    scales: Array
-    channels: tuple[tuple[str, str], ...]
-    form: Hashable
-    period: float
-
-    def update(self, time: float, q: Array, v_a: Array, state: Array) -> None:
-        """Look at the machine, (nq,), (n,), (k,), before the next period."""
-
-    def look(self, at: Traced) -> list[Number]:
-        """What is recorded in `channels`, as formulas."""
-
-    def observe(self, time: float, q_a: Array, v_a: Array, state: Array) -> Array:
-        """The same in numbers."""
-
-
-class Free:
-    """No active forces."""
-
     path: Path | None = None
-    settings = np.zeros(0)
-    columns = 0
+    settings: Array = np.zeros(0)
 
     def __init__(self, machine: Machine):
-        self._force = np.zeros(len(machine.active))
+        self.machine = machine
 
-    def start(self, q_a: Array) -> Array:
-        """See `Controller`."""
-        return np.zeros(0)
+    def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
+        """Active forces (n,) [N], [N m], and the rates (k,) of the law's states."""
+        raise NotImplementedError
 
-    def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
-        """See `Controller`."""
-        return self._force, state
+    def begin(self, at: At) -> Sequence[Number]:
+        """The law's own states (k,) at the start, seen in numbers and at rest; none yet."""
+        return ()
 
     def references(self, times: Array) -> Array:
         """See `TracedController`."""
         return np.zeros((len(times), 0))
 
-    def trace(self, at: Traced) -> tuple[list[Number], list[Number]]:
+    def start(self, q_a: Array) -> Array:
+        """See `Controller`."""
+        # nothing is worth compiling for one posture
+        dynamics = Dynamics(self.machine, path="pinocchio")
+        return self.start_at(dynamics, self.machine.closure.solve(q_a))
+
+    def start_at(self, dynamics: Dynamics, q: Array) -> Array:
+        """`start` at a posture (nq,) that is closed already, of an exact `Dynamics`."""
+        q_a = q[self.machine.closure.active]
+        rest = np.zeros_like(q_a)
+
+        def inverse(a_a: Sequence[Number], friction: bool) -> list[Number]:
+            quantity = "inverse with friction" if friction else "inverse"
+            found: list[Number] = dynamics.tree.at(quantity, q, rest, np.array(a_a)).tolist()
+            return found
+
+        at = self._numbers(0.0, q_a, rest, np.zeros(0), inverse)
+        return np.array(self.begin(at), dtype=np.float64)
+
+    def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
+        """See `Controller`."""
+        tau, rate = self.law(self.at(time, q_a, v_a, state))
+        return np.array(tau, dtype=np.float64), np.array(rate, dtype=np.float64)
+
+    def trace(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
         """See `TracedController`."""
-        return [0.0] * len(at.v_a), at.state
+        return self.law(at)
+
+    def at(self, time: float, q_a: Array, v_a: Array, state: Array) -> At:
+        """What the law sees at a time [s] with (n,), (n,), (k,), in numbers."""
+
+        def inverse(a_a: Sequence[Number], friction: bool) -> list[Number]:
+            wanted = np.array(a_a, dtype=np.float64)
+            found: list[Number] = self._dynamics.inverse(q_a, v_a, wanted, friction).tolist()
+            return found
+
+        return self._numbers(time, q_a, v_a, state, inverse)
+
+    def _numbers(self, time: float, q_a: Array, v_a: Array, state: Array, inverse: Inverse) -> At:
+        reference = self.references(np.array([time]))[0]
+        vectors = (q_a, v_a, state, self.settings, reference)
+        own: list[list[Number]] = [vector.tolist() for vector in vectors]
+        return At(own[0], own[1], own[2], own[3], own[4], inverse)
+
+    @cached_property
+    def _dynamics(self) -> Dynamics:
+        return Dynamics(self.machine)
+
+
+class Free(Law):
+    """No active forces."""
+
+    def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
+        """See `Law`."""
+        return [0.0] * len(at.v_a), ()
 
 
 class Feedback:
@@ -130,7 +169,6 @@ class Feedback:
     """
 
     def __init__(self, function: Callable[[float, Array, Array], Array], machine: Machine):
-        self.path: Path | None = None
         self._function, self._active = function, machine.active
 
     def start(self, q_a: Array) -> Array:
@@ -142,3 +180,8 @@ class Feedback:
         forces = self._function(time, q_a.copy(), v_a.copy())
         what = f"the controller's force at t = {time:g} s"
         return as_sample(forces, len(self._active), what, self._active), state
+
+
+def path_of(controller: Controller) -> Path | None:
+    """The reference motion of a controller, if it has one."""
+    return getattr(controller, "path", None)

@@ -1,22 +1,22 @@
 """Controllers of the forces of active joints."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.codegen import Number
+from crane.codegen.scalar import subtract
 from crane.common.errors import ClosureError, CraneWarning, InputError
 from crane.common.samples import Array, as_number, as_sample
-from crane.control.base import Traced
+from crane.control.base import At, Law
 from crane.description import PIGains
-from crane.dynamics import Dynamics
 from crane.machine import Machine
 from crane.motion.trajectories import Path
 
 
-class PI:
+class PI(Law):
     """One PI controller per active joint, equation (7) of the reduced-scale forwarder paper.
 
     tau = K_p e + K_i int e dt, e = q_ref(t) - q_A.
@@ -47,50 +47,44 @@ class PI:
                     f"no PI gains for active joint '{joint}' of '{machine.name}', give kp and ki "
                     "under 'control' of the machine file"
                 )
-        self.path: Path | None = path
-        self._machine, self._reference = machine, path
-        names = machine.active
+        super().__init__(machine)
+        self.path = path
+        self._reference, names = path, machine.active
         self._integral = (
             None if integral is None else as_sample(integral, len(names), "integral", names)
         )
-        self._kp = np.array([gains[joint].kp for joint in machine.active])
-        self._ki = np.array([gains[joint].ki for joint in machine.active])
-        self.settings = np.concatenate([self._kp, self._ki])
-        self.columns = len(machine.active)
+        numbers = [[gains[joint].kp for joint in names], [gains[joint].ki for joint in names]]
+        self.settings = np.array(numbers, dtype=np.float64).ravel()
 
-    def start(self, q_a: Array) -> Array:
-        """See `Controller`."""
+    def begin(self, at: At) -> Sequence[Number]:
+        """See `Law`."""
         if self._integral is not None:
-            return self._integral
-        rest = np.zeros_like(q_a)
-        once = Dynamics(self._machine, path="pinocchio")
-        weight = once.inverse(q_a, rest, rest, friction=True)
-        error = self._reference(0.0)[0] - q_a
-        able = self._ki > 0
-        return np.where(able, weight - self._kp * error, 0.0) / np.where(able, self._ki, 1.0)
-
-    def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
-        """See `Controller`; the states are the integrals of the errors."""
-        error = self._reference.position(time) - q_a
-        return self._kp * error + self._ki * state, error
+            return list(self._integral)
+        weight = np.array(at.inverse([0.0] * len(at.q_a), friction=True))
+        kp, ki = np.array(self._gains(at))
+        able = ki > 0
+        held = np.where(able, weight - kp * np.array(self._error(at)), 0.0)
+        return list(held / np.where(able, ki, 1.0))
 
     def references(self, times: Array) -> Array:
         """See `TracedController`."""
         return self._reference.position(times)
 
-    def trace(self, at: Traced) -> tuple[list[Number], list[Number]]:
-        """See `TracedController`."""
-        n = self.columns
-        columns = self._machine.closure.active
-        error = [x - at.q[i] for x, i in zip(at.reference, columns, strict=True)]
-        tau = [
-            kp * e + ki * z
-            for kp, ki, e, z in zip(at.settings[:n], at.settings[n:], error, at.state, strict=True)
-        ]
-        return tau, error
+    def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
+        """See `Law`; the states are the integrals of the errors."""
+        error = self._error(at)
+        kp, ki = self._gains(at)
+        return [p * e + i * z for p, i, e, z in zip(kp, ki, error, at.state, strict=True)], error
+
+    def _error(self, at: At) -> list[Number]:
+        return subtract(at.reference, at.q_a)
+
+    def _gains(self, at: At) -> tuple[list[Number], list[Number]]:
+        n = len(at.q_a)
+        return at.settings[:n], at.settings[n : 2 * n]
 
 
-class ComputedTorque:
+class ComputedTorque(Law):
     """Inverse dynamics with a critically damped error: e'' + 2 w e' + w^2 e = 0.
 
     tau = inverse(q_A, v_A, a_ref + 2 w (v_ref - v_A) + w^2 (q_ref - q_A)) with friction.
@@ -105,13 +99,10 @@ class ComputedTorque:
     """
 
     def __init__(self, machine: Machine, path: Path, bandwidth: float = 20.0):
-        bandwidth = as_number(bandwidth, "the bandwidth", "rad/s", above=0)
-        self.path: Path | None = path
-        self._reference, self._bandwidth = path, bandwidth
-        self._dynamics = Dynamics(machine)
-        self._active = machine.closure.active
-        self.settings = np.array([float(bandwidth)])
-        self.columns = 3 * len(machine.active)
+        super().__init__(machine)
+        self.path = path
+        self._reference = path
+        self.settings = np.array([as_number(bandwidth, "the bandwidth", "rad/s", above=0)])
         if machine.undriven:
             warnings.warn(self._needed(machine), CraneWarning, stacklevel=2)
 
@@ -135,28 +126,16 @@ class ComputedTorque:
             "describe its cylinder or gains, and lock what is not"
         )
 
-    def start(self, q_a: Array) -> Array:
-        """See `Controller`."""
-        return np.zeros(0)
-
-    def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
-        """See `Controller`."""
-        q_ref, v_ref, a_ref = self._reference(time)
-        wanted = a_ref + 2 * self._bandwidth * (v_ref - v_a) + self._bandwidth**2 * (q_ref - q_a)
-        return self._dynamics.inverse(q_a, v_a, wanted, friction=True), state
-
     def references(self, times: Array) -> Array:
         """See `TracedController`."""
         return np.concatenate(self._reference(times), axis=1)
 
-    def trace(self, at: Traced) -> tuple[list[Number], list[Number]]:
-        """See `TracedController`."""
-        w, n, reference = at.settings[0], len(at.v_a), at.reference
-        q_a = [at.q[i] for i in self._active]
+    def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
+        """See `Law`."""
+        w, n = at.settings[0], len(at.q_a)
+        motion = (at.reference[i * n : (i + 1) * n] for i in range(3))
         wanted = [
-            a_ref + 2.0 * w * (v_ref - v) + w * w * (q_ref - x)
-            for q_ref, v_ref, a_ref, x, v in zip(
-                reference[:n], reference[n : 2 * n], reference[2 * n :], q_a, at.v_a, strict=True
-            )
+            a_ref + 2.0 * w * (v_ref - v) + w * w * (q_ref - q)
+            for q_ref, v_ref, a_ref, q, v in zip(*motion, at.q_a, at.v_a, strict=True)
         ]
-        return at.sweep.inverse(wanted, friction=True), at.state
+        return at.inverse(wanted, friction=True), ()

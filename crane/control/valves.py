@@ -11,6 +11,7 @@ from crane.codegen.scalar import apply
 from crane.common.errors import InputError, known
 from crane.common.magnitudes import meant
 from crane.common.samples import Array, as_number, as_sample
+from crane.control.base import At
 from crane.hydraulics import Hydraulics, PDGains
 from crane.machine import Machine
 from crane.motion.trajectories import Path
@@ -23,34 +24,31 @@ _JUMP = 0.01  # of the spool's stroke, over which the feedforward jumps the dead
 class Command(Protocol):
     """Where the signals of m valves come from.
 
+    What is written here is what those have that say nothing else.
+
     Attributes:
         path: The reference motion, or None.
         measured: Whether the last two references are the pressures of supply and tank.
         settings: (s,) its numbers.
-        columns: Length c of a row of references.
         period: Time between calls of `update` [s]; 0 if it wants none.
     """
 
-    path: Path | None
-    measured: bool
-    settings: Array
-    columns: int
-    period: float
+    path: Path | None = None
+    measured: bool = False
+    settings: Array = np.zeros(0)
+    period: float = 0.0
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """Think about the next period, given (nq,), (n,), (m, 2) [Pa]."""
+        return
 
     def references(self, times: Array) -> Array:
-        """What it follows, (N, c) at times (N,) [s]."""
+        """All that depends on time alone, (N, c) at times (N,) [s]."""
+        raise NotImplementedError
 
-    def signals(
-        self,
-        q_a: Sequence[Number],
-        v_a: Sequence[Number],
-        settings: Sequence[Number],
-        reference: Sequence[Number],
-    ) -> list[Number]:
-        """Signals (m,) [V], from floats or as formulas."""
+    def signals(self, at: At) -> Sequence[Number]:
+        """Signals (m,) [V], from floats or as formulas; what it sees are its own settings."""
+        raise NotImplementedError
 
 
 def circuit_of(machine: Machine) -> Hydraulics:
@@ -67,7 +65,7 @@ def circuit_of(machine: Machine) -> Hydraulics:
     return machine.hydraulics
 
 
-class Signals:
+class Signals(Command):
     """Signals given in time, straight between the instants and constant beyond them.
 
     Args:
@@ -84,9 +82,6 @@ class Signals:
         InputError: Unknown joints, wrong lengths, or times that do not increase.
     """
 
-    path: Path | None = None
-    settings = np.zeros(0)
-    period = 0.0
     title = "given valve signals"
 
     def __init__(
@@ -134,7 +129,6 @@ class Signals:
                 )
         self._values = np.column_stack(columns)
         self._count = len(circuit.joints)
-        self.columns = len(columns)
 
     def _column(self, values: ArrayLike, what: str) -> Array:
         return as_sample(values, len(self._time), what)
@@ -144,22 +138,13 @@ class Signals:
         """From zero to the last instant [s]."""
         return float(self._time[-1])
 
-    def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
-        """See `Command`."""
-
     def references(self, times: Array) -> Array:
         """See `Command`."""
         return np.column_stack([np.interp(times, self._time, x) for x in self._values.T])
 
-    def signals(
-        self,
-        q_a: Sequence[Number],
-        v_a: Sequence[Number],
-        settings: Sequence[Number],
-        reference: Sequence[Number],
-    ) -> list[Number]:
+    def signals(self, at: At) -> Sequence[Number]:
         """See `Command`."""
-        return list(reference[: self._count])
+        return at.reference[: self._count]
 
 
 def joystick(
@@ -212,7 +197,7 @@ def joystick(
     return found
 
 
-class ValvePD:
+class ValvePD(Command):
     """One PD controller per valve, equation (37) of the electro-hydraulic forwarder paper.
 
     u = K_p (q_ref - q) + K_d (q_ref' - q') + F_f, with the feedforward F_f that jumps over the
@@ -228,9 +213,6 @@ class ValvePD:
         InputError: No valves, or no gains for one.
     """
 
-    measured = False
-    period = 0.0
-
     def __init__(self, machine: Machine, path: Path, gains: Mapping[str, PDGains] | None = None):
         circuit = circuit_of(machine)
         gains = circuit.control if gains is None else gains
@@ -240,7 +222,7 @@ class ValvePD:
                     f"no gains for the valve of '{joint}' of '{machine.name}', give kp and kd "
                     "under 'control' of its 'hydraulics'"
                 )
-        self.path: Path | None = path
+        self.path = path
         self._reference = path
         self._which = [machine.active.index(joint) for joint in circuit.joints]
         valves = circuit.valves.values()
@@ -252,36 +234,26 @@ class ValvePD:
             [valve.full - valve.neutral for valve in valves],
         ]
         self.settings = np.array(numbers, dtype=np.float64).ravel()
-        self.columns = 2 * len(self._which)
-
-    def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
-        """See `Command`."""
 
     def references(self, times: Array) -> Array:
         """See `Command`."""
-        q, v, _ = self._reference(times)
+        q, v = self._reference.position(times), self._reference.velocity(times)
         return np.hstack([q[:, self._which], v[:, self._which]])
 
-    def signals(
-        self,
-        q_a: Sequence[Number],
-        v_a: Sequence[Number],
-        settings: Sequence[Number],
-        reference: Sequence[Number],
-    ) -> list[Number]:
+    def signals(self, at: At) -> Sequence[Number]:
         """See `Command`."""
         m = len(self._which)
-        kp, kd, dead, neutral, span = (settings[i * m : (i + 1) * m] for i in range(5))
+        kp, kd, dead, neutral, span = (at.settings[i * m : (i + 1) * m] for i in range(5))
         out: list[Number] = []
         for i, joint in enumerate(self._which):
-            wanted = kp[i] * (reference[i] - q_a[joint])
-            wanted = wanted + kd[i] * (reference[m + i] - v_a[joint])
+            wanted = kp[i] * (at.reference[i] - at.q_a[joint])
+            wanted = wanted + kd[i] * (at.reference[m + i] - at.v_a[joint])
             jump = dead[i] * apply("tanh", wanted * (1.0 / _JUMP))
             out.append(neutral[i] + span[i] * (wanted + jump))
         return out
 
 
-class Sampled:
+class Sampled(Command):
     """A program of the user that sets the valves once per period, as a control unit does.
 
     Args:
@@ -290,10 +262,6 @@ class Sampled:
         machine: The machine.
         period: [s], a whole number of steps of the simulation.
     """
-
-    path: Path | None = None
-    measured = False
-    settings = np.zeros(0)
 
     def __init__(
         self,
@@ -308,25 +276,18 @@ class Sampled:
         self._joints = circuit.joints
         self._active = machine.closure.active
         self.period = as_number(period, "the period", "s", above=0)
-        self.columns = len(self._joints)
         self._held = np.array([valve.neutral for valve in circuit.valves.values()])
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """See `Command`."""
         answer = self._function(time, q[self._active].copy(), v_a.copy(), pressures)
         what = f"the signals at t = {time:g} s"
-        self._held = as_sample(answer, self.columns, what, self._joints)
+        self._held = as_sample(answer, len(self._joints), what, self._joints)
 
     def references(self, times: Array) -> Array:
         """See `Command`."""
         return np.tile(self._held, (len(times), 1))
 
-    def signals(
-        self,
-        q_a: Sequence[Number],
-        v_a: Sequence[Number],
-        settings: Sequence[Number],
-        reference: Sequence[Number],
-    ) -> list[Number]:
+    def signals(self, at: At) -> Sequence[Number]:
         """See `Command`."""
-        return list(reference)
+        return at.reference

@@ -50,7 +50,7 @@ class Dynamics:
             raise InputError(f"path '{path}' is unknown, {known(PATHS, path)}")
         if not isinstance(machine, Machine):
             raise InputError(f"{machine!r} is not a machine, load it with crane.load")
-        self.machine = machine
+        self.machine, self.formulation = machine, formulation
         self.carriers = carriers(machine, formulation)
         self.forces = JointForces(machine)
         self.path = path if machine.closure.compiled else "pinocchio"

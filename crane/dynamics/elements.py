@@ -17,6 +17,9 @@ _JUMP = 1e300  # sharpness of a sign that is not smoothed
 class JointForces:
     """Friction and passive forces of all joints of a machine, in tree coordinates.
 
+    The laws stand here in numpy and once more as formulas, `Sweep._law` of
+    `crane.dynamics.traced`, on purpose: each is what checks the other.
+
     Args:
         machine: The machine whose `friction`, `forces`, `gas_springs` and `end_stops` act.
 

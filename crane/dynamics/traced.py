@@ -24,6 +24,7 @@ from crane.dynamics.elements import JointForces
 from crane.machine import Machine
 
 BODY, JOINT = 10, 19  # numbers per body and per joint
+_UPPER = np.triu_indices(3)
 
 
 def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Array:
@@ -35,7 +36,7 @@ def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Arr
     bodies = []
     for turn, inertia in zip(geometry.turns[1:], list(machine.model.inertias)[1:], strict=True):
         tensor = turn.T @ inertia.inertia @ turn
-        bodies.append([inertia.mass, *(turn.T @ inertia.lever), *tensor[np.triu_indices(3)]])
+        bodies.append([inertia.mass, *(turn.T @ inertia.lever), *tensor[_UPPER]])
     gravity = machine.model.gravity.linear
     return np.concatenate([np.ravel(bodies), np.ravel(forces.table), gravity])
 
@@ -163,7 +164,11 @@ class Sweep:
         return out
 
     def _law(self, i: int) -> tuple[Number, Number, Number, Number]:
-        """Of joint i: passive force, friction, power taken out, energy stored."""
+        """Of joint i: passive force, friction, power taken out, energy stored.
+
+        Written apart from `JointForces`, which has the same in numpy, so that each checks the
+        other.
+        """
         (
             coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck,
             stiffness, damping, constant, slack, stop, stop_damping, lower, upper,

@@ -67,7 +67,6 @@ class Circuit:
         numbers: Of the circuit, as the formulas read them.
         stiff: Number of states that need an implicit method; the others are integrals.
         size: Number of all states.
-        form: What the formulas depend on beside the zeros and ones of the numbers.
         starts: (m,) where the states of each cylinder begin, with the pressures of A and B.
         scales: (size,) accuracy that matters in each state.
     """
@@ -90,7 +89,6 @@ class Circuit:
         ]
         self._offsets = [sum(lengths[:i]) for i in range(len(lengths) + 1)]
         self.starts = self._offsets[:-1]
-        self.form = (tuple(self._compliant), tuple(self._sluggish), self._limited, measured)
         self.stiff = self._offsets[-1] + self._limited
         self.size = self.stiff + len(BALANCES)
         modulus = hydraulics.oil.bulk_modulus

@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 
@@ -138,7 +139,7 @@ class Machine:
             if joint not in driven and not (np.isfinite(effort) and effort > 0)
         )
 
-    @property
+    @cached_property
     def reference(self) -> str:
         """What `load` takes to load it again: the bundled name, or the path."""
         known_as = self.path.stem
@@ -155,7 +156,7 @@ class Machine:
         given = {name: numbers for name, numbers in given.items() if numbers}
         return f"{self.reference}{WITH}{json.dumps(given)}" if given else self.reference
 
-    @property
+    @cached_property
     def joints(self) -> tuple[str, ...]:
         """Names of all joints of the tree, in the order of q."""
         return tuple(self.model.names)[1:]
@@ -168,7 +169,7 @@ class Machine:
         """
         if joint not in self.joints:
             raise InputError(f"joint '{joint}' is unknown, {known(self.joints, joint)}")
-        return int(self.model.joints[self.model.getJointId(joint)].idx_v)
+        return self.joints.index(joint)
 
     def unit(self, joint: str) -> str:
         """Unit of a joint's coordinate, "m" or "rad"."""
@@ -181,8 +182,8 @@ class Machine:
         Raises:
             InputError: There is no such link.
         """
-        links = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
-        if link not in links:
+        if not self.model.existFrame(link, pin.FrameType.BODY):
+            links = [f.name for f in self.model.frames if f.type == pin.FrameType.BODY]
             raise InputError(f"frame '{link}' is unknown, {known(links, link)}")
         return frame_id(self.model, link)
 

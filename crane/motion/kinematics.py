@@ -8,7 +8,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 
-from crane.closure.traced import Constants, MovingBodies, folded
+from crane.closure.traced import Bodies, Constants, Loops, MovingBodies, folded
 from crane.codegen import Number, Program, Tape, TooLongError
 from crane.codegen.scalar import add, cross, dot, scale, subtract, times
 from crane.common.errors import ClosureError, InputError, UnreachableTipError
@@ -17,6 +17,7 @@ from crane.machine import Machine
 
 _ACCURACY = 1e-11  # [m] per metre of machine
 _STRIDE = 16  # samples of a path between those that are searched for one by one
+_CHUNK = 1000  # samples of a stack at once
 _BESIDE = 0.02  # share of the strokes by which a sample may miss the curve through those
 
 
@@ -39,7 +40,7 @@ class Kinematics:
                 raise InputError(f"machine '{machine.name}' has no tip, name a frame")
             frame = machine.tip
         self.machine, self.frame = machine, frame
-        self._model, self._data = machine.model, machine.model.createData()
+        self._model = machine.model
         self._frame = machine.frame(frame)
         span = machine.upper - machine.lower
         self._scale = np.where(np.isfinite(span), span, 1.0)
@@ -69,8 +70,8 @@ class Kinematics:
             (3,) or (N, 3) [m].
         """
         q = as_samples(q, self._model.nq, "q", self.machine.joints)
-        if q.ndim == 2 and self._fast is not None:
-            return self._fast.rows(q)[:, :3]
+        if q.ndim == 2 and self._points is not None:
+            return self._points.rows(q)
         return per_sample(self.position_at, q)
 
     def position_at(self, q: Array) -> Array:
@@ -159,10 +160,22 @@ class Kinematics:
         return out
 
     @cached_property
+    def _data(self) -> pin.Data:
+        return self._model.createData()
+
+    @cached_property
     def _fast(self) -> "_FastFrame | None":
         """Machine code for stacks; None where the machine is too large for it."""
         try:
             return _FastFrame(self.machine, self._frame)
+        except TooLongError:
+            return None
+
+    @cached_property
+    def _points(self) -> "_FastPoint | None":
+        """The same of the position alone."""
+        try:
+            return _FastPoint(self.machine, self._frame)
         except TooLongError:
             return None
 
@@ -304,8 +317,8 @@ class Kinematics:
         return distance, q
 
 
-class _FastFrame:
-    """Position, reduced Jacobian and bias of a frame as machine code.
+class _FastPoint:
+    """Position of a frame as machine code.
 
     Args:
         machine: The machine.
@@ -321,28 +334,61 @@ class _FastFrame:
         self._body = placed.parentJoint
         self._place = fast.geometry.turns[self._body].T @ placed.placement.translation
         self._n = len(machine.active)
-        key = ("frame", self._body, folded(self._place))
+        key = (type(self), self._body, folded(self._place))
         if key not in fast.programs:
             fast.programs[key] = self._compile(machine.model.nq)
         self._program = fast.programs[key]
 
     def rows(self, q: Array, v_a: Array | None = None) -> Array:
-        """Rows [x (3), J gamma (3 n), bias (3)] at postures (N, nq) and velocities (N, n)."""
-        v_a = np.zeros((len(q), self._n)) if v_a is None else np.ascontiguousarray(v_a)
+        """Rows of `_outputs` at postures (N, nq) and velocities (N, n), zero if not given."""
+        v_a = np.zeros((len(q), self._n)) if v_a is None else v_a
         out = np.empty((len(q), self._program.outputs("formula").size))
-        arrays = (self._closure.geometry.numbers, self._place, np.ascontiguousarray(q), v_a, out)
-        self._program.call("rows", len(q), *arrays)
+        constants = self._closure.geometry.numbers, self._place
+        for i in range(0, len(q), _CHUNK):  # what has to be copied stays in the cache
+            few = (np.ascontiguousarray(x[i : i + _CHUNK]) for x in (q, v_a, out))
+            self._program.call("rows", min(_CHUNK, len(q) - i), *constants, *few)
         return out
 
-    def _compile(self, nq: int) -> Program:
-        tape, n, body = Tape(), self._n, self._body
+    def _outputs(self, tape: Tape) -> list[Number]:
+        """What a row holds: x (3)."""
+        posture, _, point = self._placed(tape)
+        return self._in_world(posture, subtract(point, posture.origin[0]))
+
+    def _placed(self, tape: Tape) -> tuple[Bodies, Loops, list[Number]]:
+        """Bodies, loops and the frame's place, seen from the trunk."""
         _, posture, loops = self._closure.trace(tape, 0, 2)
+        place = Constants(tape, 1, self._place).vector(0)
+        point = add(posture.origin[self._body], times(posture.rotation[self._body], place))
+        return posture, loops, point
+
+    def _in_world(self, posture: Bodies, vector: list[Number]) -> list[Number]:
+        """A vector seen from the trunk, in the world's directions."""
+        return times([list(axis) for axis in zip(*posture.rotation[0], strict=True)], vector)
+
+    def _compile(self, nq: int) -> Program:
+        program, n = Program(), self._n
+        size = program.add("formula", 4, self._outputs(Tape())).size
+        arrays = ("geometry", "place", "q", "v", "out")
+        with program.routine("rows", counts=("count",), arrays=arrays) as r:
+            with r.loop(r.count) as i:
+                rows = r.q.row(i, nq), r.v.row(i, n), r.out.row(i, size)
+                r.call("formula", r.geometry, r.place, *rows)
+            r.give(r.count)
+        program.compile()
+        return program
+
+
+class _FastFrame(_FastPoint):
+    """Position, reduced Jacobian and bias of a frame as machine code."""
+
+    def _outputs(self, tape: Tape) -> list[Number]:
+        """What a row holds: x (3), J gamma (3 n), bias (3)."""
+        n, body = self._n, self._body
+        posture, loops, point = self._placed(tape)
         v_a, parents = tape.loads(3, 0, n), posture.geometry.parents
         rates: list[Number] = [0.0]
         rates += [dot(loops.gamma[i], v_a) for i in range(1, len(parents))]
         motion = MovingBodies(posture, loops, rates, [0.0] * 3, parents)
-        place = Constants(tape, 1, self._place).vector(0)
-        point = add(posture.origin[body], times(posture.rotation[body], place))
         columns: list[list[Number]] = [[0.0] * 3 for _ in range(n)]
         (v, w), (a, e) = motion.velocity[body], motion.acceleration[body]
         i = body
@@ -357,17 +403,7 @@ class _FastFrame:
             e = add(e, scale(motion.drift[i], angular))
             i = parents[i]
         bend = add(a, cross(e, point), cross(w, add(v, cross(w, point))))
-        world = [list(axis) for axis in zip(*posture.rotation[0], strict=True)]
-        jacobian = [times(world, column) for column in columns]
-        outputs = times(world, subtract(point, posture.origin[0]))
+        jacobian = [self._in_world(posture, column) for column in columns]
+        outputs = self._in_world(posture, subtract(point, posture.origin[0]))
         outputs += [column[row] for row in range(3) for column in jacobian]
-        program = Program()
-        size = program.add("formula", 4, [*outputs, *times(world, bend)]).size
-        arrays = ("geometry", "place", "q", "v", "out")
-        with program.routine("rows", counts=("count",), arrays=arrays) as r:
-            with r.loop(r.count) as i:
-                rows = r.q.row(i, nq), r.v.row(i, n), r.out.row(i, size)
-                r.call("formula", r.geometry, r.place, *rows)
-            r.give(r.count)
-        program.compile()
-        return program
+        return [*outputs, *self._in_world(posture, bend)]

@@ -36,6 +36,27 @@ class Path:
         """Coordinates alone, (n,) or (N, n) at times () or (N,) [s]."""
         return np.asarray(self._curves[0](np.clip(time, 0.0, self.duration)))
 
+    def velocity(self, time: ArrayLike) -> Array:
+        """Velocities alone, likewise."""
+        return self._rate(1, time)
+
+    def _rate(self, order: int, time: ArrayLike) -> Array:
+        """A derivative; zero before and after the path, where it stands still."""
+        inside = np.clip(time, 0.0, self.duration)
+        rate: Array = np.asarray(self._curves[order](inside))
+        rate[inside != time] = 0.0
+        return rate
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Two vectors (n,) between which the coordinates stay, which may be farther apart.
+
+        A polynomial sum a_i u^i is no farther than sum |a_i| h^i, i > 0, from a_0 in 0 <= u <= h.
+        """
+        curve = self._curves[0]
+        powers = np.vander(np.diff(curve.x), len(curve.c))[:, :-1]
+        reach = np.einsum("imj,mi->mj", np.abs(curve.c[:-1]), powers)
+        return (curve.c[-1] - reach).min(axis=0), (curve.c[-1] + reach).max(axis=0)
+
     def turns(self) -> Array:
         """Times (k,) [s] at which a coordinate may be largest or least: knots, and rests."""
         curve, rate = self._curves[:2]
@@ -52,13 +73,7 @@ class Path:
         Returns:
             Three arrays (n,) or (N, n).
         """
-        time = np.asarray(time, dtype=np.float64)
-        inside = (time >= 0) & (time <= self.duration)
-        position, velocity, acceleration = (
-            np.asarray(curve(np.clip(time, 0.0, self.duration))) for curve in self._curves
-        )
-        moving = inside[..., None]
-        return position, np.where(moving, velocity, 0.0), np.where(moving, acceleration, 0.0)
+        return self.position(time), self._rate(1, time), self._rate(2, time)
 
 
 def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Path:
@@ -196,10 +211,13 @@ def beyond_limits(machine: Machine, path: Path, until: float = np.inf) -> str:
         path: Reference of its active joints.
         until: End of what is looked at [s].
     """
+    least, most = path.bounds()
+    if least.shape != machine.lower.shape:
+        return ""  # of another machine, which is told elsewhere
+    if (np.maximum(machine.lower - least, most - machine.upper) <= LIMIT_SLACK).all():
+        return ""  # without a look where it turns
     times = np.unique(np.minimum(path.turns(), until))
     q_a = path.position(times)
-    if q_a.shape[1:] != machine.lower.shape:
-        return ""  # of another machine, which is told elsewhere
     excess = np.maximum(machine.lower - q_a, q_a - machine.upper)
     if not (excess > LIMIT_SLACK).any():
         return ""

@@ -19,7 +19,7 @@ displacements and forces, crane.recordings.measured turns into them.
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +42,8 @@ class Recording:
     """Samples of N instants of a machine with n active joints.
 
     The arrays are copied to contiguous float64 and checked: shapes, finite numbers, time
-    strictly increasing. Treat them as constants.
+    strictly increasing. Treat them as constants. With `copy=False`, for arrays that nobody else
+    will change, those that are contiguous float64 already are kept.
 
     Attributes:
         time: Instants (N,) [s], N >= 1.
@@ -69,8 +70,9 @@ class Recording:
     machine: str = ""
     task: str = ""
     controller: str = ""
+    copy: InitVar[bool] = True
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, copy: bool) -> None:
         joints = tuple(self.joints)
         count = np.size(self.time)
         shape = (count, len(joints))
@@ -82,12 +84,12 @@ class Recording:
         checked = {
             "joints": joints,
             "units": {x: self.units[x] for x in joints},
-            "time": _array(TIME, self.time, (count,)),
-            "q": _array("q", self.q, shape, joints),
-            "v": _array("v", self.v, shape, joints),
-            "tau": _array("tau", self.tau, shape, joints),
+            "time": _array(TIME, self.time, (count,), copy),
+            "q": _array("q", self.q, shape, copy, joints),
+            "v": _array("v", self.v, shape, copy, joints),
+            "tau": _array("tau", self.tau, shape, copy, joints),
             "channels": {
-                name: _array(f"channel '{name}'", values, (count,))
+                name: _array(f"channel '{name}'", values, (count,), copy)
                 for name, values in self.channels.items()
             },
             "channel_units": {name: self.channel_units.get(name, "") for name in self.channels},
@@ -261,11 +263,11 @@ def check_finite(columns: Mapping[str, Array]) -> None:
 
 
 def _array(
-    what: str, value: ArrayLike, shape: tuple[int, ...], names: Sequence[str] = ()
+    what: str, value: ArrayLike, shape: tuple[int, ...], copy: bool, names: Sequence[str] = ()
 ) -> Array:
-    """A float64 copy of that shape."""
+    """A contiguous float64 array of that shape, a copy where asked for or needed."""
     try:
-        array = np.array(value, dtype=np.float64, order="C")
+        array = np.array(value, dtype=np.float64, order="C", copy=copy or None)
     except (TypeError, ValueError):
         raise RecordingError(f"{what} is not an array of numbers, give {shape}") from None
     if array.shape != shape:

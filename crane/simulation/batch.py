@@ -1,8 +1,8 @@
 """Many simulations at once: variants of a machine, initial states, payloads."""
 
 import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +13,14 @@ from crane.common.samples import Array, Brief
 from crane.control import Controller
 from crane.dynamics import Dynamics
 from crane.machine import Machine
-from crane.motion.trajectories import beyond_limits
 from crane.simulation.recorded import imbalance
-from crane.simulation.run import Progress, trajectory
+from crane.simulation.run import (
+    Progress,
+    as_controller,
+    count_steps,
+    reference_beyond,
+    trajectory,
+)
 
 _Result = tuple[Array, Array, Array, Array, Array, str]
 
@@ -92,12 +97,11 @@ def simulate_batch(
 
     def run(i: int) -> _Result:
         machine = machines[i]
-        control = None if controller is None else controller(machine)
-        path = getattr(control, "path", None)
-        if path is not None:
-            text = beyond_limits(machine, path, np.inf if duration is None else duration)
-            beyond.update({i: text} if text else {})
-        time, rows = trajectory(Dynamics(machine), control, starts[i], duration, step)
+        control = as_controller(None if controller is None else controller(machine), machine)
+        steps = count_steps(control, duration, step)
+        if text := reference_beyond(machine, control, steps * step):
+            beyond[i] = text
+        time, rows = trajectory(Dynamics(machine), control, starts[i], steps, step)
         energy = np.hstack([rows.kinetic, rows.potential, rows.work, rows.lost])
         q_a = rows.q[:, machine.closure.active]
         return time, q_a, rows.v_a, rows.tau, energy, imbalance(rows, step)
@@ -108,18 +112,27 @@ def simulate_batch(
     waiting = list(range(len(machines)))
     workers = threads or os.cpu_count() or 1
     with ThreadPoolExecutor(workers) as pool:
-        for group in (waiting[:1], waiting[1:]):
-            futures = {pool.submit(run, i): i for i in group}
-            for future in as_completed(futures):
-                try:
-                    results[futures[future]] = future.result()
-                except CraneError as error:
-                    failures[futures[future]] = str(error)
-                if progress is not None:
-                    progress((len(results) + len(failures)) / len(machines))
+        for i, future in _finished(pool, run, (waiting[:1], waiting[1:])):
+            error = future.exception()
+            if isinstance(error, CraneError):
+                failures[i] = str(error)
+            else:
+                results[i] = future.result()
+            if progress is not None:
+                progress((len(results) + len(failures)) / len(machines))
     if not results:
         raise InputError(f"all {len(machines)} simulations failed, the first: {failures[0]}")
     return _stack(results, failures, beyond, len(machines))
+
+
+def _finished(
+    pool: ThreadPoolExecutor, run: Callable[[int], _Result], groups: Sequence[Sequence[int]]
+) -> Iterator[tuple[int, Future[_Result]]]:
+    """Every run as it is finished, one group after the other."""
+    for group in groups:
+        futures = {pool.submit(run, i): i for i in group}
+        for future in as_completed(futures):
+            yield futures[future], future
 
 
 def _stack(

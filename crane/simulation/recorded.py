@@ -1,17 +1,21 @@
 """What a simulation leaves: a recording with channels, and what is to be said of its energy."""
 
 import warnings
+from collections.abc import Iterator
 
 import numpy as np
 
 from crane.codegen import Parts
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
-from crane.control import Controller, Free, Signals, StiffController, ValveDrive
+from crane.control import Controller, Free, Signals, ValveDrive, path_of
 from crane.hydraulics.circuit import BALANCES
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
+from crane.motion.trajectories import Path
 from crane.recordings.recording import Recording
+
+Column = tuple[str, Array, str]  # name, values, unit
 
 _IMBALANCE = 5e-3  # share of the energy that went through
 
@@ -28,41 +32,12 @@ def recorded(
         rows: See `trajectory`.
         task: Name to put into it.
     """
-    path = control.path
     q_a = rows.q[:, machine.closure.active]
     _warn_of_limits(machine, time, q_a)
     channels: dict[str, Array] = {}
     units: dict[str, str] = {}
-
-    def add(name: str, values: Array, unit: str) -> None:
+    for name, values, unit in _channels(machine, control, time, rows):
         channels[name], units[name] = values, unit
-
-    for column in machine.closure.passive:
-        joint = machine.joints[column]
-        add(joint, rows.q[:, column], machine.unit(joint))
-    if machine.tip is not None:
-        for axis, values in zip("xyz", Kinematics(machine).positions(rows.q).T, strict=True):
-            add(f"tip_{axis}", values, "m")
-    if path is not None:
-        reference, reference_rate, _ = path(time)
-        for i, joint in enumerate(machine.active):
-            add(f"reference_{joint}", reference[:, i], machine.unit(joint))
-            rate_unit = machine.unit(joint) + "/s"
-            add(f"reference_velocity_{joint}", reference_rate[:, i], rate_unit)
-        if path.tip is not None:
-            for axis, values in zip("xyz", path.tip(time)[0].T, strict=True):
-                add(f"reference_tip_{axis}", values, "m")
-    for i, joint in enumerate(machine.active):
-        add(f"friction_{joint}", rows.friction[:, i], "N" if machine.unit(joint) == "m" else "N m")
-    names = {"kinetic": "kinetic", "potential": "potential", "work": "work", "dissipated": "lost"}
-    for name, part in names.items():
-        add(name, getattr(rows, part)[:, 0], "J")
-    if isinstance(control, StiffController):
-        for (name, unit), values in zip(control.channels, rows.channels.T, strict=True):
-            add(name, values, unit)
-        integrals = rows.own[:, -len(BALANCES) :]
-        for (name, unit), values in zip(BALANCES.items(), integrals.T, strict=True):
-            add(name, values, unit)
     return Recording(
         time=time,
         joints=machine.active,
@@ -75,7 +50,51 @@ def recorded(
         machine=machine.call,
         task=task,
         controller=_name_of(control),
+        copy=False,
     )
+
+
+def _channels(machine: Machine, control: Controller, time: Array, rows: Parts) -> Iterator[Column]:
+    """What is recorded beside the active joints."""
+    for column in machine.closure.passive:
+        joint = machine.joints[column]
+        yield joint, rows.q[:, column], machine.unit(joint)
+    if machine.tip is not None:
+        yield from _point("tip", Kinematics(machine).positions(rows.q))
+    path = path_of(control)
+    if path is not None:
+        yield from _references(machine, path, time)
+    for i, joint in enumerate(machine.active):
+        yield (
+            f"friction_{joint}",
+            rows.friction[:, i],
+            "N" if machine.unit(joint) == "m" else "N m",
+        )
+    names = {"kinetic": "kinetic", "potential": "potential", "work": "work", "dissipated": "lost"}
+    for name, part in names.items():
+        yield name, getattr(rows, part)[:, 0], "J"
+    if isinstance(control, ValveDrive):
+        integrals = rows.own[:, -len(BALANCES) :]
+        units = [*control.channels, *BALANCES.items()]
+        for (name, unit), values in zip(units, [*rows.channels.T, *integrals.T], strict=True):
+            yield name, values, unit
+
+
+def _references(machine: Machine, path: Path, time: Array) -> Iterator[Column]:
+    """What a path asks of the joints, and of the tip where it was given there."""
+    q, v = path.position(time), path.velocity(time)
+    for i, joint in enumerate(machine.active):
+        unit = machine.unit(joint)
+        yield f"reference_{joint}", q[:, i], unit
+        yield f"reference_velocity_{joint}", v[:, i], unit + "/s"
+    if path.tip is not None:
+        yield from _point("reference_tip", path.tip.position(time))
+
+
+def _point(name: str, positions: Array) -> Iterator[Column]:
+    """Positions (N, 3) [m] by axis."""
+    for axis, values in zip("xyz", positions.T, strict=True):
+        yield f"{name}_{axis}", values, "m"
 
 
 def _name_of(control: Controller) -> str:

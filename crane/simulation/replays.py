@@ -1,6 +1,7 @@
 """Measured valve signals put through the model, and what comes out beside what was measured."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -187,22 +188,36 @@ def _prepare(
     time = time - time[0]
     if len(time) < 2:
         raise RecordingError("has one sample, give at least two")
-    signals = {}
-    for name in table.units:
-        if name.startswith(_SIGNAL):
-            joint = name.removeprefix(_SIGNAL)
-            if joint in machine.locks:
-                continue  # the valve of a joint that is held moves nothing
-            if joint not in joints:
-                raise RecordingError(f"column '{name}' is of no valve, {known(joints, joint)}")
-            signals[joint] = column(table, name, "V")
-    if not signals:
-        names = ", ".join(f"'{_SIGNAL}{joint} [V]'" for joint in joints)
-        raise RecordingError(f"no signal of a valve, give at least one of {names}")
+    signals = _signals(machine, joints, table)
     check_pressures(machine, table)
     supply, tank = (
         column(table, name, "Pa") if name in table.units else None for name in (_SUPPLY, _TANK)
     )
+    pressures = _pressures(joints, table)
+    drive = ValveDrive(machine, Signals(machine, time, signals, supply, tank), pressures)
+    if not any(joint in table.units for joint in machine.joints):
+        return time, drive, None
+    return time, drive, _initial(machine, table, time, list(signals.values()))
+
+
+def _signals(machine: Machine, joints: Sequence[str], table: Table) -> dict[str, Array]:
+    """Of the valves that were moved, by joint [V]."""
+    signals = {}
+    for name in (name for name in table.units if name.startswith(_SIGNAL)):
+        joint = name.removeprefix(_SIGNAL)
+        if joint in machine.locks:
+            continue  # the valve of a joint that is held moves nothing
+        if joint not in joints:
+            raise RecordingError(f"column '{name}' is of no valve, {known(joints, joint)}")
+        signals[joint] = column(table, name, "V")
+    if not signals:
+        names = ", ".join(f"'{_SIGNAL}{joint} [V]'" for joint in joints)
+        raise RecordingError(f"no signal of a valve, give at least one of {names}")
+    return signals
+
+
+def _pressures(joints: Sequence[str], table: Table) -> dict[str, tuple[float, float]]:
+    """Of A and B at the first sample, by joint [Pa]."""
     pressures: dict[str, tuple[float, float]] = {}
     for joint in joints:
         pair = [f"pressure_{joint}_{side}" for side in "ab"]
@@ -213,21 +228,24 @@ def _prepare(
         if there:
             a, b = (float(column(table, name)[0]) for name in pair)
             pressures[joint] = a, b
-    drive = ValveDrive(machine, Signals(machine, time, signals, supply, tank), pressures)
-    initial = None
-    if any(joint in table.units for joint in machine.joints):
-        for text in moved_locks(machine, _columns(table), table.units):
-            raise RecordingError(f"{text}, do not lock it, or lock it where it is")
-        tell_disagreement(machine, table)
-        q_a, v_a = motion_of(machine, table)
-        _warn_of_limits(machine, time, q_a)
-        steady = time <= _steady(time, list(signals.values()))
-        states = []
-        for i, joint in enumerate(machine.active):
-            rates = joint + VELOCITY in table.units or joint not in table.units
-            states.append(_start(time, q_a[:, i], v_a[:, i] if rates else None, steady))
-        initial = np.array([x for x, _ in states]), np.array([v for _, v in states])
-    return time, drive, initial
+    return pressures
+
+
+def _initial(
+    machine: Machine, table: Table, time: Array, signals: list[Array]
+) -> tuple[Array, Array]:
+    """Active coordinates and velocities at the start."""
+    for text in moved_locks(machine, _columns(table), table.units):
+        raise RecordingError(f"{text}, do not lock it, or lock it where it is")
+    tell_disagreement(machine, table)
+    q_a, v_a = motion_of(machine, table)
+    _warn_of_limits(machine, time, q_a)
+    steady = time <= _steady(time, signals)
+    states = []
+    for i, joint in enumerate(machine.active):
+        rates = joint + VELOCITY in table.units or joint not in table.units
+        states.append(_start(time, q_a[:, i], v_a[:, i] if rates else None, steady))
+    return np.array([x for x, _ in states]), np.array([v for _, v in states])
 
 
 def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
@@ -244,7 +262,7 @@ def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
                 f"measured '{joint}' goes to {q_a[k, i]:.6g} {unit} at t = {time[k]:.4g} s, "
                 f"beyond its limit {limit:.6g} {unit}: look at the limits and the sensor's zero",
                 CraneWarning,
-                stacklevel=4,
+                stacklevel=5,
             )
 
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from crane.codegen import Parts, TooLongError
 from crane.common.errors import ClosureError, CraneWarning, InputError, SimulationError, known
 from crane.common.samples import Array, as_number, as_sample
-from crane.control import Command, Controller, Feedback, Free, Signals, StiffController, ValveDrive
+from crane.control import Command, Controller, Feedback, Free, Law, Signals, ValveDrive, path_of
 from crane.dynamics import Dynamics
 from crane.machine import Machine
 from crane.motion.trajectories import Path, beyond_limits
@@ -86,13 +86,12 @@ def simulate(
     """
     if not (isinstance(task, str) and task.isprintable()):
         raise InputError(f"task {task!r} is not one line of text")
-    control = _as_controller(controller, machine)
-    if control.path is not None:
-        until = np.inf if duration is None else as_number(duration, "the duration", "s", above=0)
-        if text := beyond_limits(machine, control.path, until):
-            warnings.warn(text, CraneWarning, stacklevel=2)
+    control = as_controller(controller, machine)
+    steps = count_steps(control, duration, step)
+    if text := reference_beyond(machine, control, steps * step):
+        warnings.warn(text, CraneWarning, stacklevel=2)
     dynamics = Dynamics(machine, formulation, path)
-    time, rows = trajectory(dynamics, control, initial, duration, step, method, progress)
+    time, rows = trajectory(dynamics, control, initial, steps, step, method, progress)
     # the energies are integrated with the motion, so they tell when the step is too long
     text = imbalance(rows, step)
     if text and formulation == "exact":
@@ -102,34 +101,39 @@ def simulate(
 
 def trajectory(
     dynamics: Dynamics,
-    controller: Controller | Command | Force | None,
+    control: Controller,
     initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None,
-    duration: float | None,
+    steps: int,
     step: float,
     method: str | None = None,
     progress: Progress | None = None,
 ) -> tuple[Array, Parts]:
     """What `simulate` computes, without channels; see there for arguments and errors.
 
+    Args:
+        dynamics: The machine.
+        control: See `as_controller`.
+        initial: See `simulate`.
+        steps: See `count_steps`.
+        step: [s].
+        method: See `simulate`.
+        progress: See `simulate`.
+
     Returns:
         Times (N,), and what `crane.simulation.integration.row_layout` names, (N, .) each.
     """
-    machine = dynamics.machine
-    control = _as_controller(controller, machine)
-    if duration is None:
-        if control.path is None:
-            raise InputError("no duration and no path to take it from, give a duration")
-        duration = control.path.duration
-    steps = _count(duration, step)
-    q_a, v_a = _start(machine, initial, control.path)
+    machine, path = dynamics.machine, path_of(control)
+    q_a, v_a = _start(machine, initial, path)
     try:
-        posture, own = machine.closure.solve(q_a), control.start(q_a)
+        posture = machine.closure.solve(q_a)
+        own = _own_start(control, dynamics, posture)
     except ClosureError as error:
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
     state = np.concatenate([posture, v_a, own, np.zeros(_ENERGIES)])
     integration = _integration(dynamics, control, len(own), method)
     layout = row_layout(machine, control, len(own))
-    times, rows = step * np.arange(steps + 1, dtype=np.float64), np.empty((steps + 1, layout.size))
+    times = step * np.arange(steps + 1, dtype=np.float64)
+    rows = np.empty((steps + 1, layout.size), order="F")  # recorded by columns, without a copy
 
     def report(done: int) -> None:
         if progress is not None:
@@ -137,46 +141,60 @@ def trajectory(
 
     try:
         integration.run(times[:-1], state, step, rows, report)
-        rows[-1] = [*state, *integration.slow.observe(times[-1], state)[1]]
+        rows[-1] = integration.last(times[-1], state)
     except HaltedError as halt:
         finer, done = integration.finer(times[:-1], rows, step), integration.done
         q_a = layout.view(rows[:done]).q[:, machine.closure.active]
-        raise explained(machine, halt, times[:done], q_a, control.path, finer) from None
+        raise explained(machine, halt, times[:done], q_a, path, finer) from None
     if progress is not None:
         progress(1.0)
     return times, layout.view(rows)
+
+
+def _own_start(control: Controller, dynamics: Dynamics, q: Array) -> Array:
+    """The controller's states at a closed posture; laws look at the machine as it is there."""
+    if isinstance(control, Law) and dynamics.formulation == "exact":
+        return control.start_at(dynamics, q)
+    return control.start(q[dynamics.machine.closure.active])
 
 
 def _integration(
     dynamics: Dynamics, control: Controller, own: int, method: str | None
 ) -> Steps | StiffSteps | AdaptiveSteps:
     """What integrates by a method, or by that which the controller asks for."""
-    stiff = isinstance(control, StiffController)
-    if method is None:
-        method = "rosenbrock" if stiff else "rk4"
-    if method == "rosenbrock" and isinstance(control, StiffController):
-        if dynamics.path == "compiled":
-            with suppress(TooLongError):
-                return StiffSteps(dynamics, control)
-        if control.period:
-            raise InputError("a program with a period runs on the compiled path alone")
-        return AdaptiveSteps(dynamics, control, own, "BDF")
-    if isinstance(control, StiffController) and control.period:
+    if isinstance(control, ValveDrive) and method in (None, "rosenbrock"):
+        return _stiff(dynamics, control, own)
+    if isinstance(control, ValveDrive) and control.period:
         raise InputError(
             f"method '{method}' does not call the valves' program, leave the method out"
         )
-    if method == "rk4":
+    if method in (None, "rk4"):
         return Steps(dynamics, control, own)
     if method in ADAPTIVE:
         return AdaptiveSteps(dynamics, control, own, method)
     raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")
 
 
-def _as_controller(
-    controller: Controller | Command | Force | None, machine: Machine
-) -> Controller:
+def _stiff(dynamics: Dynamics, control: ValveDrive, own: int) -> StiffSteps | AdaptiveSteps:
+    """What integrates a circuit: machine code, or scipy where there is none."""
+    if dynamics.path == "compiled":
+        with suppress(TooLongError):
+            return StiffSteps(dynamics, control)
+    if control.period:
+        raise InputError("a program with a period runs on the compiled path alone")
+    return AdaptiveSteps(dynamics, control, own, "BDF")
+
+
+def as_controller(controller: Controller | Command | Force | None, machine: Machine) -> Controller:
+    """What drives a machine, from what `simulate` takes.
+
+    Raises:
+        InputError: It is none of that, or the machine is no machine.
+    """
     if not isinstance(machine, Machine):
         raise InputError(f"{machine!r} is not a machine, load it with crane.load")
+    if isinstance(controller, Law):
+        return controller
     if controller is None:
         if machine.hydraulics is not None:
             neutral = Signals(machine, [0.0], {})
@@ -195,7 +213,17 @@ def _as_controller(
     return Feedback(controller, machine)
 
 
-def _count(duration: float, step: float) -> int:
+def count_steps(control: Controller, duration: float | None, step: float) -> int:
+    """Steps [s] in a duration [s], that of the controller's path if not given.
+
+    Raises:
+        InputError: There is no duration, there are too many steps, or no whole number of them.
+    """
+    if duration is None:
+        path = path_of(control)
+        if path is None:
+            raise InputError("no duration and no path to take it from, give a duration")
+        duration = path.duration
     duration = as_number(duration, "the duration", "s", above=0)
     step = as_number(step, "the step", "s", above=0)
     if duration / step > _MOST:
@@ -211,13 +239,19 @@ def _count(duration: float, step: float) -> int:
     return steps
 
 
+def reference_beyond(machine: Machine, control: Controller, until: float) -> str:
+    """What to say of a reference that leaves the limits before a time [s], else nothing."""
+    path = path_of(control)
+    return "" if path is None else beyond_limits(machine, path, until)
+
+
 def _start(
     machine: Machine, initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None, path: Path | None
 ) -> tuple[Array, Array]:
     size, rest = len(machine.active), np.zeros(len(machine.active))
     if initial is None:
         if path is not None:
-            return machine.check_limits(path(0.0)[0], "the start of the path"), rest
+            return machine.check_limits(path.position(0.0), "the start of the path"), rest
         return np.array(machine.home[machine.closure.active]), rest
     if isinstance(initial, tuple) and len(initial) == 2 and np.ndim(initial[0]) == 1:
         q_a = machine.check_limits(initial[0], "initial q_a")

@@ -11,7 +11,7 @@ import crane
 from crane.codegen.scalar import apply
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
-from crane.control import PI, Traced
+from crane.control import PI, At
 from forwarder.paper import (
     CRUISE,
     DURATION,
@@ -56,15 +56,10 @@ class Pushed(PI):
         """F_F, (3,) or (N, 3)."""
         return friction_as_printed(v_a, np.tanh(v_a / self._smoothing))
 
-    def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
+    def law(self, at: At) -> tuple[list, list]:
         """See `PI`."""
-        tau, rate = super().__call__(time, q_a, v_a, state)
-        return tau - self.push(v_a), rate
-
-    def trace(self, at: Traced) -> tuple[list, list]:
-        """See `PI`."""
-        n = self.columns
-        tau, rate = super().trace(at._replace(settings=at.settings[: 2 * n]))
+        n = len(at.q_a)
+        tau, rate = super().law(at)
         table, sharpness = at.settings[2 * n : 6 * n], at.settings[6 * n :]
         out = []
         for i, (force, v) in enumerate(zip(tau, at.v_a, strict=True)):

@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from crane.common.errors import (
     known,
 )
 from crane.common.samples import Array, as_number, as_seed
-from crane.control import PI, Traced
+from crane.control import PI, At, Law
 from crane.dynamics import Dynamics
 from crane.formats import load
 from crane.machine import Machine
@@ -203,7 +203,7 @@ class Rig:
         noise = noise * [s.noise for s in sensors]
         plant, dynamics = self.plant, Dynamics(self.plant)
         n, nq, active = len(plant.active), plant.model.nq, plant.closure.active
-        held, substeps = _Held(n), _substeps(dynamics, reference, step)
+        held, substeps = _Held(plant), _substeps(dynamics, reference, step)
         h, steps = step / substeps, Steps(dynamics, held, 0)
         state = np.concatenate([plant.closure.solve(reference[0]), np.zeros(n + 2)])
         now = steps.slow.layout.view(state)
@@ -239,26 +239,15 @@ class Rig:
         return current, tau
 
 
-class _Held:
-    """Forces that hold until they are set again, as a `TracedController`."""
+class _Held(Law):
+    """Forces that hold until they are set again."""
 
-    path: Path | None = None
-    columns = 0
+    def __init__(self, machine: Machine):
+        super().__init__(machine)
+        self.settings = np.zeros(len(machine.active))
 
-    def __init__(self, count: int):
-        self.settings = np.zeros(count)
-
-    def start(self, q_a: Array) -> Array:
-        return np.zeros(0)
-
-    def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
-        return self.settings, state
-
-    def references(self, times: Array) -> Array:
-        return np.zeros((len(times), 0))
-
-    def trace(self, at: Traced) -> tuple[list[Number], list[Number]]:
-        return at.settings, at.state
+    def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
+        return at.settings, ()
 
 
 def _velocity(q: Array, step: float) -> Array:

@@ -2,16 +2,18 @@
 
 import numpy as np
 
-from crane.closure.traced import Constants, folded
+from crane.closure.traced import folded
 from crane.codegen import Expression, Number, Program, Tape, largest, maximum, select
 from crane.codegen.derivative import derivatives
 from crane.codegen.factors import eliminated, loaded, stored, substituted
 from crane.codegen.scalar import add, apply, dot, minimum, scale, subtract, times
 from crane.common.samples import Array
-from crane.control import StiffController, Traced
+from crane.control import At, ValveDrive
 from crane.dynamics import Dynamics
 from crane.dynamics.traced import Sweep
+from crane.simulation.integration.blocks import in_blocks
 from crane.simulation.integration.state import seen_layout, state_layout
+from crane.simulation.integration.traced import columns_of, form_of, machine_at, settings_of
 
 # ROS34PW2 of Rang and Angermann (2005): order 3 with any Jacobian, L-stable, stiffly accurate,
 # with an embedded method of order 2.
@@ -60,22 +62,16 @@ class StiffStepper:
         TooLongError: It would take too long to compile.
     """
 
-    def __init__(self, dynamics: Dynamics, control: StiffController):
+    def __init__(self, dynamics: Dynamics, control: ValveDrive):
         machine = dynamics.machine
         self._fast, self._numbers = machine.closure.fast, dynamics.numbers
-        self._carriers, self._control = dynamics.carriers, control
+        self._dynamics, self._control = dynamics, control
+        self._columns = columns_of(control)
         self._state = state_layout(machine, len(control.scales))
         self._seen = seen_layout(machine, control)
         self._stiff = int(np.isfinite(control.scales).sum())
-        key = (
-            "stiff",
-            type(control),
-            control.columns,
-            folded(control.settings),
-            control.form,
-            folded(self._numbers),
-            dynamics.carriers,
-        )
+        form = form_of(control, self._columns, len(machine.active), len(control.scales), fold=True)
+        key = ("stiff", form, self._stiff, folded(self._numbers), dynamics.carriers)
         if key not in self._fast.programs:
             self._fast.programs[key] = self._compile()
         self._program = self._fast.programs[key]
@@ -88,35 +84,43 @@ class StiffStepper:
         )
         self._lengths = np.zeros(2)
 
-    def run(self, times: Array, state: Array, step: float, out: Array) -> int:
+    def run(self, times: Array, state: Array, step: float, rows: Array) -> int:
         """See `CompiledStepper.run`."""
-        halves = times[0] + 0.5 * step * np.arange(2 * len(times) + 1)
-        references = np.ascontiguousarray(self._control.references(halves))
+        machine = self._fast.geometry.numbers, self._numbers
         settings = np.ascontiguousarray(self._control.settings)
         if self._lengths[0] != step:
             self._lengths[:] = step, 0.01 * step
-        return self._program.call(
-            "run", len(times), self._fast.close_address, self._fast.geometry.numbers,
-            self._numbers, settings, references, state, out, self._lengths, self._fast.bounds,
-            self._scales,
-        )  # fmt: skip
 
-    def _trace(self, tape: Tape, state: int, theta: int | None) -> tuple[Sweep, Traced]:
+        def call(count: int, references: Array, out: Array) -> int:
+            return self._program.call(
+                "run", count, self._fast.close_address, *machine, settings, references, state,
+                out, self._lengths, self._fast.bounds, self._scales,
+            )  # fmt: skip
+
+        return in_blocks(call, self._control, times, step, rows)
+
+    def observe(self, time: float, state: Array) -> Array:
+        """See `CompiledStepper.observe`."""
+        settings = np.ascontiguousarray(self._control.settings)
+        reference = np.ascontiguousarray(self._control.references(np.array([time])))
+        seen = np.empty(self._seen.size)
+        machine = self._fast.geometry.numbers, self._numbers
+        self._program.call("observe", *machine, settings, reference, state, seen)
+        return seen
+
+    def _trace(self, tape: Tape, state: int, theta: int | None) -> tuple[Sweep, At]:
         """The machine at a state, its references between three rows or in one."""
-        control = self._control
-        q, posture, loops = self._fast.trace(tape, 0, state)
-        parts = self._state.view(tape.loads(state, 0, self._state.size))
-        constants = Constants(tape, 1, self._numbers)
-        sweep = Sweep(posture, loops, constants, q, parts.v_a, self._carriers)
-        settings = Constants(tape, 2, control.settings).vector(0, len(control.settings))
-        rows = [tape.loads(3, control.columns * row, control.columns) for row in range(3)]
+        control, columns = self._control, self._columns
+        sweep, q_a, parts = machine_at(self._dynamics, tape, self._state, state)
+        settings = settings_of(control, tape, 2, fold=True)
+        rows = [tape.loads(3, columns * row, columns) for row in range(3)]
         reference = rows[0]
         if theta is not None:
             # the parabola through the rows at 0, 1/2, 1
             s = tape.load(theta, 0)
             shares = ((2.0 * s - 1.0) * (s - 1.0), 4.0 * s * (1.0 - s), s * (2.0 * s - 1.0))
             reference = [dot(shares, values) for values in zip(*rows, strict=True)]
-        return sweep, Traced(sweep, q, parts.v_a, parts.own, settings, reference)
+        return sweep, At(q_a, parts.v_a, parts.own, settings, reference, sweep.inverse)
 
     def _compile(self) -> Program:
         program, control = Program(), self._control
@@ -142,7 +146,7 @@ class StiffStepper:
 
         h[1] is the length to try next.
         """
-        size, seen, columns = self._state.size, self._seen.size, self._control.columns
+        size, seen, columns = self._state.size, self._seen.size, self._columns
         names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds", "scales")
         with program.routine("run", counts=("steps",), functions=("close",), arrays=names) as r:
             following = r.array("following", program.outputs("finish"))

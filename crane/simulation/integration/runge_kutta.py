@@ -2,14 +2,15 @@
 
 import numpy as np
 
-from crane.closure.traced import Constants, folded
+from crane.closure.traced import folded
 from crane.codegen import Program, Tape, largest
 from crane.codegen.scalar import add, dot, scale
 from crane.common.samples import Array
-from crane.control import Traced, TracedController
+from crane.control import At, TracedController
 from crane.dynamics import Dynamics
-from crane.dynamics.traced import Sweep
+from crane.simulation.integration.blocks import in_blocks
 from crane.simulation.integration.state import seen_layout, state_layout
+from crane.simulation.integration.traced import columns_of, form_of, machine_at, settings_of
 
 
 class CompiledStepper:
@@ -27,17 +28,11 @@ class CompiledStepper:
     def __init__(self, dynamics: Dynamics, control: TracedController, states: int):
         machine = dynamics.machine
         self._fast, self._numbers = machine.closure.fast, dynamics.numbers
-        self._carriers = dynamics.carriers
-        self._control = control
+        self._dynamics, self._control = dynamics, control
+        self._columns = columns_of(control)
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
-        key = (
-            type(control),
-            control.columns,
-            len(control.settings),
-            states,
-            folded(self._numbers),
-            dynamics.carriers,
-        )
+        form = form_of(control, self._columns, len(machine.active), states, fold=False)
+        key = ("rk4", form, states, folded(self._numbers), dynamics.carriers)
         if key not in self._fast.programs:
             self._fast.programs[key] = self._compile()
         self._program = self._fast.programs[key]
@@ -46,13 +41,11 @@ class CompiledStepper:
         program, control = Program(), self._control
         for name in ("observe", "rate"):
             tape = Tape()
-            q, posture, loops = self._fast.trace(tape, 0, 4)
-            at = self._state.view(tape.loads(4, 0, self._state.size))
-            constants = Constants(tape, 1, self._numbers)
-            sweep = Sweep(posture, loops, constants, q, at.v_a, self._carriers)
-            settings = tape.loads(2, 0, len(control.settings))
-            reference = tape.loads(3, 0, control.columns)
-            tau, own_rate = control.trace(Traced(sweep, q, at.v_a, at.own, settings, reference))
+            sweep, q_a, parts = machine_at(self._dynamics, tape, self._state, 4)
+            settings = settings_of(control, tape, 2, fold=False)
+            reference = tape.loads(3, 0, self._columns)
+            at = At(q_a, parts.v_a, parts.own, settings, reference, sweep.inverse)
+            tau, own_rate = control.trace(at)
             a_a = sweep.forward(tau, friction=True)
             powers = [dot(tau, at.v_a), sweep.dissipation]
             outputs = {"rate": [*sweep.rates[1:], *a_a, *own_rate, *powers]}
@@ -66,7 +59,7 @@ class CompiledStepper:
 
     def _add_run(self, program: Program) -> None:
         """run: steps, each recorded before it is made, until one needs a closer look."""
-        size, seen, columns = self._state.size, self._seen.size, self._control.columns
+        size, seen, columns = self._state.size, self._seen.size, self._columns
         names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds")
         with program.routine("run", counts=("steps",), functions=("close",), arrays=names) as r:
             following = r.array("following", program.outputs("finish"))
@@ -96,26 +89,40 @@ class CompiledStepper:
                 r.copy(r.state, following, size)
             r.give(r.steps)
 
-    def run(self, times: Array, state: Array, step: float, out: Array) -> int:
-        """Steps from the first of `times` on, one row of `out` before each.
+    def run(self, times: Array, state: Array, step: float, rows: Array) -> int:
+        """Steps from the first of `times` on, one row before each.
 
         Args:
             times: (steps,) [s].
             state: The state at the first time; replaced by that after the last step done.
             step: [s].
-            out: (steps, size + seen), state and observations at each of the times.
+            rows: (steps, size + seen), state and observations at each of the times.
 
         Returns:
             How many steps were done; the one after them needs a closer look.
         """
-        halves = times[0] + 0.5 * step * np.arange(2 * len(times) + 1)
-        references = np.ascontiguousarray(self._control.references(halves))
+        machine = self._fast.geometry.numbers, self._numbers
         settings = np.ascontiguousarray(self._control.settings)
         steps = np.array([step, 0.5 * step])
-        return self._program.call(
-            "run", len(times), self._fast.close_address, self._fast.geometry.numbers,
-            self._numbers, settings, references, state, out, steps, self._fast.bounds,
-        )  # fmt: skip
+
+        def call(count: int, references: Array, out: Array) -> int:
+            return self._program.call(
+                "run", count, self._fast.close_address, *machine, settings, references, state,
+                out, steps, self._fast.bounds,
+            )  # fmt: skip
+
+        return in_blocks(call, self._control, times, step, rows)
+
+    def observe(self, time: float, state: Array) -> Array:
+        """What is seen (.,) at a time [s] and a state."""
+        settings = np.ascontiguousarray(self._control.settings)
+        reference = np.ascontiguousarray(self._control.references(np.array([time])))
+        layout = self._program.outputs("observe")
+        out = np.empty(layout.size)
+        machine = self._fast.geometry.numbers, self._numbers
+        self._program.call("observe", *machine, settings, reference, state, out)
+        seen: Array = out[layout["seen"]]
+        return seen
 
     def _add_sums(self, program: Program) -> None:
         """blend(s, k, h) = s + h k; finish(s, k1, k2, k3, k4, h) = s + h/6 (...), largest move."""

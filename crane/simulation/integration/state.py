@@ -1,7 +1,7 @@
 """What a simulation integrates and what it observes, part by part."""
 
 from crane.codegen import Layout
-from crane.control import Controller, StiffController
+from crane.control import Controller, ValveDrive
 from crane.machine import Machine
 
 
@@ -13,7 +13,7 @@ def state_layout(machine: Machine, own: int) -> Layout:
 def seen_layout(machine: Machine, control: Controller) -> Layout:
     """What is observed: tau (n), friction (n), kinetic, potential [J], channels of circuits."""
     n = len(machine.active)
-    channels = len(control.channels) if isinstance(control, StiffController) else 0
+    channels = len(control.channels) if isinstance(control, ValveDrive) else 0
     return Layout(tau=n, friction=n, kinetic=1, potential=1, channels=channels)
 
 

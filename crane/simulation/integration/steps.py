@@ -6,13 +6,13 @@ import numpy as np
 
 from crane.codegen import TooLongError, carefully
 from crane.common.samples import Array
-from crane.control import Controller, StiffController, TracedController
+from crane.control import Controller, TracedController, ValveDrive
 from crane.dynamics import Dynamics
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.runge_kutta import CompiledStepper
 from crane.simulation.integration.stepwise import Progress, PythonStepper
 
-_CHUNK = 1000  # steps between reports of progress
+_CHUNK = 5000  # steps between reports of progress
 _BACK, _AHEAD = 40, 20  # steps before and after a halt that are done anew with finer ones
 _FINER = (2, 8)  # how much finer
 
@@ -34,7 +34,7 @@ class Steps:
         self.slow = PythonStepper(dynamics, control, own)
         self.done = 0
         self._fast: CompiledStepper | None = None
-        if isinstance(control, StiffController) or dynamics.path != "compiled":
+        if isinstance(control, ValveDrive) or dynamics.path != "compiled":
             return
         if isinstance(control, TracedController):
             with suppress(TooLongError):
@@ -49,7 +49,7 @@ class Steps:
             times: (N,) instants [s].
             state: At the first; replaced by that a step after the last.
             step: [s].
-            rows: (N, .), filled with state and observations at the instants.
+            rows: (N, .) in any order, filled with state and observations at the instants.
             progress: Called with the number of finished steps.
 
         Raises:
@@ -70,6 +70,20 @@ class Steps:
 
         carefully(len(times), quick if fast else None, careful, _CHUNK, progress)
         self.done = len(times)
+
+    def last(self, time: float, state: Array) -> Array:
+        """A row without a step after it.
+
+        Args:
+            time: [s].
+            state: There.
+
+        Raises:
+            HaltedError: It cannot be observed.
+        """
+        fast = self._fast
+        seen = fast.observe(time, state) if fast else self.slow.observe(time, state)[1]
+        return np.concatenate([state, seen])
 
     def finer(self, times: Array, rows: Array, step: float) -> float:
         """A step [s] with which the motion goes on where it halted; 0 if none was found.

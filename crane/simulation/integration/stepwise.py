@@ -4,9 +4,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from crane.common.errors import ClosureError
+from crane.codegen import Parts
+from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
-from crane.control import Controller, StiffController
+from crane.control import Controller, ValveDrive
 from crane.dynamics import Dynamics
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.state import state_layout
@@ -42,8 +43,10 @@ class PythonStepper:
         at = self.layout.view(state)
         seen = self._dynamics.at("observation", at.q, at.v_a, tau)
         more: Array = np.zeros(0)
-        if isinstance(self._control, StiffController):
-            more = self._control.observe(time, at.q[self._active], at.v_a, at.own)
+        if isinstance(self._control, ValveDrive):
+            control = self._control
+            where = control.at(time, at.q[self._active], at.v_a, at.own)
+            more = np.array(control.look(where), dtype=np.float64)
         return rate, np.concatenate([tau, seen, more])
 
     def advance(self, time: float, state: Array, first: Array, step: float) -> Array:
@@ -72,8 +75,19 @@ class PythonStepper:
     def _rate(self, time: float, state: Array) -> tuple[Array, Array]:
         at = self.layout.view(state)
         try:
-            tau, own_rate = self._control(time, at.q[self._active], at.v_a, at.own)
+            tau, own_rate = self._asked(time, at)
             rates = self._dynamics.at("rates", at.q, at.v_a, tau)
         except ClosureError as error:
             raise HaltedError(time, at.q[self._active], f": {error}") from None
         return np.concatenate([rates[:-1], own_rate, [tau @ at.v_a, rates[-1]]]), tau
+
+    def _asked(self, time: float, at: Parts) -> tuple[Array, Array]:
+        """What the controller answers, (n,) and (k,)."""
+        tau, rate = self._control(time, at.q[self._active], at.v_a, at.own)
+        if np.shape(tau) != at.v_a.shape or np.shape(rate) != at.own.shape:
+            raise InputError(
+                f"{type(self._control).__name__} gives forces of the shape {np.shape(tau)} and "
+                f"rates of the shape {np.shape(rate)}, give {at.v_a.shape} and {at.own.shape}: "
+                "one per active joint, one per state"
+            )
+        return np.asarray(tau), rate

@@ -4,7 +4,7 @@ import numpy as np
 
 from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
-from crane.control import StiffController
+from crane.control import ValveDrive
 from crane.dynamics import Dynamics
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.rosenbrock import StiffStepper
@@ -29,7 +29,7 @@ class StiffSteps:
         TooLongError: It would take too long to compile.
     """
 
-    def __init__(self, dynamics: Dynamics, control: StiffController):
+    def __init__(self, dynamics: Dynamics, control: ValveDrive):
         self._dynamics, self._control = dynamics, control
         self._fast = StiffStepper(dynamics, control)
         self.slow = PythonStepper(dynamics, control, len(control.scales))
@@ -62,6 +62,10 @@ class StiffSteps:
                 raise self._stopped(times[self.done], at.q, at.v_a)
             if progress is not None:
                 progress(self.done)
+
+    def last(self, time: float, state: Array) -> Array:
+        """See `Steps.last`."""
+        return np.concatenate([state, self._fast.observe(time, state)])
 
     def finer(self, times: Array, rows: Array, step: float) -> float:
         """No step: within recorded ones the method has found the finest itself."""

@@ -1,0 +1,44 @@
+"""Many steps by one call of machine code after the other."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from crane.common.samples import Array
+from crane.control import TracedController
+
+_BLOCK = 1000  # steps of a call: their rows stay in the cache until they are where they belong
+
+
+def in_blocks(
+    call: Callable[[int, Array, Array], int],
+    control: TracedController,
+    times: Array,
+    step: float,
+    rows: Array,
+) -> int:
+    """Steps from the first of `times` on, one row before each.
+
+    Args:
+        call: (count, references (2 count + 1, c), out (count, .)) -> how many steps were done.
+        control: What has the references.
+        times: (steps,) [s].
+        step: [s].
+        rows: (steps, .) in any order, filled.
+
+    Returns:
+        How many steps were done; the one after them needs a closer look.
+    """
+    length = min(_BLOCK, len(times))
+    halves = times[::length, None] + 0.5 * step * np.arange(2 * length + 1)
+    firsts = range(0, len(times), length)
+    instants = halves.ravel()[: 2 * len(times) + len(firsts)]
+    references = np.ascontiguousarray(control.references(instants))
+    out = np.empty((length, rows.shape[1]))
+    for i, first in enumerate(firsts):
+        count = min(length, len(times) - first)
+        done = call(count, references[i * halves.shape[1] :], out)
+        rows[first : first + done] = out[:done]
+        if done < count:
+            return first + done
+    return len(times)

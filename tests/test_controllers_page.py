@@ -1,0 +1,133 @@
+"""The program of docs/controllers.md, and what the page promises beyond it."""
+
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import crane
+from crane.common.errors import CraneWarning, InputError
+from crane.control import Law
+from crane.simulation.integration import CompiledStepper, PythonStepper
+
+PAGE = Path(__file__).parents[1] / "docs" / "controllers.md"
+
+pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
+
+
+@pytest.fixture(scope="module")
+def page():
+    """What is defined after the page's blocks."""
+    blocks = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.DOTALL | re.MULTILINE)
+    assert len(blocks) == 4
+    names: dict = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        exec(compile("\n".join(blocks), str(PAGE), "exec"), names)
+    return names
+
+
+def test_the_page_does_what_it_says(page):
+    assert page["recording"].time[-1] == pytest.approx(0.1)
+    assert page["slow"].channels["reference_q1"].shape == page["slow"].time.shape
+    # the drives do come to their limits, and the law waits as the class does
+    at_limit = np.abs(page["slow"].tau) == page["most"]
+    assert at_limit.any() and not at_limit.all()
+    for name in ("q", "v", "tau"):
+        slow, fast = getattr(page["slow"], name), getattr(page["fast"], name)
+        np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-9 * np.abs(slow).max())
+    assert np.ptp(page["swinging"].q, axis=0).min() > 1e-6
+
+
+def test_laws_of_the_page_run_without_python(page, monkeypatch):
+    monkeypatch.setattr(PythonStepper, "observe", None)
+    monkeypatch.setattr(PythonStepper, "advance", None)
+    for name in ("law", "shaken"):
+        start = page["path"].position(0.0)
+        crane.simulate(page["machine"], page[name], start, duration=0.02)
+
+
+@pytest.mark.parametrize("name", ["law", "shaken"])
+def test_one_law_gives_the_same_in_numbers_and_traced(page, name):
+    law, machine = page[name], page["machine"]
+    start = page["path"].position(0.0) + [0.05, 1e-3, -5e-4]
+
+    class Called:
+        def start(self, q_a):
+            return law.start(q_a)
+
+        def __call__(self, *seen):
+            return law(*seen)
+
+    runs = [crane.simulate(machine, one, start, duration=0.05) for one in (law, Called())]
+    assert np.abs(runs[0].q - runs[1].q).max() < 1e-12
+    scale = np.abs(runs[0].tau).max(axis=0)
+    assert (np.abs(runs[0].tau - runs[1].tau).max(axis=0) < 1e-9 * scale).all()
+
+
+def test_settings_reuse_machine_code_and_other_numbers_do_not(page, monkeypatch):
+    machine, path, most = page["machine"], page["path"], page["most"]
+    made = []
+    compiled = CompiledStepper._compile
+    monkeypatch.setattr(CompiledStepper, "_compile", lambda x: made.append(x) or compiled(x))
+    tighter = crane.simulate(machine, page["Fast"](machine, path, 0.5 * most), duration=0.02)
+    assert not made
+    assert np.abs(tighter.tau[:, 0]).max() == 0.5 * most[0]
+    start, damping = path.position(0.0), np.diag([0.05, 500.0, 500.0])
+    stronger = page["Shaken"](machine, np.array([0.04, 3.0, 3.0]), damping)
+    one, two = (
+        crane.simulate(machine, law, start, duration=0.1) for law in (page["shaken"], stronger)
+    )
+    assert len(made) == 1
+    swing = [r.tau[:, 0] + damping[0, 0] * r.v[:, 0] - page["weight"][0] for r in (one, two)]
+    np.testing.assert_allclose(swing[1], 2 * swing[0], atol=1e-12)
+
+
+def test_states_begin_where_the_machine_stands(page):
+    """`begin` sees the inverse dynamics at the start, whoever asks."""
+
+    class Held(Law):
+        def begin(self, at):
+            return at.inverse([0.0, 0.0, 0.0], friction=False)
+
+        def law(self, at):
+            return at.state, [0.0, 0.0, 0.0]
+
+    machine, q_a = page["machine"], page["path"].position(0.0)
+    weight = crane.Dynamics(machine).inverse(q_a, np.zeros(3), np.zeros(3))
+    np.testing.assert_allclose(Held(machine).start(q_a), weight, rtol=1e-12, atol=1e-12)
+    recording = crane.simulate(machine, Held(machine), q_a, duration=0.01)
+    np.testing.assert_array_equal(recording.tau[0], Held(machine).start(q_a))
+
+
+def test_wrong_numbers_of_forces_and_rates_are_told(page):
+    machine, start = page["machine"], page["path"].position(0.0)
+
+    class Short(Law):
+        def law(self, at):
+            return at.v_a[:2], at.v_a
+
+    with pytest.raises(InputError, match="law of Short gives 2 forces and 3 rates, give 3 and 0"):
+        crane.simulate(machine, Short(machine), start, duration=0.01)
+
+    class Wide:
+        def start(self, q_a):
+            return np.zeros(1)
+
+        def __call__(self, time, q_a, v_a, state):
+            return np.zeros(4), state
+
+    told = r"Wide gives forces of the shape \(4,\) and rates of the shape \(1,\), give \(3,\) and"
+    with pytest.raises(InputError, match=told):
+        crane.simulate(machine, Wide(), start, duration=0.01)
+
+
+def test_a_branch_in_a_law_is_an_error(page):
+    class Branching(Law):
+        def law(self, at):
+            return [1.0 if x > 0 else -1.0 for x in at.q_a], ()
+
+    with pytest.raises(TypeError, match="'>' not supported"):
+        crane.simulate(page["machine"], Branching(page["machine"]), duration=0.01)
