@@ -9,6 +9,17 @@ from typing import Annotated
 import typer
 
 import crane
+from crane.cli import (  # noqa: F401  register their commands
+    check,
+    circuit,
+    commands,
+    convert,
+    design,
+    live,
+    pictures,
+    simulate,
+    workspace,
+)
 from crane.cli.shared import app, say
 from crane.common.errors import CraneError, CraneWarning, one_line
 
