@@ -261,11 +261,8 @@ def _motion(
 
 def _check_forces(model: Model, motion: Motion, rows: Equations, trust: bool) -> None:
     """Doubts about the forces of a recording, by what the model can say."""
-    every = max(1, round((rows.time[1] - rows.time[0]) / (motion.time[1] - motion.time[0])))
-    q, v, a = (x[::every] for x in (motion.q, motion.v, motion.a))
     modelled = rows.compare(rows.base.values(model.nominal)).modelled
-    thinned = Motion(rows.time, q, v, a, rows.forces)
-    check_forces(thinned, modelled, model.machine.active, trust=trust)
+    check_forces(rows.thinned(), modelled, model.machine.active, trust=trust)
     tell_delays(model.machine.active, *delays(model, rows.base, motion, rows.slow))
 
 
