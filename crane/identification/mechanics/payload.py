@@ -10,11 +10,11 @@ from crane.common.errors import InputError, RecordingError, known
 from crane.common.samples import Array, Brief
 from crane.dynamics import Dynamics
 from crane.identification.estimation.regressor import triangular
+from crane.identification.mechanics.against import check_forces
 from crane.identification.mechanics.base import Base
-from crane.identification.mechanics.checks import check_forces
 from crane.identification.mechanics.equations import Equations, Progress
 from crane.identification.mechanics.feasible import body_parameters, pseudo_inertia
-from crane.identification.mechanics.identify import METHODS, equations_of, in_parts, motion_of
+from crane.identification.mechanics.identify import METHODS, equations_of, in_parts
 from crane.identification.mechanics.model import (
     PER_BODY,
     Model,
@@ -22,6 +22,7 @@ from crane.identification.mechanics.model import (
     friction,
     inertial_columns,
 )
+from crane.identification.mechanics.reading import motion_of
 from crane.identification.mechanics.result import Comparison, aligned
 from crane.identification.signals.motion import Motion, moving
 from crane.machine import Machine
