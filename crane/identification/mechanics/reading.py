@@ -64,9 +64,8 @@ def motion_of(
     step = float(np.median(np.diff(time)))
     lowest = _HUM * motion_frequency(columns[:, :n], step)
     tell_hum(time, dict(zip(names, columns.T, strict=True)), lowest)
-    q, tau = columns[:, :n], columns[:, n:].copy()
-    found = differentiate(time, q, derivatives, cutoff, progress)
-    return Motion(time, found.q, found.v, found.a, tau, _passed(found))
+    found = differentiate(time, columns[:, :n], derivatives, cutoff, progress)
+    return Motion(time, found.q, found.v, found.a, columns[:, n:], _passed(found))
 
 
 def _columns(machine: Machine, recording: Recording) -> list[int]:
