@@ -399,9 +399,7 @@ def test_strokes_do_not_depend_on_the_blocks(machine, columns, truth, tmp_path, 
     del columns["q3 [deg]"]
     columns["q10 [rad]"] = machine.closure.solve(truth["q"])[:, machine.column("q10")]
     columns["q10 [rad]"][333] += 2
-    with pytest.raises(
-        RecordingError, match=r"\(sample 333\).* zero and sign of q2, q10"
-    ):
+    with pytest.raises(RecordingError, match=r"\(sample 333\).* zero and sign of q2, q10"):
         read_measured(machine, write(tmp_path, columns))
 
 
