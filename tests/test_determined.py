@@ -80,6 +80,25 @@ def test_two_that_act_alike_are_named_together():
     assert weak_directions(["boom.mx", "stick.mx"], 0.5 * np.eye(2), np.ones(2)) == []
 
 
+def test_a_combination_of_what_is_determined_is_named_without_a_warning(plain):
+    """All known to 0.7 of what can be, and hanging together: their sum is known to more than 1."""
+    alike = 0.49 * (0.9 + 0.1 * np.eye(len(plain.names)))
+    found = dataclasses.replace(
+        plain,
+        values=np.zeros(len(plain.names)),
+        covariance=alike * np.outer(plain.magnitude, plain.magnitude),
+    )
+    assert not any(found.marks) and found.doubt == ""
+    ((std, words),) = found.undetermined
+    assert std > 5 and f"  +- {std:.2g}  {words}\n" in found.to_text()
+    # as soon as one is not determined, the warning counts it
+    vague = found.covariance.copy()
+    vague[3] *= 2
+    vague[:, 3] *= 2
+    found = dataclasses.replace(found, covariance=vague)
+    assert found.doubt.startswith("this motion does not determine 1 of 75 base parameters, ")
+
+
 def test_what_cannot_be_is_called_impossible(plain):
     values, std = plain.values.copy(), plain.std
     i = int(np.argmin(std / plain.magnitude))

@@ -11,7 +11,8 @@ from rig import Rig, Tolerances
 import crane
 from crane.common.errors import CraneWarning, RecordingError
 from crane.identification.excitation.fourier import Fourier
-from crane.identification.mechanics.identify import identify, motion_of
+from crane.identification.mechanics.identify import identify
+from crane.identification.mechanics.reading import motion_of
 from crane.identification.signals.hum import line
 from crane.identification.signals.outliers import outliers, repaired
 from crane.recordings.logs import read_log

@@ -19,7 +19,7 @@ from crane.identification.hydraulics.cylinder_signals import (
     opening,
     spool_position,
 )
-from crane.identification.hydraulics.orifice_rows import terms
+from crane.identification.hydraulics.orifice_rows import OrificeRows, terms
 from crane.identification.hydraulics.orifices import identify_orifices
 from crane.identification.hydraulics.valve import identify_valve
 from crane.identification.signals.steady import steady
@@ -214,6 +214,21 @@ def test_parameters_without_noise(machine, quick, other, method):
     assert judged.relative < 1e-5 and found.training[0].relative < 1e-5
     assert found.bulk_modulus == pytest.approx(BETA, rel=1e-8)
     assert len(judged.time) == len(judged.left) == len(judged.right) > 500
+
+
+@pytest.mark.parametrize("method", ["weak", "chambers", "ls"])
+def test_rows_of_a_recording_are_made_once(machine, quick, method, monkeypatch):
+    """And what both chambers' equations say together is (29)."""
+    made, init = [], OrificeRows.__init__
+    monkeypatch.setattr(OrificeRows, "__init__", lambda *a: made.append(a) or init(*a))
+    run = recorded(quick)
+    found = identify_orifices(machine, run, "boom", method)
+    assert len(made) == 1
+    (both,), alone = found.training, found.predict(run)
+    assert len(made) == 2
+    for name in ("time", "left", "right"):
+        one, other = getattr(both, name), getattr(alone, name)
+        assert np.abs(one - other).max() < 1e-12 * np.abs(other).max()
 
 
 def test_the_paper_s_way_without_noise(machine, quick):

@@ -304,7 +304,7 @@ def test_no_load_can_be_told(mini):
         (
             lambda: estimate_payload(mini, dataclasses.replace(given, tau=1e3 * given.tau)),
             RecordingError,
-            "'q1_force' is 980",
+            "'q1_force' is 987",
         ),
         (lambda: estimate_payload(mini, slewing), RecordingError, "this motion does not tell"),
     ):

@@ -15,8 +15,9 @@ from crane.identification.estimation.estimators import least_squares
 from crane.identification.excitation.excite import excite
 from crane.identification.mechanics.base import base_parameters, random_samples
 from crane.identification.mechanics.feasible import pseudo_inertia
-from crane.identification.mechanics.identify import identify, motion_of
+from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.model import Inertial, Model, friction
+from crane.identification.mechanics.reading import motion_of
 from crane.identification.signals.motion import Motion
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")

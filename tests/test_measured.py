@@ -12,6 +12,7 @@ from broken import MINI, copy_machine, swap
 import crane
 from crane.cli.runs import read_run
 from crane.common.errors import CraneError, CraneWarning, RecordingError
+from crane.recordings import measured
 from crane.recordings.measured import read_measured
 from crane.recordings.recording import Recording
 
@@ -384,6 +385,21 @@ def test_sensors_that_agree_within_their_noise_are_not(machine, columns, truth, 
     columns |= {"X1 [mm]": 1e3 * truth["q"][:, 1], "X2 [mm]": 1e3 * truth["q"][:, 2]}
     with warnings.catch_warnings():
         warnings.simplefilter("error", CraneWarning)
+        read_measured(machine, write(tmp_path, columns))
+
+
+def test_strokes_do_not_depend_on_the_blocks(machine, columns, truth, tmp_path, monkeypatch):
+    """Nor does what an error calls a sample: it counts from the first of all."""
+    file = write(tmp_path, columns)
+    whole = read_measured(machine, file)
+    monkeypatch.setattr(measured, "_AT_ONCE", 50)
+    blocks = read_measured(machine, file)
+    for name in ("q", "v", "tau"):
+        assert close(getattr(blocks, name), getattr(whole, name), 1e-12)
+    del columns["q3 [deg]"]
+    columns["q10 [rad]"] = machine.closure.solve(truth["q"])[:, machine.column("q10")]
+    columns["q10 [rad]"][333] += 2
+    with pytest.raises(RecordingError, match=r"\(sample 333\).* zero and sign of q2, q10"):
         read_measured(machine, write(tmp_path, columns))
 
 

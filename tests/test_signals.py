@@ -8,7 +8,8 @@ from scipy.linalg import block_diag
 
 from crane.common.errors import CraneWarning, InputError, RecordingError
 from crane.identification.mechanics import checks
-from crane.identification.mechanics.checks import check, check_forces
+from crane.identification.mechanics.against import check_forces
+from crane.identification.mechanics.checks import check, check_samples
 from crane.identification.signals import motion as signals
 from crane.identification.signals import smoother
 from crane.identification.signals.motion import Motion, differentiate
@@ -310,10 +311,6 @@ def recorded():
     }
 
 
-def gap(r):
-    r["tau"][300:340, 1] = np.nan
-
-
 def scale(name, column, factor):
     def spoil(r):
         r[name][:, column] *= factor
@@ -354,7 +351,6 @@ def short(r):
 
 SPOILT = {
     "short": (short, "40 samples are too few, record at least 50"),
-    "nan": (gap, "'X1_force' holds no number from 1.2 to 1.356 s (40 samples in all), cut"),
     "hole": (hole, "no sample between 7.996 and 8.5 s where the usual step is 0.004 s, cut"),
     "still": (still, "no joint moves, record a motion"),
     "dead": (dead, "'X1_force' is constant while 'X1' moves, check it"),
@@ -377,11 +373,15 @@ SPOILT = {
 
 @pytest.mark.parametrize(("spoil", "message"), SPOILT.values(), ids=SPOILT.keys())
 def test_bad_recordings_are_explained(spoil, message):
+    def judge():
+        check_samples(recording["time"])
+        check(**recording)
+
     recording = recorded()
-    check(**recording)
+    judge()
     spoil(recording)
     with pytest.raises(RecordingError) as error:
-        check(**recording)
+        judge()
     assert message in str(error.value)
 
 

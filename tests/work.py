@@ -1,8 +1,12 @@
 """How much a call computes: lines of the package that it runs, whatever else the machine does."""
 
 import sys
+from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
+
+from crane.closure.compiled import FastClosure
+from crane.dynamics.compiled import Formula
 
 PACKAGE = str(Path(__file__).parents[1] / "crane")
 
@@ -42,3 +46,37 @@ def at_most(limit):
         yield work
     finally:
         sys.settrace(before)
+
+
+@contextmanager
+def passes(monkeypatch):
+    """Count samples: those whose loops are closed, and those at which each quantity is computed.
+
+    Keys are "closed" and the names of `crane.dynamics.compiled.QUANTITIES`.
+    """
+    count, made, quantities = Counter(), Formula.__init__, {}
+
+    def named(formula, quantity, *arguments):
+        made(formula, quantity, *arguments)
+        quantities[id(formula._program)] = quantity
+
+    def counted(kind, name, keys, size):
+        function = getattr(kind, name)
+
+        def spied(self, *arguments):
+            out = function(self, *arguments)
+            for key in keys(self):
+                count[key] += size(out, arguments)
+            return out
+
+        patch.setattr(kind, name, spied)
+
+    def quantity(formula):
+        return quantities.get(id(formula._program), "other")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Formula, "__init__", named)
+        counted(FastClosure, "follow", lambda _: ["closed"], lambda out, _: out)
+        counted(Formula, "each", lambda x: ["closed", quantity(x)], lambda out, _: out)
+        counted(Formula, "along", lambda x: [quantity(x)], lambda _, given: len(given[0]))
+        yield count

@@ -17,7 +17,7 @@ from crane.description.sources import find, unchanged
 from crane.formats import recalled
 from crane.machine import Machine
 from crane.recordings import timeseries
-from crane.recordings.measured import is_measured, read_measured
+from crane.recordings.measured import completed, is_measured, read_measured
 from crane.recordings.recording import Recording
 from crane.recordings.summary import subject, summarize, title
 from crane.simulation.replays import Comparison
@@ -199,7 +199,7 @@ def read_run(path: Path, machine: Machine | None = None) -> Recording:
     table = timeseries.read(path)
     named = table.notes.get("machine", "")
     if named and is_measured(table):
-        return read_measured(machine_of(path, named), path)
+        return completed(machine_of(path, named), table, path)
     return Recording.from_table(table, path)
 
 

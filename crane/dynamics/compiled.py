@@ -105,6 +105,11 @@ class Formula:
         arguments = self._arguments(targets, inputs, out)
         return self._program.call("each", len(targets), *arguments)
 
+    def along(self, q: Array, inputs: Array, out: Array) -> None:
+        """The quantity at closed postures (N, nq) with inputs (N, 2 n) into out (N, size)."""
+        geometry = self._fast.geometry.numbers
+        self._program.call("along", len(q), geometry, self._numbers, q, inputs, out)
+
     def _arguments(self, targets: Array, inputs: Array, out: Array) -> tuple[int | Array, ...]:
         fast = self._fast
         arrays = (fast.geometry.numbers, self._numbers, targets, inputs)
@@ -123,13 +128,15 @@ def _compile(
     program.add("formula", 4, outputs)
     tape = Tape()  # what is not finite is left to the checks that name it
     program.add("scan", 2, [largest([*tape.loads(0, 0, n), *tape.loads(1, 0, 2 * n)])])
-    _add_loop(program, n)
+    _add_loop(program, len(q), n)
     program.compile()
     return program
 
 
-def _add_loop(program: Program, n: int) -> None:
+def _add_loop(program: Program, nq: int, n: int) -> None:
     """each: close the loops sample by sample and evaluate there; once: the same of one sample.
+
+    along: evaluate at postures that are closed already.
 
     Like `follow` of `FastClosure`, it stops at the first sample that is too far from the one
     before it.
@@ -144,6 +151,12 @@ def _add_loop(program: Program, n: int) -> None:
                 r.give(i)
             out = r.out.row(i, outputs)
             r.call("formula", r.geometry, r.numbers, r.q, r.inputs.row(i, 2 * n), out)
+        r.give(r.count)
+    closed = ("geometry", "numbers", "postures", "inputs", "out")
+    with program.routine("along", counts=("count",), arrays=closed) as r:
+        with r.loop(r.count) as i:
+            q, inputs, out = r.postures.row(i, nq), r.inputs.row(i, 2 * n), r.out.row(i, outputs)
+            r.call("formula", r.geometry, r.numbers, q, inputs, out)
         r.give(r.count)
     with program.routine("once", functions=("follow",), arrays=arrays) as r:
         scanned = r.array("scanned", program.outputs("scan"))

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from crane.codegen import TooLongError, carefully
 from crane.common.errors import InputError, known
-from crane.common.samples import Array, as_samples
+from crane.common.samples import Array, as_samples, per_sample
 from crane.dynamics.compiled import Formula
 from crane.dynamics.elements import JointForces
 from crane.dynamics.formulation import carriers
@@ -198,21 +198,26 @@ class Dynamics:
         return "pinocchio" if self._formula(quantity) is None else "compiled"
 
     def at(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
-        """A quantity of one sample at a posture that is closed already.
+        """A quantity at postures that are closed already, which are not checked.
 
         Args:
             quantity: A key of `crane.dynamics.compiled.QUANTITIES`.
-            q: (nq,) closed posture.
-            v_a: (n,) [m/s], [rad/s].
-            x: (n,) a_A or tau_A, whatever the quantity asks for.
+            q: (nq,) or (N, nq) closed postures.
+            v_a: (n,) or (N, n) [m/s], [rad/s].
+            x: The same shape, a_A or tau_A, whatever the quantity asks for.
 
         Returns:
-            The result, flattened.
+            The results, each flattened.
         """
         formula = self._formula(quantity)
         if formula is None:
-            return self.tree.at(quantity, q, v_a, x)
-        return formula.at(np.ascontiguousarray(q), np.concatenate([v_a, x]))
+            return per_sample(lambda *one: self.tree.at(quantity, *one), q, v_a, x)
+        inputs = np.concatenate([v_a, x], axis=-1)
+        if q.ndim == 1:
+            return formula.at(np.ascontiguousarray(q), inputs)
+        out = np.empty((len(q), formula.size))
+        formula.along(np.ascontiguousarray(q), inputs, out)
+        return out
 
     @property
     def _n(self) -> int:
@@ -276,13 +281,7 @@ class Dynamics:
         closure, n = self.machine.closure, self._n
         formula = self._formula(quantity)
         if formula is None:
-            postures = closure.solve(targets)
-            return np.array(
-                [
-                    self.tree.at(quantity, q, row[:n], row[n:])
-                    for q, row in zip(postures, rows, strict=True)
-                ]
-            )
+            return self.at(quantity, closure.solve(targets), rows[:, :n], rows[:, n:])
         out = np.empty((len(targets), formula.size))
 
         def reach(i: int) -> None:

@@ -100,11 +100,11 @@ class JointForces:
         f = area pressure (V0 / V)^exponent.
 
         Args:
-            q: (nq,) [m], [rad].
-            v: (nv,) [m/s], [rad/s].
+            q: (nq,) or (N, nq) [m], [rad].
+            v: (nv,) or (N, nv) [m/s], [rad/s].
 
         Returns:
-            (nv,) [N], [N m].
+            (nv,) or (N, nv) [N], [N m].
         """
         over, under = np.maximum(0.0, q - self._upper), np.maximum(0.0, self._lower - q)
         stopping = under * np.maximum(0.0, 1 - self._stop_damping * v) - over * np.maximum(

@@ -142,7 +142,7 @@ def _value(node: ast.expr, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
         if name in arrays:
             if arrays[name].dtype.kind not in "biuf":
                 raise RecordingError(f"'{name}' of the log is {arrays[name].dtype}, no numbers")
-            return arrays[name].astype(np.float64)
+            return arrays[name].astype(np.float64, copy=False)
         if name == "pi":
             return np.asarray(math.pi)
         raise RecordingError(f"the log has no '{name}', {known(arrays, name)}")

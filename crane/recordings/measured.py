@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from crane.closure import Closure
 from crane.common.errors import ClosureError, CraneWarning, MechanismError, RecordingError, at
 from crane.common.samples import Array
 from crane.machine import Machine
@@ -39,6 +40,8 @@ _SAME = 1e-6  # [m], [rad]
 _HELD = {"rad": 0.02, "m": 2e-3}  # by which a joint that is held may be off
 _AGREE = {"rad": 5e-3, "m": 5e-4}  # root mean square by which sensors of one joint may differ
 _COMPARED = 2000  # samples at which they are compared
+_AT_ONCE = 1 << 16  # samples whose postures are held
+_SAMPLE = re.compile(r"\(sample (\d+)\)")  # of an error of the closure
 _SLACK = 0.1  # of a range, by which sensors may be off
 
 
@@ -57,7 +60,15 @@ def read_measured(machine: Machine, path: str | Path) -> Recording:
         RecordingError: The file is malformed, does not tell all coordinates and forces, or tells
             what the machine cannot do.
     """
-    table = timeseries.read(path)
+    return completed(machine, timeseries.read(path), path)
+
+
+def completed(machine: Machine, table: Table, path: str | Path) -> Recording:
+    """The same of a table that was read from a path.
+
+    Raises:
+        RecordingError: As for `read_measured`.
+    """
     full = all(x in table.units and x + FORCE in table.units for x in machine.active)
     try:
         if not full:
@@ -291,26 +302,31 @@ def _motion(machine: Machine, drives: tuple[str, ...], table: Table) -> tuple[Ar
     """Active coordinates and velocities (N, n) from those of the joints that were measured."""
     time = column(table, TIME)
     q_b = np.column_stack([column(table, x, machine.unit(x)) for x in drives])
-    v_b = np.column_stack([derivative(x, time) for x in q_b.T])
-    _fill_in_velocities(v_b, drives, machine, table)
+    v_b = np.empty_like(q_b)
+    for x, v, joint in zip(q_b.T, v_b.T, drives, strict=True):
+        v[:] = derivative(x, time) if (told := _velocity(machine, joint, table)) is None else told
     if set(drives) == set(machine.active):
         order = [drives.index(x) for x in machine.active]
         return q_b[:, order], v_b[:, order]
     angles = ", ".join(x for x in drives if x not in machine.active)
     hint = f"see that zero and sign of {angles} are the machine's"
+    q_a, v_a = np.empty_like(q_b), np.empty_like(v_b)
     try:
         closure = machine.driven_by(drives).closure
-        q = closure.solve(q_b)
-        gamma = closure.gamma(q)[:, machine.closure.active]
-        q_a = q[:, machine.closure.active]
-        off = np.abs(machine.closure.solve(q_a) - q).max(axis=1)
-    except (ClosureError, MechanismError) as error:
+    except MechanismError as error:
         raise RecordingError(f"{error}; {hint}") from None
-    if (off > _SAME).any():
-        raise RecordingError(
-            f"sample {int(np.argmax(off > _SAME))} is beyond a dead centre, where "
-            f"{', '.join(machine.active)} do not tell the posture: {hint}, or cut the recording"
-        )
+    for start in range(0, len(time), _AT_ONCE):
+        some = slice(start, start + _AT_ONCE)
+        try:
+            q_a[some], v_a[some], off = _driven(machine, closure, q_b[some], v_b[some])
+        except ClosureError as error:
+            raise RecordingError(f"{_counted_from(start, error)}; {hint}") from None
+        if (off > _SAME).any():
+            raise RecordingError(
+                f"sample {start + int(np.argmax(off > _SAME))} is beyond a dead centre, where "
+                f"{', '.join(machine.active)} do not tell the posture: {hint}, or cut the "
+                "recording"
+            )
     low, high = q_a.min(axis=0), q_a.max(axis=0)
     slack = _SLACK * _span(machine)
     computed = np.array([x not in drives for x in machine.active])
@@ -321,13 +337,40 @@ def _motion(machine: Machine, drives: tuple[str, ...], table: Table) -> tuple[Ar
             f"{machine.unit(machine.active[i])}, its limits are {machine.lower[i]:.4g} and "
             f"{machine.upper[i]:.4g}: {hint}"
         )
-    v_a = np.einsum("nij,nj->ni", gamma, v_b)
-    _fill_in_velocities(v_a, machine.active, machine, table)
+    for v, joint in zip(v_a.T, machine.active, strict=True):
+        if (told := _velocity(machine, joint, table)) is not None:
+            v[:] = told
     return q_a, v_a
 
 
-def _fill_in_velocities(v: Array, joints: Sequence[str], machine: Machine, table: Table) -> None:
-    """Put those that are recorded in the place of computed ones (N, joints)."""
-    for i, joint in enumerate(joints):
-        if joint + VELOCITY in table.units:
-            v[:, i] = column(table, joint + VELOCITY, VELOCITY_UNITS[machine.unit(joint)])
+def _driven(
+    machine: Machine, closure: Closure, q_b: Array, v_b: Array
+) -> tuple[Array, Array, Array]:
+    """q_A and v_A = gamma_A v_B, and how far from the posture q_A leads (N,).
+
+    Args:
+        machine: Driven by q_A.
+        closure: Of the same machine driven by q_B.
+        q_b: (N, n).
+        v_b: (N, n).
+
+    Raises:
+        ClosureError: No posture has these coordinates.
+    """
+    q = closure.solve(q_b)
+    gamma = closure.gamma(q)[:, machine.closure.active]
+    q_a = q[:, machine.closure.active]
+    off = np.abs(machine.closure.solve(q_a) - q).max(axis=1)
+    return q_a, np.einsum("nij,nj->ni", gamma, v_b), off
+
+
+def _counted_from(start: int, error: ClosureError) -> str:
+    """What an error says of a block of samples, its samples counted from the first of all."""
+    return _SAMPLE.sub(lambda found: f"(sample {start + int(found[1])})", str(error))
+
+
+def _velocity(machine: Machine, joint: str, table: Table) -> Array | None:
+    """A joint's velocity (N,) where it is recorded."""
+    if joint + VELOCITY not in table.units:
+        return None
+    return column(table, joint + VELOCITY, VELOCITY_UNITS[machine.unit(joint)])

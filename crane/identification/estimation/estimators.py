@@ -2,7 +2,7 @@
 
 Rows come from joints (`groups`) at instants (`samples`); rows may be missing. The noise of a
 joint may be correlated in time, and with that of the other joints at the same instant. The
-regressor is read in blocks of rows, see `rows.Regressor`, and may be larger than the memory.
+regressor is read in blocks of rows, see `regressor.Regressor`, and may be larger than the memory.
 """
 
 import math

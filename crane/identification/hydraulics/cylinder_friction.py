@@ -20,7 +20,7 @@ from crane.dynamics import Dynamics
 from crane.identification.estimation import estimators
 from crane.identification.estimation.estimators import Estimate
 from crane.identification.hydraulics.cylinder_signals import column
-from crane.identification.mechanics.identify import motion_of
+from crane.identification.mechanics.reading import motion_of
 from crane.identification.signals.steady import steady
 from crane.machine import Machine
 from crane.recordings.recording import Recording

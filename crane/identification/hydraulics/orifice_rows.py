@@ -71,9 +71,10 @@ class OrificeRows:
         self, machine: Machine, joint: str, signals: CylinderSignals, window: float, chambers: bool
     ):
         cylinder, _ = parts(machine, joint)
-        whole = np.array([[cylinder.area_a, -cylinder.area_b]])
+        areas = np.array([cylinder.area_a, -cylinder.area_b])
         self.machine, self.joint, self.signals = machine, joint, signals
-        self.mix = np.eye(2) if chambers else whole
+        self.mix = np.eye(2) if chambers else areas[None]
+        self._whole = areas if chambers else np.ones(1)  # of the equations, in (29)
         self.windows = w = Windows.over(len(signals.time), signals.step, window)
         self.kept = w.within(regions(signals.opening))
         states, columns = self._mixed(signals)
@@ -88,6 +89,12 @@ class OrificeRows:
     def _mixed(self, signals: CylinderSignals) -> tuple[Array, Array]:
         states, columns = terms(self.machine, self.joint, signals)
         return np.tensordot(self.mix, states, 1), np.tensordot(self.mix, columns, 1)
+
+    def sides(self, X: Array) -> Sides:
+        """Both sides of (29) by X (5,), all windows."""
+        W, y = np.tensordot(self._whole, self.W, 1), np.tensordot(self._whole, self.y, 1)
+        time = self.signals.time[self.windows.centres]
+        return Sides(time, (W @ X).mean(axis=0), y.mean(axis=0))
 
     def sensitivity(self, X: Array, sensor: str, by: float) -> tuple[Array, Array]:
         """By what noise of a sensor moves the differentiated part, and the other, (E, N) each."""
@@ -138,15 +145,3 @@ def terms(machine: Machine, joint: str, signals: CylinderSignals) -> tuple[Array
 def _root(drop: Array) -> Array:
     """Signed square root."""
     return np.copysign(np.sqrt(np.abs(drop)), drop)
-
-
-def sides(
-    machine: Machine, joint: str, signals: CylinderSignals, X: Array, window: float
-) -> Sides:
-    """Both sides of (29) by X (5,), all windows."""
-    rows = OrificeRows(machine, joint, signals, window, False)
-    return Sides(
-        signals.time[rows.windows.centres],
-        (rows.W[0] @ X).mean(axis=0),
-        rows.y[0].mean(axis=0),
-    )

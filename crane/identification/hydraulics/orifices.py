@@ -19,7 +19,7 @@ from crane.identification.hydraulics.cylinder_signals import (
     noise_levels,
     parts,
 )
-from crane.identification.hydraulics.orifice_rows import OrificeRows, Sides, sides, terms
+from crane.identification.hydraulics.orifice_rows import OrificeRows, Sides, terms
 from crane.identification.signals.motion import differentiate
 from crane.machine import Machine
 from crane.recordings.recording import Recording
@@ -102,7 +102,9 @@ class Orifices(Brief):
             period: Likewise.
         """
         signals = cylinder_signals(self.machine, recording, self.joint, period)
-        return sides(self.machine, self.joint, signals, self.values, self.window)
+        return OrificeRows(self.machine, self.joint, signals, self.window, False).sides(
+            self.values
+        )
 
     def to_text(self) -> str:
         """A table of the parameters."""
@@ -197,7 +199,7 @@ def identify_orifices(
         ]
         values, covariance, freedom, condition, misfit = _weak(sets, levels, joint)
     _check_values(values, covariance, joint, method, runs)
-    training = tuple(sides(machine, joint, run, values, window) for run in runs)
+    training = tuple(rows.sides(values) for rows in sets)
     return Orifices(
         machine, joint, method, values, covariance, freedom, condition, misfit, window, training
     )

@@ -6,6 +6,7 @@ from crane.common.samples import Array
 from crane.identification.mechanics.base import Base
 from crane.identification.mechanics.model import Model
 from crane.identification.signals.motion import Motion, low_pass, moving
+from crane.identification.signals.spectrum import below
 
 _FAST = 10.0  # times the frequency of the motion: cutoff of what is compared
 _MOTION = 0.995  # of the power of the coordinates is below that frequency
@@ -126,12 +127,4 @@ def _decomposed(A: Array) -> tuple[Array, Array, Array]:
 
 def motion_frequency(q: Array, step: float) -> float:
     """Below which 99.5 % of the power of coordinates (N, n) is, of the fastest joint [Hz]."""
-    from scipy.signal import periodogram
-
-    frequency, power = periodogram(q - q.mean(axis=0), 1 / step, axis=0, window="hann")
-    share = np.cumsum(power, axis=0)
-    return max(
-        float(frequency[max(1, np.searchsorted(column, _MOTION * column[-1]))])
-        for column in share.T
-        if column[-1] > 0
-    )
+    return max(below(_MOTION, column, step) for column in q.T if np.ptp(column) > 0)

@@ -136,6 +136,11 @@ class Equations:
                 self._memories.setdefault(following, dict(memory))
         return both
 
+    def thinned(self) -> Motion:
+        """The motion at the instants that are left, with the filtered forces."""
+        q, v, a = (x[:: self._thinning] for x in (self._motion.q, self._motion.v, self._motion.a))
+        return Motion(self.time, q, v, a, self.forces)
+
     def modelled(self, values: Array) -> Array:
         """W values (M, n) for columns of parameters (r,), or (r, k) at once: (M, n, k)."""
         out = np.empty((*self.moving.shape, *values.shape[1:]))

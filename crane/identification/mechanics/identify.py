@@ -1,6 +1,5 @@
 """From a recording to parameters."""
 
-import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -17,116 +16,30 @@ from crane.identification.estimation.estimators import (
     least_squares,
     weighted,
 )
+from crane.identification.mechanics.against import check_forces, tell_delays, tell_validation
 from crane.identification.mechanics.base import Base, base_parameters
-from crane.identification.mechanics.checks import (
-    check,
-    check_forces,
-    check_samples,
-    doubt,
-    tell_delays,
-    tell_hum,
-    tell_validation,
-    without_outliers,
-)
-from crane.identification.mechanics.delays import delays, motion_frequency
+from crane.identification.mechanics.delays import delays
 from crane.identification.mechanics.determined import advice, magnitudes
 from crane.identification.mechanics.equations import Equations, Progress
 from crane.identification.mechanics.model import Model, Term
 from crane.identification.mechanics.possible import possible, prior_of_bodies
 from crane.identification.mechanics.priors import check_told, checked
+from crane.identification.mechanics.reading import motion_of
 from crane.identification.mechanics.result import Identification
-from crane.identification.signals.motion import Derivatives, Motion, differentiate, resample
-from crane.identification.signals.outliers import outliers, repaired
+from crane.identification.signals.motion import Motion
+from crane.identification.signals.spectrum import below
 from crane.machine import Machine
-from crane.recordings.measured import moved_locks
-from crane.recordings.recording import FORCE, Recording
+from crane.recordings.recording import Recording
 
 METHODS = {"ols": least_squares, "wls": weighted, "huber": huber}
 _SLOW = 0.02  # of a joint's largest velocity, below which its rows are left out
 _SETTLED = 4.0  # of the velocity over which friction's sign changes, tanh 4 = 0.9993
 _MOVING = 0.5  # of a joint's largest velocity, above which rows count always
-_MOVES = 3.0  # standard deviations of a joint's velocity, above which it moves
 _KNOWN = 0.75  # of the frequency where a smoother passes half: there it passes 91 %
 _TIMES = 3.0  # times the frequency below which 99 % of the velocities are, the filter's least
+_POWER = 0.99
 _FAST = 40.0  # times the frequency below which 99 % of the accelerations are
-_HUM = 10.0  # times the frequency of the motion, above which a line in a spectrum is hum
 _PART = 0.3  # of what is left to do that one pass over a recording is taken for
-
-
-def motion_of(
-    machine: Machine,
-    recording: Recording,
-    derivatives: str = "kalman",
-    cutoff: float | None = None,
-    trust: bool = False,
-    progress: Progress | None = None,
-) -> Motion:
-    """Velocities and accelerations of a recording, which is checked first.
-
-    Outliers are bridged by lines between their neighbours, before anything is filtered.
-
-    Args:
-        machine: What was recorded.
-        recording: With all active joints of the machine.
-        derivatives: "kalman" or "lowpass", see `signals.differentiate`.
-        cutoff: [Hz] of "lowpass".
-        trust: Whether what is most likely wrong with the recording is only told, and outliers
-            are left in.
-        progress: Takes the finished share.
-
-    Raises:
-        RecordingError: What is recorded cannot serve; the message names column and time.
-    """
-    missing = [joint for joint in machine.active if joint not in recording.joints]
-    if missing:
-        listed = ", ".join(f"'{joint}'" for joint in missing)
-        held = " ".join(f"--lock {joint}=VALUE" for joint in missing)
-        raise RecordingError(
-            f"{listed} of '{machine.name}' not recorded, {known(recording.joints)}; lock what was "
-            f"held ({held})"
-        )
-    order = [recording.joints.index(joint) for joint in machine.active]
-    q, v, tau = (x[:, order] for x in (recording.q, recording.v, recording.tau))
-    for joint in machine.active:
-        if recording.units[joint] != machine.unit(joint):
-            raise RecordingError(
-                f"'{joint}' is recorded in {recording.units[joint]}, give {machine.unit(joint)}"
-            )
-    limits = np.column_stack([machine.lower, machine.upper])
-    bounded = limits if np.isfinite(limits).all() else None
-    units = {joint: machine.unit(joint) for joint in machine.active}
-    time = recording.time
-    every = {x: column for x, column in recording.columns().items() if x in machine.locks}
-    for text in moved_locks(machine, every, recording.units | recording.channel_units):
-        doubt(f"{text}, do not lock it, or lock it where it is", trust)
-    names = [x + suffix for suffix in ("", FORCE) for x in machine.active]
-    raw = dict(zip(names, np.column_stack([q, tau]).T, strict=True))
-    check_samples(time, raw)
-    raw = without_outliers(time, raw, trust)
-    q, tau = np.split(np.column_stack(list(raw.values())), 2, axis=1)
-    if np.any(v):  # only compared; where no velocities were recorded, derivatives of outliers
-        v = np.column_stack([repaired(x, outliers(x)) for x in v.T])
-    check(time, q, tau, machine.active, units, v if np.any(v) else None, bounded, trust=trust)
-    del v, raw
-    step = float(np.median(np.diff(time)))
-    columns = np.column_stack([q, tau])
-    if np.abs(np.diff(time) - step).max() > 1e-3 * step:
-        time, columns = resample(time, columns, step)
-    q, tau = np.split(columns, 2, axis=1)
-    lowest = _HUM * motion_frequency(q, step)
-    tell_hum(time, dict(zip(names, columns.T, strict=True)), lowest)
-    found = differentiate(time, q, derivatives, cutoff, progress)
-    return Motion(time, found.q, found.v, found.a, tau, _passed(found))
-
-
-def _passed(found: Derivatives) -> float:
-    """Least of the frequencies [Hz] of which half is left, of the joints that move."""
-    if found.passed is None:
-        return math.inf
-    if found.std_v is None:
-        return float(found.passed.min())
-    moves = found.v.std(axis=0) > _MOVES * np.sqrt(np.mean(found.std_v**2, axis=0))
-    return float(found.passed[moves].min(initial=math.inf))
 
 
 def identify(
@@ -211,8 +124,8 @@ def identify(
         covariance = told.grouping @ estimate.covariance @ told.grouping.T
     training, judged = rows.compare(selection @ values), None
     size = magnitudes(model, told, columns.factors(rows.y, rows.groups))
-    base, bandwidth, limits = rows.base, rows.bandwidth, rows.slow
-    del rows, columns
+    base, bandwidth, limits, remedy = rows.base, rows.bandwidth, rows.slow, advice(machine, motion)
+    del rows, columns, motion
     if validation is not None:
         other = _motion(machine, validation, trust, progress)
         judge = Equations(model, base, other, bandwidth, limits, progress)
@@ -222,7 +135,7 @@ def identify(
         finished(1.0)
     found = Identification(
         model, told, values, covariance, parameters, estimate, method, feasible, training, size,
-        advice(machine, motion), judged,
+        remedy, judged,
     )  # fmt: skip
     if found.doubt:
         warnings.warn(found.doubt, CraneWarning, stacklevel=2)
@@ -261,11 +174,8 @@ def _motion(
 
 def _check_forces(model: Model, motion: Motion, rows: Equations, trust: bool) -> None:
     """Doubts about the forces of a recording, by what the model can say."""
-    every = max(1, round((rows.time[1] - rows.time[0]) / (motion.time[1] - motion.time[0])))
-    q, v, a = (x[::every] for x in (motion.q, motion.v, motion.a))
     modelled = rows.compare(rows.base.values(model.nominal)).modelled
-    thinned = Motion(rows.time, q, v, a, rows.forces)
-    check_forces(thinned, modelled, model.machine.active, trust=trust)
+    check_forces(rows.thinned(), modelled, model.machine.active, trust=trust)
     tell_delays(model.machine.active, *delays(model, rows.base, motion, rows.slow))
 
 
@@ -323,14 +233,9 @@ def _bandwidth(motion: Motion) -> float:
 
 def _fastest(x: Array, step: float) -> float:
     """Frequency [Hz] below which 99 % of the power of each of the signals (N, n) is."""
-    from scipy.signal import periodogram
-
-    size = np.maximum(x.std(axis=0), 1e-300)
-    frequency, power = periodogram(x / size, 1 / step, axis=0, window="hann")
-    share = np.cumsum(power, axis=0)
-    last = [
-        float(frequency[np.searchsorted(column, 0.99 * column[-1])])
-        for column, moved in zip(share.T, np.ptp(x, axis=0), strict=True)
-        if moved > 0
+    found = [
+        below(_POWER, column / max(column.std(), 1e-300), step)
+        for column in x.T
+        if np.ptp(column) > 0
     ]
-    return max([*last, float(frequency[1])])
+    return max(found, default=1 / (len(x) * step))

@@ -70,7 +70,13 @@ class Inertial:
 
     def columns(self, at: Samples) -> Array:
         """See `Term`."""
-        return self._dynamics.regressor(at.q_a, at.v_a, at.a_a)
+        return inertial_columns(self._dynamics, at)
+
+
+def inertial_columns(dynamics: Dynamics, at: Samples) -> Array:
+    """`Dynamics.regressor` (N, n, 10 nb) along a motion, whose loops are closed already."""
+    found = dynamics.at("regressor", at.q, at.v_a, at.a_a)
+    return found.reshape(*at.v_a.shape, -1)
 
 
 def body_names(machine: Machine) -> tuple[str, ...]:
@@ -316,13 +322,14 @@ def default_terms(machine: Machine) -> list[Term]:
 class Model:
     """The parameters of a machine and their linear effect on the drives' forces.
 
-        tau_A = W(q_A, v_A, a_A) beta - gamma^T f,
+        tau_A = W(q_A, v_A, a_A) beta + known,
 
-    f the passive forces of the machine that no term scales.
+    known = -gamma^T f with the passive forces f of the machine that no term scales.
 
     Args:
         machine: The machine.
         terms: Groups of columns; `default_terms` if not given.
+        known: Samples -> (N, n), in the place of these forces.
 
     Attributes:
         names: (p,) of the parameters.
@@ -335,7 +342,12 @@ class Model:
         InputError: Two parameters of the same name.
     """
 
-    def __init__(self, machine: Machine, terms: Sequence[Term] | None = None):
+    def __init__(
+        self,
+        machine: Machine,
+        terms: Sequence[Term] | None = None,
+        known: Callable[[Samples], Array] | None = None,
+    ):
         self.machine = machine
         self.terms = list(default_terms(machine) if terms is None else terms)
         self.terms.sort(key=lambda term: not isinstance(term, Inertial))
@@ -351,7 +363,8 @@ class Model:
             name.removesuffix(".gas_scale") for name in self.names if name.endswith(".gas_scale")
         }
         rest = tuple(spring for spring in machine.gas_springs if spring.joint not in scaled)
-        self._known = Dynamics(machine.replace(gas_springs=rest))
+        self._forces = JointForces(machine.replace(gas_springs=rest))
+        self._given = known
 
     def samples(
         self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike, starts: Sequence[int] = (0,)
@@ -371,5 +384,8 @@ class Model:
         return np.concatenate([term.columns(at) for term in self.terms], axis=2)
 
     def known(self, at: Samples) -> Array:
-        """Forces that no parameter changes, -gamma^T f, (N, n): tau = W beta + known."""
-        return -self._known.passive(at.q_a, at.v_a)
+        """Forces (N, n) that no parameter changes: tau = W beta + known."""
+        if self._given is not None:
+            return self._given(at)
+        force = self._forces.passive(at.q, np.einsum("kij,kj->ki", at.gamma, at.v_a))
+        return -np.einsum("kij,ki->kj", at.gamma, force)

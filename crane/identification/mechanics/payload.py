@@ -1,5 +1,6 @@
 """Mass and centre of mass of a load from a recording of a machine that is known."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import NoReturn
 
@@ -9,12 +10,19 @@ from crane.common.errors import InputError, RecordingError, known
 from crane.common.samples import Array, Brief
 from crane.dynamics import Dynamics
 from crane.identification.estimation.regressor import triangular
+from crane.identification.mechanics.against import check_forces
 from crane.identification.mechanics.base import Base
-from crane.identification.mechanics.checks import check_forces
 from crane.identification.mechanics.equations import Equations, Progress
 from crane.identification.mechanics.feasible import body_parameters, pseudo_inertia
-from crane.identification.mechanics.identify import METHODS, equations_of, in_parts, motion_of
-from crane.identification.mechanics.model import PER_BODY, Model, Samples, friction
+from crane.identification.mechanics.identify import METHODS, equations_of, in_parts
+from crane.identification.mechanics.model import (
+    PER_BODY,
+    Model,
+    Samples,
+    friction,
+    inertial_columns,
+)
+from crane.identification.mechanics.reading import motion_of
 from crane.identification.mechanics.result import Comparison, aligned
 from crane.identification.signals.motion import Motion, moving
 from crane.machine import Machine
@@ -53,8 +61,7 @@ class Load:
 
     def columns(self, at: Samples) -> Array:
         """See `model.Term`."""
-        rows = self._dynamics.regressor(at.q_a, at.v_a, at.a_a)
-        return rows[:, :, self._columns] @ self._turn
+        return inertial_columns(self._dynamics, at)[:, :, self._columns] @ self._turn
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -188,16 +195,23 @@ def estimate_payload(
     if not isinstance(motion, Motion):
         motion = motion_of(machine, motion, trust=trust, progress=progress)
     load = Load(machine, frame, inertia)
-    own = Dynamics(machine).inverse(motion.q, motion.v, motion.a, friction=True)
-    moves = np.flatnonzero(np.ptp(motion.v, axis=0) > 0)
-    names = [machine.active[i] for i in moves]
-    q, v, a, tau = (x[:, moves] for x in (motion.q, motion.v, motion.a, motion.tau))
-    check_forces(Motion(motion.time, q, v, a, tau), own[:, moves], names, trust=trust)
-    rest = Motion(motion.time, motion.q, motion.v, motion.a, motion.tau - own)
+    moves = np.ptp(motion.v, axis=0) > 0
+    names = [joint for joint, moved in zip(machine.active, moves, strict=True) if moved]
+    dynamics = Dynamics(machine)
+
+    def own(at: Samples) -> Array:
+        """Forces (N, n) of the machine without the load."""
+        return dynamics.at("inverse with friction", at.q, at.v_a, at.a_a)
+
     bare = machine.replace(friction={}, forces=(), gas_springs=(), end_stops=())
     extra = [friction(bare, joint, ("coulomb",), smoothing=0.0) for joint in names]
-    model = Model(bare, [load, *extra])
-    rows, base = equations_of(model, rest, progress=progress)
+    model = Model(bare, [load, *extra], own)
+    # weight tells a load: what smoothing takes from the accelerations bounds no bandwidth
+    rows, base = equations_of(model, replace(motion, passed=math.inf), progress=progress)
+    thinned = rows.thinned()
+    q, v, a, tau = (x[:, moves] for x in (thinned.q, thinned.v, thinned.a, thinned.tau))
+    moved = Motion(thinned.time, q, v, a, tau)
+    check_forces(moved, rows.offset[:, moves], names, trust=trust)
     columns = rows.selection(base)
     found = METHODS[method](rows.columns(columns), rows.y, rows.groups, rows.samples)
     told, directions = _told(base)
@@ -226,7 +240,10 @@ def estimate_payload(
     }
     estimate = PayloadEstimate(
         frame, mass, com, covariance, freedom, directions, corrections, None,
-        rows.compare(columns @ found.values),
+        Comparison(
+            rows.time, rows.forces - rows.offset, rows.modelled(columns @ found.values),
+            rows.moving, machine.active,
+        ),
     )  # fmt: skip
     low, high = estimate.interval()[0].tolist()
     own_mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])

@@ -156,13 +156,13 @@ class Identification:
 
     @property
     def doubt(self) -> str:
-        """One line on what is not determined or impossible, "" where nothing is."""
+        """One line on the parameters not determined or impossible, "" where none is."""
         vague, wrong = (
             [name for name, mark in zip(self.names, self.marks, strict=True) if mark == kind]
             for kind in ("not determined", "impossible")
         )
         parts = []
-        if vague or self.undetermined:
+        if vague:  # combinations of such as are determined each the table names without a warning
             weakest = self.undetermined[0][1] if self.undetermined else vague[0]
             parts.append(
                 f"this motion does not determine {len(vague)} of {len(self.names)} base "

@@ -14,6 +14,7 @@ from crane.identification.signals.smoother import smooth
 _FEWEST = 50  # samples
 _LONGEST_GAP = 5.0  # steps
 _JITTER = 0.01  # steps
+_EVEN = 1e-3  # steps, by which one may differ from the others
 _WINDOW = np.array([0.35875, 0.48829, 0.14128, 0.01168])  # Blackman and Harris, about its middle
 _WINDOW_LENGTH = 1.3332  # over 1 / cutoff
 
@@ -139,6 +140,15 @@ def resample(time: Array, columns: Array, step: float) -> tuple[Array, Array]:
     count = math.floor((time[-1] - time[0]) / step * (1 + 1e-9)) + 1
     instants = time[0] + step * np.arange(count)
     return instants, CubicSpline(time, columns)(instants)
+
+
+def evenly(time: Array, columns: Array) -> tuple[Array, Array]:
+    """Equidistant instants and the columns (N, ...) there: resampled if they are not already."""
+    steps = np.diff(time)
+    step = float(np.median(steps))
+    if np.abs(steps - step).max() <= _EVEN * step:
+        return time, columns
+    return resample(time, columns, step)
 
 
 def check_gaps(time: Array) -> None:

@@ -1,0 +1,144 @@
+"""Recorded forces against a model's: wrong units, signs and delays, and fits that do not carry."""
+
+import math
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+
+from crane.common.errors import CraneWarning
+from crane.common.samples import Array
+from crane.identification.mechanics.checks import delay, doubt, shifted
+from crane.identification.mechanics.result import Comparison
+from crane.identification.signals.motion import Motion, sampling
+
+_FACTOR = 30.0  # by which a force may be off from what the model says
+_SHAPE = 0.9  # correlation from which a model is believed on a factor
+_BLOCKS = 10  # of time, whose scatter is the standard error of that factor
+_WORSE = 4.0  # times the training's error, from which a validation is remarked on
+_CERTAIN = 0.999  # probability of a delay that is told
+
+
+def check_forces(
+    motion: Motion,
+    modelled: Array,
+    joints: Sequence[str],
+    longest_delay: float = 0.05,
+    trust: bool = False,
+) -> None:
+    """Compare recorded forces with those (N, n) of a model, of rough parameters even.
+
+    What friction and rotors can make counts for nothing: the scale c of a joint is that of the
+    regression tau = c modelled + c0 + c1 sign(v) + c2 v + c3 |v| + c4 a, its standard error the
+    scatter of ten blocks of time. Where the model has hardly a share in the force besides, c says
+    nothing, and a force that is many times the model's is a doubt that is told, not refused.
+
+    Raises:
+        RecordingError: It is sure that they differ by more than a factor of thirty, in sign, or
+            that they come late or early.
+    """
+    doubtful = []
+    for i, joint in enumerate(joints):
+        measured, expected = motion.tau[:, i], modelled[:, i]
+        if np.ptp(expected) == 0 or np.ptp(measured) == 0:
+            continue
+        scale, error, alike = _scale(measured, expected, motion.v[:, i], motion.a[:, i])
+        size = abs(scale)
+        if alike > _SHAPE and not 1 / _FACTOR < size < _FACTOR and error < size / 4:
+            power = math.log10(max(size, 1e-300))
+            looks = "look at its unit and its gear ratio"
+            if 2.3 < abs(power) < 3.7:
+                looks = f"it looks {'1000-fold' if power > 0 else 'like kN'}, give SI units"
+            doubt(f"'{joint}_force' is {scale:.3g} times the model's, {looks}", trust)
+            continue
+        if alike > _SHAPE and scale < -4 * error and size > 1 / _FACTOR:
+            text = f"'{joint}_force' is {scale:.2g} times the model's, turn its sign"
+            doubt(text, trust)
+            continue
+        ratio = math.sqrt(np.mean(measured**2) / np.mean(expected**2))
+        known = 1 / _FACTOR < size < _FACTOR and error < size / 2
+        if not known and not 1 / _FACTOR < ratio < _FACTOR:
+            doubtful.append(f"'{joint}_force' is {ratio:.3g} times the model's")
+        late = delay(motion.time, expected, measured)
+        # a rough model is believed on a delay only if that explains nearly everything: a force
+        # that friction makes looks like inertia's a quarter period later
+        if not 0.5 < ratio < 2.0:
+            continue
+        near = _alike(expected, measured, round(late / sampling(motion.time)))
+        if abs(late) > longest_delay and near > max(0.9, _alike(expected, measured, 0) + 0.05):
+            doubt(shifted(f"{joint}_force", late, "its model"), trust)
+    if doubtful:
+        text = (
+            f"{', '.join(doubtful)}: friction and rotors may outweigh the bodies there, or the "
+            "unit is wrong, this recording cannot say"
+        )
+        warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def tell_delays(
+    joints: Sequence[str], late: Array, std: Array, blocks: int, longest_delay: float = 0.05
+) -> None:
+    """Warn of forces that come late, by what `delays.delays` found (n,) [s].
+
+    Early ones only where friction cannot be the reason: by more than `longest_delay`.
+    """
+    from scipy.stats import t
+
+    if not blocks:
+        return
+    limit, told = float(t.ppf(_CERTAIN, blocks - 1)), []
+    for joint, seconds, error in zip(joints, late, std, strict=True):
+        if seconds > limit * error or seconds < -max(longest_delay, limit * error):
+            side = "behind" if seconds > 0 else "ahead of"
+            told.append(
+                f"'{joint}_force' is {1e3 * abs(seconds):.0f} ms (+- {1e3 * error:.1g}) {side} its"
+                " motion"
+            )
+    if told:
+        text = f"{', '.join(told)}: record them with one clock, or shift them"
+        warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def tell_validation(training: Comparison, validation: Comparison) -> None:
+    """Warn where a fit predicts far worse than it fits, both relative and in N or N m."""
+    told = []
+    pairs = zip(
+        training.joints, training.relative, validation.relative, training.rmse, validation.rmse,
+        strict=True,
+    )  # fmt: skip
+    for joint, fitted, judged, rmse, other in pairs:
+        if judged > _WORSE * fitted and other > _WORSE * rmse:
+            told.append(f"'{joint}' {judged / fitted:.3g} times ({100 * judged:.3g} %)")
+    if told:
+        text = (
+            f"errors on the validation are far above those on the training: {', '.join(told)}: "
+            "the recordings do not belong together, or too little is told by the first one"
+        )
+        warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def _scale(y: Array, x: Array, v: Array, a: Array) -> tuple[float, float, float]:
+    """Scale of y against x with friction and rotors beside it, standard error, correlation."""
+    others = np.column_stack([np.ones_like(v), np.sign(v), v, np.abs(v), a])
+    size = np.linalg.norm(others, axis=0)
+    U, values, _ = np.linalg.svd(others / np.where(size > 0, size, 1.0), full_matrices=False)
+    U = U[:, values > 1e-9 * values[0]]
+    left, energy = [], []
+    for column in (y, x):
+        rest = column - U @ (U.T @ column)
+        left.append(rest)
+        energy.append(float(rest @ rest))
+        if energy[-1] < 1e-18 * float(column @ column):  # all of it is friction's
+            return 0.0, math.inf, 0.0
+    scale = float(left[0] @ left[1]) / energy[1]
+    off = left[1] * (left[0] - scale * left[1])
+    parts = np.array([part.sum() for part in np.array_split(off, _BLOCKS)])
+    error = math.sqrt(float(parts @ parts) * _BLOCKS / (_BLOCKS - 1)) / energy[1]
+    return scale, error, abs(scale) * math.sqrt(energy[1] / energy[0])
+
+
+def _alike(one: Array, other: Array, shift: int) -> float:
+    """Correlation of one signal with another that comes so many samples later."""
+    count = len(one) - abs(shift)
+    late = max(shift, 0), max(-shift, 0)
+    return float(np.corrcoef(one[late[1] :][:count], other[late[0] :][:count])[0, 1])

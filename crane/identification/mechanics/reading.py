@@ -1,0 +1,112 @@
+"""From a recording to a motion: what is wrong with it is told, derivatives are found."""
+
+import math
+
+import numpy as np
+
+from crane.common.errors import RecordingError, known
+from crane.common.samples import Array
+from crane.identification.mechanics.checks import (
+    check,
+    check_samples,
+    doubt,
+    tell_hum,
+    without_outliers,
+)
+from crane.identification.mechanics.delays import motion_frequency
+from crane.identification.mechanics.equations import Progress
+from crane.identification.signals.motion import Derivatives, Motion, differentiate, evenly
+from crane.identification.signals.outliers import outliers, repaired
+from crane.machine import Machine
+from crane.recordings.measured import moved_locks
+from crane.recordings.recording import FORCE, Recording
+
+_MOVES = 3.0  # standard deviations of a joint's velocity, above which it moves
+_HUM = 10.0  # times the frequency of the motion, above which a line in a spectrum is hum
+
+
+def motion_of(
+    machine: Machine,
+    recording: Recording,
+    derivatives: str = "kalman",
+    cutoff: float | None = None,
+    trust: bool = False,
+    progress: Progress | None = None,
+) -> Motion:
+    """Velocities and accelerations of a recording, which is checked first.
+
+    Outliers are bridged by lines between their neighbours, before anything is filtered.
+
+    Args:
+        machine: What was recorded.
+        recording: With all active joints of the machine.
+        derivatives: "kalman" or "lowpass", see `signals.differentiate`.
+        cutoff: [Hz] of "lowpass".
+        trust: Whether what is most likely wrong with the recording is only told, and outliers
+            are left in.
+        progress: Takes the finished share.
+
+    Raises:
+        RecordingError: What is recorded cannot serve; the message names column and time.
+    """
+    order = _columns(machine, recording)
+    every = {x: column for x, column in recording.columns().items() if x in machine.locks}
+    for text in moved_locks(machine, every, recording.units | recording.channel_units):
+        doubt(f"{text}, do not lock it, or lock it where it is", trust)
+    time, n = recording.time, len(order)
+    check_samples(time)
+    names = [x + suffix for suffix in ("", FORCE) for x in machine.active]
+    columns = without_outliers(
+        time, names, np.column_stack([recording.q[:, order], recording.tau[:, order]]), trust
+    )
+    _check(machine, time, columns, recording.v[:, order], trust)
+    time, columns = evenly(time, columns)
+    step = float(np.median(np.diff(time)))
+    lowest = _HUM * motion_frequency(columns[:, :n], step)
+    tell_hum(time, dict(zip(names, columns.T, strict=True)), lowest)
+    found = differentiate(time, columns[:, :n], derivatives, cutoff, progress)
+    return Motion(time, found.q, found.v, found.a, columns[:, n:], _passed(found))
+
+
+def _columns(machine: Machine, recording: Recording) -> list[int]:
+    """Which of a recording's joints the machine's active ones are.
+
+    Raises:
+        RecordingError: One is missing, or in another unit.
+    """
+    missing = [joint for joint in machine.active if joint not in recording.joints]
+    if missing:
+        listed = ", ".join(f"'{joint}'" for joint in missing)
+        held = " ".join(f"--lock {joint}=VALUE" for joint in missing)
+        raise RecordingError(
+            f"{listed} of '{machine.name}' not recorded, {known(recording.joints)}; lock what was "
+            f"held ({held})"
+        )
+    for joint in machine.active:
+        if recording.units[joint] != machine.unit(joint):
+            raise RecordingError(
+                f"'{joint}' is recorded in {recording.units[joint]}, give {machine.unit(joint)}"
+            )
+    return [recording.joints.index(joint) for joint in machine.active]
+
+
+def _check(machine: Machine, time: Array, columns: Array, v: Array, trust: bool) -> None:
+    """Refuse coordinates and forces (N, 2 n), and velocities (N, n) as recorded, by `check`."""
+    q, tau = np.split(columns, 2, axis=1)
+    recorded = None
+    if np.any(v):  # only compared; where none were recorded, derivatives of outliers
+        recorded = np.column_stack([repaired(x, outliers(x)) for x in v.T])
+    limits = np.column_stack([machine.lower, machine.upper])
+    bounded = limits if np.isfinite(limits).all() else None
+    units = {joint: machine.unit(joint) for joint in machine.active}
+    check(time, q, tau, machine.active, units, recorded, bounded, trust=trust)
+
+
+def _passed(found: Derivatives) -> float:
+    """Least of the frequencies [Hz] of which half is left, of the joints that move."""
+    if found.passed is None:
+        return math.inf
+    if found.std_v is None:
+        return float(found.passed.min())
+    moves = found.v.std(axis=0) > _MOVES * np.sqrt(np.mean(found.std_v**2, axis=0))
+    return float(found.passed[moves].min(initial=math.inf))
