@@ -8,7 +8,10 @@ if TYPE_CHECKING:
     from crane.common.errors import CraneError, CraneWarning
     from crane.control import (
         PI,
+        Command,
         ComputedTorque,
+        Controller,
+        Law,
         Sampled,
         Signals,
         TipVelocity,
@@ -19,13 +22,24 @@ if TYPE_CHECKING:
     from crane.description import EndStop, ForceElement, Friction, GasSpring, PIGains
     from crane.dynamics import Dynamics
     from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
-    from crane.identification.hydraulics.cylinder_friction import cylinder_friction
+    from crane.formats.check import check
+    from crane.hydraulics import PDGains
+    from crane.identification.excitation.excite import Excitation, excite
+    from crane.identification.hydraulics.cylinder_friction import identify_cylinder_friction
     from crane.identification.hydraulics.orifices import identify_orifices
     from crane.identification.hydraulics.valve import identify_valve
     from crane.identification.mechanics.identify import identify
+    from crane.identification.mechanics.payload import identify_payload
     from crane.identification.mechanics.result import Identification
     from crane.machine import Machine, Payload
-    from crane.motion import Kinematics, Path, point_to_point, polynomial, task_path, tip_path
+    from crane.motion import (
+        Kinematics,
+        Trajectory,
+        point_to_point,
+        polynomial,
+        task_trajectory,
+        tip_trajectory,
+    )
     from crane.motion.workspaces import Workspace, workspace
     from crane.recordings import Recording
     from crane.recordings.measured import read_measured
@@ -37,88 +51,51 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
-    "crane.closure": ("Closure",),
-    "crane.common.errors": (
-        "CraneError",
-        "CraneWarning",
-    ),
-    "crane.control": (
-        "PI",
-        "ComputedTorque",
-        "Sampled",
-        "Signals",
-        "TipVelocity",
-        "ValveDrive",
-        "ValvePD",
-        "joystick",
-    ),
-    "crane.description": (
-        "EndStop",
-        "ForceElement",
-        "Friction",
-        "GasSpring",
-        "PIGains",
-    ),
-    "crane.dynamics": ("Dynamics",),
-    "crane.formats": (
-        "load",
-        "write_machine",
-        "write_mjcf",
-        "write_urdf_plus",
-    ),
-    "crane.identification.hydraulics.cylinder_friction": ("cylinder_friction",),
-    "crane.identification.hydraulics.orifices": ("identify_orifices",),
-    "crane.identification.hydraulics.valve": ("identify_valve",),
-    "crane.identification.mechanics.identify": ("identify",),
-    "crane.identification.mechanics.result": ("Identification",),
-    "crane.machine": (
-        "Machine",
-        "Payload",
-    ),
-    "crane.motion": (
-        "Kinematics",
-        "Path",
-        "point_to_point",
-        "polynomial",
-        "task_path",
-        "tip_path",
-    ),
-    "crane.motion.workspaces": (
-        "Workspace",
-        "workspace",
-    ),
-    "crane.recordings": ("Recording",),
-    "crane.recordings.measured": ("read_measured",),
-    "crane.simulation": (
-        "Batch",
-        "Comparison",
-        "replay",
-        "simulate",
-        "simulate_batch",
-    ),
-    "crane.studies": (
-        "Study",
-        "study",
-    ),
-    "crane.view.page": ("report",),
-    "crane.view.sketch": ("sketch",),
+    "crane.closure": "Closure",
+    "crane.common.errors": "CraneError CraneWarning",
+    "crane.control": "PI Command ComputedTorque Controller Law Sampled Signals TipVelocity "
+    "ValveDrive ValvePD joystick",
+    "crane.description": "EndStop ForceElement Friction GasSpring PIGains",
+    "crane.dynamics": "Dynamics",
+    "crane.formats": "load write_machine write_mjcf write_urdf_plus",
+    "crane.formats.check": "check",
+    "crane.hydraulics": "PDGains",
+    "crane.identification.excitation.excite": "Excitation excite",
+    "crane.identification.hydraulics.cylinder_friction": "identify_cylinder_friction",
+    "crane.identification.hydraulics.orifices": "identify_orifices",
+    "crane.identification.hydraulics.valve": "identify_valve",
+    "crane.identification.mechanics.identify": "identify",
+    "crane.identification.mechanics.payload": "identify_payload",
+    "crane.identification.mechanics.result": "Identification",
+    "crane.machine": "Machine Payload",
+    "crane.motion": "Kinematics Trajectory point_to_point polynomial task_trajectory "
+    "tip_trajectory",
+    "crane.motion.workspaces": "Workspace workspace",
+    "crane.recordings": "Recording",
+    "crane.recordings.measured": "read_measured",
+    "crane.simulation": "Batch Comparison replay simulate simulate_batch",
+    "crane.studies": "Study study",
+    "crane.view.page": "report",
+    "crane.view.sketch": "sketch",
 }
 
 __all__ = [
-    "PI", "Batch", "Closure", "Comparison", "ComputedTorque", "CraneError", "CraneWarning",
-    "Dynamics", "EndStop", "ForceElement", "Friction", "GasSpring", "Identification", "Kinematics",
-    "Machine", "PIGains", "Path", "Payload", "Recording", "Sampled", "Signals", "Study",
-    "TipVelocity", "ValveDrive", "ValvePD", "Workspace", "cylinder_friction", "identify",
-    "identify_orifices", "identify_valve", "joystick", "load", "point_to_point", "polynomial",
-    "read_measured", "replay", "report", "simulate", "simulate_batch", "sketch", "study",
-    "task_path", "tip_path", "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
+    "PI", "Batch", "Closure", "Command", "Comparison", "ComputedTorque", "Controller",
+    "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation", "ForceElement", "Friction",
+    "GasSpring", "Identification", "Kinematics", "Law", "Machine", "PDGains", "PIGains",
+    "Payload", "Recording", "Sampled", "Signals", "Study", "TipVelocity", "Trajectory",
+    "ValveDrive", "ValvePD", "Workspace", "check", "excite", "identify",
+    "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
+    "joystick", "load", "point_to_point", "polynomial", "read_measured", "replay", "report",
+    "simulate", "simulate_batch", "sketch", "study", "task_trajectory", "tip_trajectory",
+    "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
     # imports run when a name is first used, so that `crane --help` answers at once
     for module, names in _HOMES.items():
-        if name in names:
+        if name in names.split():
             return getattr(import_module(module), name)
     raise AttributeError(f"module 'crane' has no attribute '{name}'")
 

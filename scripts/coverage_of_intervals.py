@@ -35,7 +35,7 @@ def main() -> None:
     machine = crane.load("mini_forwarder")
     given = terms if options.tuned else default_terms
     settings = {"slow": SLOW, "bandwidth": BANDWIDTH} if options.tuned else {}
-    path = excite(machine, Model(machine, terms(machine)), seed=0).path
+    path = excite(machine, Model(machine, terms(machine)), seed=0).trajectory
     found: dict[str, list[tuple[float, bool]]] = {}
     shares = []
     for seed in range(options.first, options.first + options.rigs):

@@ -24,14 +24,14 @@ def engines_of(machine: crane.Machine) -> dict[str, Engine]:
     v, nq = machine.closure.gamma(q) @ v_a, machine.model.nq
     kinematics, free, peer = Kinematics(machine), Free(machine), ConstraintDynamics(machine)
     fast = Runner(machine, free, q_a, v_a)
-    slow = PythonStepper(crane.Dynamics(machine, path="pinocchio"), free, 0)
+    slow = PythonStepper(crane.Dynamics(machine, backend="pinocchio"), free, 0)
     mujocos = {(name, h): MuJoCo(machine, h, name) for name in INTEGRATORS for h in STEPS}
 
     def ours(step: float) -> Tip:
         state = fast.run(step, round(DURATION / step))
         return lambda: kinematics.position_at(state[:nq])
 
-    def pinocchio_path(step: float) -> Tip:
+    def pinocchio_backend(step: float) -> Tip:
         state = np.concatenate([q, v_a, np.zeros(2)])
         for i in range(round(DURATION / step)):
             rate, _ = slow.observe(i * step, state)
@@ -52,8 +52,8 @@ def engines_of(machine: crane.Machine) -> dict[str, Engine]:
         return run
 
     return {
-        "compiled path": ours,
-        "Pinocchio path": pinocchio_path,
+        "compiled backend": ours,
+        "Pinocchio backend": pinocchio_backend,
         "constraintDynamics": constraints,
         **{f"MuJoCo {name}": mujoco(name) for name in INTEGRATORS},
     }
@@ -63,7 +63,7 @@ def work_precision(machine: crane.Machine, rounds: int, picture: Path | None) ->
     """Tip error after `DURATION` over CPU time."""
     engines = engines_of(machine)
     steps = {step: round(DURATION / step) for step in STEPS}
-    reference = engines["compiled path"](2e-5)()
+    reference = engines["compiled backend"](2e-5)()
     q_a, v_a = START
     dynamics, none = crane.Dynamics(machine), np.zeros(len(q_a))
 
@@ -103,7 +103,7 @@ def work_precision(machine: crane.Machine, rounds: int, picture: Path | None) ->
     ]
     head = ("tip error [m], CPU time [ms]", *(f"{1e3 * step:g} ms" for step in STEPS))
     note = (
-        "Reference: the compiled path with steps of 0.02 ms; scipy's DOP853 on "
+        "Reference: the compiled backend with steps of 0.02 ms; scipy's DOP853 on "
         f"`Dynamics.forward` ends {gap:.0e} m from it."
     )
     return "\n\n".join([table(head, rows), note, table(*ratios(curves))])

@@ -10,7 +10,7 @@ from subject import START, FormulaLoop, Runner, along
 
 import crane
 from crane.control import PI, ComputedTorque, Free, Law, ValveDrive, ValvePD
-from crane.motion.trajectories import task_path
+from crane.motion.trajectories import task_trajectory
 
 
 def agree(machine: crane.Machine) -> str:
@@ -28,8 +28,8 @@ def agree(machine: crane.Machine) -> str:
         soft.append(engine.acceleration()[active])
     give = np.array([1e-4 / 0.9999, 2e-4 / 0.9998, 4e-4 / 0.9996])
     others = {
-        "Pinocchio path": (
-            crane.Dynamics(machine, path="pinocchio").forward(q_a, v_a, rest),
+        "Pinocchio backend": (
+            crane.Dynamics(machine, backend="pinocchio").forward(q_a, v_a, rest),
             1e-11,
         ),
         "pin.constraintDynamics": (ConstraintDynamics(machine).acceleration(q, v)[active], 1e-9),
@@ -47,7 +47,7 @@ def agree(machine: crane.Machine) -> str:
     give_way = np.abs(soft[0] - ours).max() / np.abs(ours).max()
     return (
         f"All engines carry {mass:.4f} kg. Largest difference of their accelerations at the start "
-        f"from the compiled path, relative: {', '.join(gaps)} (MuJoCo's in the limit of rigid "
+        f"from the compiled backend, relative: {', '.join(gaps)} (MuJoCo's in the limit of rigid "
         f"connections; with its largest impedance, 0.9999, it is {give_way:.0e})."
     )
 
@@ -57,7 +57,7 @@ def forward_dynamics(machine: crane.Machine, rounds: int) -> str:
     q_a, v_a = along(2000)
     tau = np.zeros_like(q_a)
     q = machine.closure.solve(q_a)
-    ours, slow = crane.Dynamics(machine), crane.Dynamics(machine, path="pinocchio")
+    ours, slow = crane.Dynamics(machine), crane.Dynamics(machine, backend="pinocchio")
     samples = list(zip(q_a, v_a, tau, strict=True))
     rates = (ours.at("rates", *sample) for sample in zip(q, v_a, tau, strict=True))
     states = [(x, rate[: machine.model.nv]) for x, rate in zip(q, rates, strict=True)]
@@ -66,12 +66,12 @@ def forward_dynamics(machine: crane.Machine, rounds: int) -> str:
     model, data = machine.model, machine.model.createData()
     few = samples[:100]
     calls: dict[str, Call] = {
-        "compiled path, the formula in a loop of machine code, posture given": formula.run,
+        "compiled backend, the formula in a loop of machine code, posture given": formula.run,
         "the same, called through ctypes": formula.call_each,
-        "compiled path, a stack (loops closed, everything in machine code)": (
+        "compiled backend, a stack (loops closed, everything in machine code)": (
             lambda: ours.forward(q_a, v_a, tau)
         ),
-        "compiled path, one sample called from Python (loops closed)": (
+        "compiled backend, one sample called from Python (loops closed)": (
             lambda: [ours.forward(*sample) for sample in samples]
         ),
         "`pin.rnea` of the spanning tree, called from Python": (
@@ -83,7 +83,7 @@ def forward_dynamics(machine: crane.Machine, rounds: int) -> str:
         "`pin.normalize`, which has nothing to do here, called from Python": (
             lambda: [pin.normalize(model, x) for x, _ in states]
         ),
-        "Pinocchio path, one sample called from Python (loops closed)": (
+        "Pinocchio backend, one sample called from Python (loops closed)": (
             lambda: [slow.forward(*sample) for sample in few]
         ),
     }
@@ -96,7 +96,7 @@ def forward_dynamics(machine: crane.Machine, rounds: int) -> str:
 
 def one_step(mini: crane.Machine, bare: crane.Machine, rounds: int) -> str:
     """One step of each integrator at 1 ms."""
-    path = task_path(mini, "lift")
+    path = task_trajectory(mini, "lift")
     start = path(0.0)
     full, plain = Runner(mini, PI(mini, path), *start[:2]), Runner(bare, Free(bare), *START)
     q = bare.closure.solve(START[0])
@@ -108,8 +108,8 @@ def one_step(mini: crane.Machine, bare: crane.Machine, rounds: int) -> str:
         engines[name].run(1000)
 
     calls: dict[str, Call] = {
-        "compiled path, RK4, with friction and PI controllers": lambda: full.run(1e-3, 1000),
-        "compiled path, RK4, springs and dampers only": lambda: plain.run(1e-3, 1000),
+        "compiled backend, RK4, with friction and PI controllers": lambda: full.run(1e-3, 1000),
+        "compiled backend, RK4, springs and dampers only": lambda: plain.run(1e-3, 1000),
         "MuJoCo Euler, springs and dampers only": lambda: theirs("Euler"),
         "MuJoCo implicitfast, springs and dampers only": lambda: theirs("implicitfast"),
         "MuJoCo RK4, springs and dampers only": lambda: theirs("RK4"),
@@ -121,12 +121,12 @@ def one_step(mini: crane.Machine, bare: crane.Machine, rounds: int) -> str:
 def task(mini: crane.Machine, rounds: int) -> str:
     """Ten seconds of tasks at 1 ms: from call to recording, over the loop in machine code."""
     valves = crane.load("patu655")
-    lift, push = task_path(mini, "lift"), task_path(valves, "push")
+    lift, push = task_trajectory(mini, "lift"), task_trajectory(valves, "push")
 
     def driven() -> ValveDrive:
         return ValveDrive(valves, ValvePD(valves, push))
 
-    cases: dict[str, tuple[crane.Machine, Callable[[], Law], crane.Path]] = {
+    cases: dict[str, tuple[crane.Machine, Callable[[], Law], crane.Trajectory]] = {
         "`mini_forwarder` lifts, `PI`": (mini, lambda: PI(mini, lift), lift),
         "the same, `ComputedTorque`": (mini, lambda: ComputedTorque(mini, lift), lift),
         "`patu655` pushes on its valves, `ValvePD`": (valves, driven, push),

@@ -28,8 +28,8 @@ def hydraulic_crane(rounds: int) -> str:
     for step in (1e-3, 1e-2):
         took = sorted(spent(60.0, step=step) for _ in range(rounds))[rounds // 2]
         rows.append((f"crane, recorded every {1e3 * step:g} ms", took, 60.0))
-    slow = spent(_SHORT, step=1e-2, path="pinocchio")
-    rows.append(("scipy's BDF on Pinocchio's path", slow, _SHORT))
+    slow = spent(_SHORT, step=1e-2, backend="pinocchio")
+    rows.append(("scipy's BDF on the Pinocchio backend", slow, _SHORT))
     best = rows[0][1] / 60.0
     return table(
         ("", "CPU time per second of work [ms]", "times faster than real time", "ratio"),

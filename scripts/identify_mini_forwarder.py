@@ -82,7 +82,7 @@ def main() -> None:
     covered, floors = [], []
     for seed in range(1, options.rigs + 1):
         virtual = rig(machine, seed)
-        one, other = (virtual.run(reference.path) for reference in (learn, judge))
+        one, other = (virtual.run(reference.trajectory) for reference in (learn, judge))
         settings = {"terms": terms(machine), "slow": SLOW, "bandwidth": BANDWIDTH}
         result = identify(machine, one, **settings)
         truth = result.base.values(Model(virtual.plant, terms(virtual.plant)).nominal)

@@ -15,8 +15,8 @@ Curves = dict[str, list[tuple[float, float, float]]]  # (step [s], tip error [m]
 
 DURATION = 2.4  # [s], a whole number of each step
 LOOKS = {
-    "compiled path": (RECORDED, "o"),
-    "Pinocchio path": ("#7fb0e0", "s"),
+    "compiled backend": (RECORDED, "o"),
+    "Pinocchio backend": ("#7fb0e0", "s"),
     "constraintDynamics": ("#3c8c4a", "^"),
     "MuJoCo Euler": ("#b9b9b9", "v"),
     "MuJoCo implicitfast": ("#e0a060", "D"),
@@ -68,7 +68,7 @@ def draw(curves: Curves, path: Path) -> None:
             colour, marker = LOOKS[name]
             _, errors, times = np.array(points).T
             axes.loglog(1e3 * times, errors, marker + "-", color=colour, ms=5, label=name)
-        first = curves["compiled path"]
+        first = curves["compiled backend"]
         for step, error, t in first:
             axes.annotate(
                 f"{1e3 * step:g} ms", (1e3 * t, error), (-5, -3), textcoords="offset points",

@@ -36,12 +36,12 @@ DRAWS = 40  # of the feasible set, per kind of variation
 
 
 def exact_wins(
-    rig: Rig, paths: dict[str, crane.Path], runs: dict[str, dict[tuple[str, str], Run]]
+    rig: Rig, paths: dict[str, crane.Trajectory], runs: dict[str, dict[tuple[str, str], Run]]
 ) -> np.ndarray:
     """(3, 3) tasks and signals where the exact form comes closer to a rig's measurement."""
     out = []
     for task, path in paths.items():
-        recording = rig.run(path, task=task)
+        recording = rig.run(path, label=task)
         exact, decoupled = (
             percentage_error(recording.time, recording.tau, runs[task][name, "braking"].tau)[0]
             for name in FORMULATIONS
@@ -60,7 +60,7 @@ def main() -> None:
     warnings.simplefilter("ignore", crane.CraneWarning)
     machine = crane.load("mini_forwarder")
     rig = Rig(machine, SEED)
-    paths = {task: crane.task_path(machine, task) for task in TASKS}
+    paths = {task: crane.task_trajectory(machine, task) for task in TASKS}
     runs: dict[str, dict[tuple[str, str], Run]] = {}
     measured: dict[str, Run] = {}
     for task, path in paths.items():
@@ -69,7 +69,7 @@ def main() -> None:
             for formulation in FORMULATIONS
             for reading in READINGS
         }
-        recording = rig.run(path, task=task)
+        recording = rig.run(path, label=task)
         measured[task] = run_of(recording, path, recording.tau)
     wins = {
         seed: exact_wins(Rig(machine, seed), paths, runs) for seed in range(1, options.rigs + 1)

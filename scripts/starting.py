@@ -16,7 +16,7 @@ from measuring import table
 import crane
 from crane.control import PI
 from crane.dynamics.compiled import QUANTITIES
-from crane.motion.trajectories import task_path
+from crane.motion.trajectories import task_trajectory
 from crane.simulation.integration import CompiledStepper
 
 
@@ -65,7 +65,7 @@ def _compiling() -> Iterator[tuple[str, float]]:
         start = time.perf_counter()
         dynamics.at(quantity, q, zero, zero)
         yield quantity, time.perf_counter() - start
-    control = PI(mini, task_path(mini, "lift"))
+    control = PI(mini, task_trajectory(mini, "lift"))
     start = time.perf_counter()
     CompiledStepper(dynamics, control, 3)
     yield "the simulation's loop with PI control", time.perf_counter() - start

@@ -28,7 +28,7 @@ def swinging(machine: crane.Machine) -> crane.Machine:
         model.inertias[body] = pin.Inertia(inertia.mass, inertia.lever, tensor)
     machine = dataclasses.replace(machine, model=model)
     middle = np.array([0.0, 0.015, 0.015])
-    weight = crane.Dynamics(machine, path="pinocchio").gravity(middle)
+    weight = crane.Dynamics(machine, backend="pinocchio").gravity(middle)
     springs = tuple(
         crane.ForceElement(joint, stiffness=k, rest=float(m + w / k), damping=c)
         for joint, k, c, m, w in zip(

@@ -31,7 +31,7 @@ from crane.common.errors import CraneError, CraneWarning  # noqa: E402
 from crane.control import controller, joystick  # noqa: E402
 from crane.formats.check import check  # noqa: E402
 from crane.identification.mechanics.identify import identify  # noqa: E402
-from crane.motion.trajectories import task_path  # noqa: E402
+from crane.motion.trajectories import task_trajectory  # noqa: E402
 from crane.simulation.replays import replay  # noqa: E402
 from crane.view.page import report  # noqa: E402
 from crane.view.plots.recording import plot_recording  # noqa: E402
@@ -240,14 +240,14 @@ def prepare_recordings(both):
     """Machines, and a valid recording of each: of angles, and of valves with pressures."""
     global MACHINES, RECORDINGS
     bar = crane.load(DATA / "four_bar.yaml")
-    swing = controller("pi", bar, task_path(bar, "swing"))
-    runs = [crane.simulate(bar, swing, duration=1.0, step=0.01, task="swing")]
+    swing = controller("pi", bar, task_trajectory(bar, "swing"))
+    runs = [crane.simulate(bar, swing, duration=1.0, step=0.01, label="swing")]
     MACHINES, RECORDINGS = [bar], []
     if both:  # whose formulas take ten seconds
         boom = crane.load("patu655")
         MACHINES.append(boom)
         stir = joystick(boom, "stir")
-        runs.append(crane.simulate(boom, stir, duration=0.05, step=0.01, task="stir"))
+        runs.append(crane.simulate(boom, stir, duration=0.05, step=0.01, label="stir"))
     with tempfile.TemporaryDirectory() as folder:
         for run in runs:
             run.to_csv(Path(folder) / "run.csv")

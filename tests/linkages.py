@@ -39,7 +39,7 @@ def loaded(name):
 @cache
 def dynamics_of(name):
     """Formulas of the two machines with one large block take seconds to compile."""
-    return crane.Dynamics(load(name), path="pinocchio" if name in LARGE else "compiled")
+    return crane.Dynamics(load(name), backend="pinocchio" if name in LARGE else "compiled")
 
 
 def postures(machine, reach, count, seed=0):
@@ -142,7 +142,7 @@ def assert_same(one, two, reach, forces=True):
     np.testing.assert_allclose(places[1], places[0], rtol=0, atol=1e-11)
     if not forces:
         one, two = (x.replace(forces=(), gas_springs=(), end_stops=()) for x in (one, two))
-    both = [crane.Dynamics(machine, path="pinocchio") for machine in (one, two)]
+    both = [crane.Dynamics(machine, backend="pinocchio") for machine in (one, two)]
     for q_a, v_a, a_a in postures(one, reach, 4):
         q_a = np.clip(q_a, one.lower, one.upper)
         for quantity in (

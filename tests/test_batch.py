@@ -84,18 +84,18 @@ def test_threads_share_a_machine(forwarder):
     rng = np.random.default_rng(5)
     q_a = np.column_stack([rng.uniform(-3, 3, 400), *rng.uniform(0, 0.03, (2, 400))])
     v_a = rng.normal(size=(400, 3)) * [1, 0.02, 0.02]
-    wanted = crane.Dynamics(forwarder, path="pinocchio").bias(q_a, v_a)
+    wanted = crane.Dynamics(forwarder, backend="pinocchio").bias(q_a, v_a)
     worst = []
 
-    def work(path, shift):
-        dynamics = crane.Dynamics(forwarder, path=path)
+    def work(backend, shift):
+        dynamics = crane.Dynamics(forwarder, backend=backend)
         order = np.roll(np.arange(400), shift)
         found = np.array([dynamics.bias(q_a[i], v_a[i]) for i in order])
         worst.append(np.abs(found - wanted[order]).max())
 
     threads = [
-        threading.Thread(target=work, args=(path, 37 * i))
-        for i, path in enumerate(["compiled", "pinocchio"] * 2)
+        threading.Thread(target=work, args=(backend, 37 * i))
+        for i, backend in enumerate(["compiled", "pinocchio"] * 2)
     ]
     for thread in threads:
         thread.start()
@@ -111,14 +111,14 @@ def test_a_machine_cannot_be_changed(forwarder):
         forwarder.friction["X1"] = crane.Friction()
 
 
-@pytest.mark.parametrize("path", ["compiled", "pinocchio"])
-def test_dynamics_keep_the_parameters_of_their_moment(path):
+@pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
+def test_dynamics_keep_the_parameters_of_their_moment(backend):
     machine = crane.load("ur5_robot")
-    dynamics = crane.Dynamics(machine, path=path)
+    dynamics = crane.Dynamics(machine, backend=backend)
     before = dynamics.gravity(np.ones(6))
     machine.model.inertias[3].mass *= 2
     np.testing.assert_array_equal(dynamics.gravity(np.ones(6)), before)
-    assert np.abs(crane.Dynamics(machine, path=path).gravity(np.ones(6)) - before).max() > 1
+    assert np.abs(crane.Dynamics(machine, backend=backend).gravity(np.ones(6)) - before).max() > 1
 
 
 @pytest.mark.parametrize(

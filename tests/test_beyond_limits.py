@@ -33,7 +33,7 @@ class InPython:
     """A controller without formulas."""
 
     def __init__(self, control):
-        self._control, self.path, self.start = control, control.path, control.start
+        self._control, self.reference, self.start = control, control.reference, control.start
 
     def __call__(self, *arguments):
         return self._control(*arguments)
@@ -44,14 +44,14 @@ class InPython:
     [
         {},
         {"method": "RK45"},
-        pytest.param({"path": "pinocchio"}, marks=pytest.mark.slow),
+        pytest.param({"backend": "pinocchio"}, marks=pytest.mark.slow),
         pytest.param({"method": "Radau"}, marks=pytest.mark.slow),
         pytest.param({"method": "LSODA"}, marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.parametrize("python", [False, True])
 def test_a_run_beyond_the_limits_is_told_before_and_named_after(free, how, python):
-    """By computed torque, on every path and by every method: no error of the closure itself."""
+    """By computed torque, on every backend and by every method: no error of the closure itself."""
     control = crane.ComputedTorque(free, to(0.06))
     with warnings.catch_warnings(record=True) as caught, pytest.raises(SimulationError) as error:
         warnings.simplefilter("always", CraneWarning)
@@ -81,7 +81,7 @@ def test_pushed_beyond_the_limits_without_a_reference(free):
 
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 def test_a_step_that_is_too_long_is_told_with_one_that_is_not(mini):
-    path = crane.task_path(mini, "lift")
+    path = crane.task_trajectory(mini, "lift")
     with pytest.raises(SimulationError, match=r"with a step of 0\.0025 s it goes on: shorten"):
         crane.simulate(mini, crane.PI(mini, path), duration=0.5, step=5e-3)
     crane.simulate(mini, crane.PI(mini, path), duration=0.5, step=2.5e-3)
@@ -126,7 +126,7 @@ def test_a_task_beyond_the_limits_is_an_error(tmp_path):
     machine = crane.load(tmp_path / "arm.yaml")
     line = "task 'far': the reference of 'q' goes to 1.3 rad at t = 2 s, beyond its limit 1.12 rad"
     with pytest.raises(LimitError, match=line):
-        crane.task_path(machine, "far")
+        crane.task_trajectory(machine, "far")
     with pytest.raises(InputError, match="none of 1 variants .* goes to 1.3 rad at t = 2 s"):
         crane.study(tmp_path / "arm.yaml", {"arm.mass": [2.0]}, ["far"], ["peak_q"])
 

@@ -1,4 +1,4 @@
-"""Machine code of one machine against Pinocchio's path and the closure in numpy."""
+"""Machine code of one machine against the Pinocchio backend and the closure in numpy."""
 
 import copy
 import threading
@@ -138,7 +138,7 @@ def test_every_quantity_agrees_with_pinocchio(machines, name, quantities):
     samples = draw(machine, 40, share=share)
     if name == "slider_crank":
         samples["q"] = np.random.default_rng(0).uniform(0.2, 2.8, (40, 1))
-    both = crane.Dynamics(machine), crane.Dynamics(machine, path="pinocchio")
+    both = crane.Dynamics(machine), crane.Dynamics(machine, backend="pinocchio")
     for quantity in quantities:
         found, wanted = (ask(dynamics, quantity, samples) for dynamics in both)
         assert off(found, wanted) < 1e-11, quantity
@@ -177,7 +177,7 @@ def test_random_mechanisms_agree_with_pinocchio(kind, tmp_path):
         if tested % 3 == 2:
             link = f"body{machine.model.njoints - 1}"
             machine = machine.with_payload(crane.Payload(link, 1.0, (0.1, 0.2, -0.1)))
-        both = crane.Dynamics(machine), crane.Dynamics(machine, path="pinocchio")
+        both = crane.Dynamics(machine), crane.Dynamics(machine, backend="pinocchio")
         for quantity in ("inverse with friction", "forward with friction", "regressor"):
             found, wanted = (ask(dynamics, quantity, wide) for dynamics in both)
             assert off(found, wanted) < 1e-11, f"{quantity} of seed {seed}"
@@ -191,7 +191,7 @@ def test_elements_act_in_what_is_compared(machines):
         samples = draw(machine, 40, share=share)
         if name == "slider_crank":
             samples["q"] = np.random.default_rng(0).uniform(0.2, 2.8, (40, 1))
-        slow = crane.Dynamics(machine, path="pinocchio")
+        slow = crane.Dynamics(machine, backend="pinocchio")
         for quantity in ("friction", "passive"):
             assert np.abs(ask(slow, quantity, samples)).max() > 1e-3
     machine, share = machines["mini"]
@@ -251,7 +251,7 @@ def test_an_oblique_trunk_agrees_with_pinocchio(tmp_path, kind, closed):
     moved = samples["q"][:, stand].copy()
     samples["q"] = home + np.random.default_rng(1).uniform(-0.3, 0.3, samples["q"].shape)
     samples["q"][:, stand] = moved
-    both = crane.Dynamics(machine), crane.Dynamics(machine, path="pinocchio")
+    both = crane.Dynamics(machine), crane.Dynamics(machine, backend="pinocchio")
     for quantity in QUANTITIES:
         found, wanted = (ask(dynamics, quantity, samples) for dynamics in both)
         assert off(found, wanted) < 1e-12, quantity
@@ -310,7 +310,7 @@ def test_errors_name_the_sample(mini, fast):
         lambda: fast.inverse(q_a, zero, zero),
         lambda: fast.inverse(q_a, zero[0], zero[0]),
         lambda: fast.mass_matrix(q_a),
-        lambda: crane.Dynamics(mini, path="pinocchio").gravity(q_a),
+        lambda: crane.Dynamics(mini, backend="pinocchio").gravity(q_a),
     ):
         with pytest.raises(OutOfReachError, match=r"cannot be closed at .*X1 = 0\.2.*sample 3\)"):
             call()
@@ -544,6 +544,9 @@ def test_long_formulas_are_left_to_pinocchio(mini, monkeypatch):
 
 
 def test_paths_are_what_they_say(mini, fast):
-    assert fast.path == "compiled" and crane.Dynamics(mini, path="pinocchio").path == "pinocchio"
-    with pytest.raises(InputError, match="path 'fast' is unknown"):
-        crane.Dynamics(mini, path="fast")
+    assert (
+        fast.backend == "compiled"
+        and crane.Dynamics(mini, backend="pinocchio").backend == "pinocchio"
+    )
+    with pytest.raises(InputError, match="backend 'fast' is unknown"):
+        crane.Dynamics(mini, backend="fast")

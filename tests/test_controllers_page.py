@@ -45,14 +45,14 @@ def test_laws_of_the_page_run_without_python(page, monkeypatch):
     monkeypatch.setattr(PythonStepper, "observe", None)
     monkeypatch.setattr(PythonStepper, "advance", None)
     for name in ("law", "shaken"):
-        start = page["path"].position(0.0)
+        start = page["trajectory"].position(0.0)
         crane.simulate(page["machine"], page[name], start, duration=0.02)
 
 
 @pytest.mark.parametrize("name", ["law", "shaken"])
 def test_one_law_gives_the_same_in_numbers_and_traced(page, name):
     law, machine = page[name], page["machine"]
-    start = page["path"].position(0.0) + [0.05, 1e-3, -5e-4]
+    start = page["trajectory"].position(0.0) + [0.05, 1e-3, -5e-4]
 
     class Called:
         def start(self, q_a):
@@ -68,14 +68,14 @@ def test_one_law_gives_the_same_in_numbers_and_traced(page, name):
 
 
 def test_settings_reuse_machine_code_and_other_numbers_do_not(page, monkeypatch):
-    machine, path, most = page["machine"], page["path"], page["most"]
+    machine, trajectory, most = page["machine"], page["trajectory"], page["most"]
     made = []
     compiled = CompiledStepper._compile
     monkeypatch.setattr(CompiledStepper, "_compile", lambda x: made.append(x) or compiled(x))
-    tighter = crane.simulate(machine, page["Fast"](machine, path, 0.5 * most), duration=0.02)
+    tighter = crane.simulate(machine, page["Fast"](machine, trajectory, 0.5 * most), duration=0.02)
     assert not made
     assert np.abs(tighter.tau[:, 0]).max() == 0.5 * most[0]
-    start, damping = path.position(0.0), np.diag([0.05, 500.0, 500.0])
+    start, damping = trajectory.position(0.0), np.diag([0.05, 500.0, 500.0])
     stronger = page["Shaken"](machine, np.array([0.04, 3.0, 3.0]), damping)
     one, two = (
         crane.simulate(machine, law, start, duration=0.1) for law in (page["shaken"], stronger)
@@ -95,7 +95,7 @@ def test_states_begin_where_the_machine_stands(page):
         def law(self, at):
             return at.state, [0.0, 0.0, 0.0]
 
-    machine, q_a = page["machine"], page["path"].position(0.0)
+    machine, q_a = page["machine"], page["trajectory"].position(0.0)
     weight = crane.Dynamics(machine).inverse(q_a, np.zeros(3), np.zeros(3))
     np.testing.assert_allclose(Held(machine).start(q_a), weight, rtol=1e-12, atol=1e-12)
     recording = crane.simulate(machine, Held(machine), q_a, duration=0.01)
@@ -103,7 +103,7 @@ def test_states_begin_where_the_machine_stands(page):
 
 
 def test_wrong_numbers_of_forces_and_rates_are_told(page):
-    machine, start = page["machine"], page["path"].position(0.0)
+    machine, start = page["machine"], page["trajectory"].position(0.0)
 
     class Short(Law):
         def law(self, at):

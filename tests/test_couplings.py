@@ -86,7 +86,7 @@ def test_dynamics_are_those_of_the_projected_tree(tmp_path):
         assert dynamics.forward([q1], [v1], [tau])[0] == pytest.approx(a1, rel=1e-10)
         regressor = dynamics.regressor([q1], [v1], [a1])
         assert (regressor @ dynamics.parameters)[0] == pytest.approx(tau, rel=1e-12)
-    other = crane.Dynamics(machine, path="pinocchio")
+    other = crane.Dynamics(machine, backend="pinocchio")
     assert other.inverse([0.3], [0.5], [0.2]) == pytest.approx(
         dynamics.inverse([0.3], [0.5], [0.2]), rel=1e-12
     )

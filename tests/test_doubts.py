@@ -12,7 +12,7 @@ import crane
 from crane.common.errors import CraneWarning, RecordingError
 from crane.identification.excitation.fourier import Fourier
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.reading import motion_of
+from crane.identification.mechanics.reading import smoothed_motion
 from crane.identification.signals.hum import line
 from crane.identification.signals.outliers import outliers, repaired
 from crane.recordings.logs import read_log
@@ -102,8 +102,8 @@ def test_outliers_are_told_and_left_out(mini, clean, name, column, words):
     lines = []
 
     def call():
-        found = motion_of(mini, bad)
-        true = motion_of(mini, clean)
+        found = smoothed_motion(mini, bad)
+        true = smoothed_motion(mini, clean)
         for one, other in ((found.q, true.q), (found.tau, true.tau), (found.v, true.v)):
             # at almost all samples as without them: noise of what was bridged, two hidden ones
             off = np.abs(one - other).max(axis=1) / other.std(axis=0).max()
@@ -122,15 +122,15 @@ def test_too_many_outliers_are_refused_unless_trusted(mini, clean):
     tau[::15, 0] = 1e3
     bad = dataclasses.replace(clean, tau=tau)
     with pytest.raises(RecordingError, match=r"'q1_force' has \d+ outliers in 7501 samples"):
-        motion_of(mini, bad)
+        smoothed_motion(mini, bad)
     found = []
-    told(lambda: found.append(motion_of(mini, bad, trust=True)))
+    told(lambda: found.append(smoothed_motion(mini, bad, trust=True)))
     np.testing.assert_array_equal(found[0].tau, tau)
 
 
 def test_hum_is_told_with_its_frequency(mini, clean):
     level = 0.02 * clean.tau[:, 1].std()
-    (line,) = told(lambda: motion_of(mini, humming(clean, 1, level)))
+    (line,) = told(lambda: smoothed_motion(mini, humming(clean, 1, level)))
     assert line.startswith("hum in 'X1_force' of 50 Hz (") and "2 % of it" in line
 
 
@@ -148,15 +148,15 @@ def test_a_locked_joint_has_to_stand(mini, clean):
         locked = crane.load("mini_forwarder", lock={"q1": 0.0})
     text = "'q1' is locked at 0 rad, but goes from -2.* to 1.* rad in the recording"
     with pytest.raises(RecordingError, match=text):
-        motion_of(locked, clean)
-    (line,) = told(lambda: motion_of(locked, clean, trust=True))
+        smoothed_motion(locked, clean)
+    (line,) = told(lambda: smoothed_motion(locked, clean, trust=True))
     assert line.endswith("or lock it where it is: trusted")
     q = clean.q.copy()
     q[:, 0] = 1e-3 * np.random.default_rng(0).normal(size=len(q))
     still = dataclasses.replace(clean, q=q)
-    assert told(lambda: motion_of(locked, still)) == []
+    assert told(lambda: smoothed_motion(locked, still)) == []
     with pytest.raises(RecordingError, match="is locked at 0 rad, but goes from 0.297"):
-        motion_of(locked, dataclasses.replace(clean, q=q + [0.3, 0, 0]))
+        smoothed_motion(locked, dataclasses.replace(clean, q=q + [0.3, 0, 0]))
 
 
 def test_a_validation_that_is_far_worse_is_remarked_on(mini, clean):

@@ -496,15 +496,17 @@ def test_conservative_elements_do_virtual_work(bare):
 
 
 @pytest.mark.parametrize("exponent", [1.0, 1.4])
-@pytest.mark.parametrize("path", ["compiled", "pinocchio"])
-def test_gas_follows_its_law_and_stores_its_work(bare, exponent, path):
+@pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
+def test_gas_follows_its_law_and_stores_its_work(bare, exponent, backend):
     """p V^n = const on an active and on a passive joint; force = - d/dq_A of -int p dV."""
     area, pressure, volume, rest = -3e-4, 4e5, 2e-5, 0.01
     gas = (
         crane.GasSpring("X1", area, pressure, volume, rest, exponent),
         crane.GasSpring("q3", 2e-5, 1e5, 8e-5, 1.3, exponent),
     )
-    dynamics, plain = (crane.Dynamics(bare.replace(gas_springs=g), path=path) for g in (gas, ()))
+    dynamics, plain = (
+        crane.Dynamics(bare.replace(gas_springs=g), backend=backend) for g in (gas, ())
+    )
     column = bare.column("q3")
 
     def released(a, p, v, x):

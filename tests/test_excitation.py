@@ -74,9 +74,9 @@ def test_ways_from_and_to_rest_stay_on_the_curve(series):
 
 
 def test_a_machine_follows_it(mini, found):
-    control = crane.ComputedTorque(mini, found.path)
+    control = crane.ComputedTorque(mini, found.trajectory)
     recording = crane.simulate(mini, control, duration=2.0)
-    assert np.abs(recording.q - found.path(recording.time)[0]).max() < 1e-6
+    assert np.abs(recording.q - found.trajectory(recording.time)[0]).max() < 1e-6
 
 
 # --- limits ----------------------------------------------------------------------------------
@@ -84,10 +84,10 @@ def test_a_machine_follows_it(mini, found):
 
 def keeps(excitation, machine):
     """Largest shares of the machine's own limits at instants the search has not seen."""
-    path = excitation.path
+    path = excitation.trajectory
     q, v, a = path(np.sort(np.random.default_rng(1).uniform(0, path.duration, 20000)))
     machine.check_limits(q)
-    tau = crane.Dynamics(machine, path="pinocchio").inverse(q[::20], v[::20], a[::20], True)
+    tau = crane.Dynamics(machine, backend="pinocchio").inverse(q[::20], v[::20], a[::20], True)
     columns = machine.closure.active
     return (
         np.abs(v).max(axis=0) / machine.model.velocityLimit[columns],
@@ -127,7 +127,7 @@ def test_forces_can_be_what_limits(edited):
 def test_the_edge_of_the_branch_is_kept(five_bar):
     """Cranks that turn one radian either way leave the reach; the reference does not."""
     result = excite(five_bar, **QUICK, period=4.0)
-    q, v, a = result.path(np.linspace(0, result.path.duration, 3001))
+    q, v, a = result.trajectory(np.linspace(0, result.trajectory.duration, 3001))
     at = Model(five_bar).samples(q, v, a)  # every sample closes
     assert five_bar.closure.residual(at.q).max() < 1e-12
     assert gear(five_bar, at).max() <= 1
@@ -139,14 +139,14 @@ def test_the_edge_of_the_branch_is_kept(five_bar):
 
 def naive(excitation):
     """One sine per joint, the k-th at the k-th harmonic, 95 % of its limits."""
-    K, n = excitation.path.harmonics, len(excitation.machine.active)
-    w = 2 * np.pi / excitation.path.period
+    K, n = excitation.trajectory.harmonics, len(excitation.machine.active)
+    w = 2 * np.pi / excitation.trajectory.period
     table = np.zeros((1 + 2 * K, n))
     table[0] = excitation.limits.middle
     for i in range(n):
         k = i % K + 1
         table[k, i] = min(excitation.limits.velocity[i], k * w * excitation.limits.half[i])
-    return Fourier(table, excitation.path.period, excitation.path.periods)
+    return Fourier(table, excitation.trajectory.period, excitation.trajectory.periods)
 
 
 def information_of(excitation, path):
@@ -162,7 +162,7 @@ def information_of(excitation, path):
 def test_it_tells_more_than_random_and_naive_references(found):
     """Per parameter, the volume of the ellipsoid shrinks at least by a factor of two."""
     rank = found.base.rank
-    assert information_of(found, found.path) == pytest.approx(found.after.logdet, rel=1e-3)
+    assert information_of(found, found.trajectory) == pytest.approx(found.after.logdet, rel=1e-3)
     assert found.after.logdet - found.before.logdet > 2 * np.log(2) * rank
     assert found.after.logdet - information_of(found, naive(found)) > 2 * np.log(2) * rank
     assert found.after.condition < found.before.condition / 10
@@ -181,14 +181,14 @@ def test_condition_can_be_the_criterion(slider_crank):
 
 def test_same_seed_same_bits(slider_crank):
     first, again, other = (excite(slider_crank, **QUICK, seed=seed) for seed in (4, 4, 5))
-    assert np.array_equal(first.path.coefficients, again.path.coefficients)
+    assert np.array_equal(first.trajectory.coefficients, again.trajectory.coefficients)
     assert first.to_text() == again.to_text()
-    assert not np.array_equal(first.path.coefficients, other.path.coefficients)
+    assert not np.array_equal(first.trajectory.coefficients, other.trajectory.coefficients)
 
 
 def test_predicted_deviations_are_those_of_least_squares(mini, found):
     """600 recordings with white noise: a deviation comes out within 3 % (one sigma)."""
-    model, path, base = Model(mini), found.path, found.base
+    model, path, base = Model(mini), found.trajectory, found.base
     time = path.lead + found.step * np.arange(path.periods * round(path.period / found.step))
     W = model.regressor(model.samples(*path(time)))[:, :, base.independent]
     W = (W / found.noise[:, None]).reshape(-1, base.rank)
@@ -232,7 +232,7 @@ def test_files(slider_crank, tmp_path):
     result = excite(slider_crank, **QUICK)
     result.to_csv(tmp_path / "reference.csv")
     recording = crane.Recording.from_csv(tmp_path / "reference.csv")
-    q, v, a = result.path(recording.time)
+    q, v, a = result.trajectory(recording.time)
     assert np.array_equal(recording.q, q) and np.array_equal(recording.v, v)
     joint = slider_crank.active[0]
     assert np.array_equal(recording.channels[f"{joint}_acceleration"], a[:, 0])

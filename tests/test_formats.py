@@ -38,7 +38,7 @@ def test_mujoco_computes_the_written_machine_alike(case, tmp_path):
     name, machine = case
     write_mjcf(machine, tmp_path / "written.xml")
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "written.xml"))
-    data, dynamics = mujoco.MjData(model), crane.Dynamics(machine, path="pinocchio")
+    data, dynamics = mujoco.MjData(model), crane.Dynamics(machine, backend="pinocchio")
     columns = [machine.column(model.joint(i).name) for i in range(model.njnt)]
     assert model.nv == len(columns) == machine.model.nv
     for q_a, v_a, _ in postures(machine, MACHINES[name][2], 3):

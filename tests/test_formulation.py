@@ -66,10 +66,10 @@ def draw(machine, count, seed=3):
     )
 
 
-@pytest.mark.parametrize("path", ["compiled", "pinocchio"])
-def test_decoupled_is_the_sum_of_lone_chains(bare, path):
+@pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
+def test_decoupled_is_the_sum_of_lone_chains(bare, backend):
     q_a, v_a, a_a = draw(bare, 40)
-    dynamics = crane.Dynamics(bare, formulation="decoupled", path=path)
+    dynamics = crane.Dynamics(bare, formulation="decoupled", backend=backend)
     lone = [Lone(bare, chain) for chain in bare.chains]
     for sample in zip(q_a, v_a, a_a, strict=True):
         gamma, q, v, a = moved(bare, *sample)
@@ -113,8 +113,8 @@ def moved(machine, q_a, v_a, a_a):
 def test_both_paths_agree(mini):
     q_a, v_a, x = draw(mini, 30, seed=5)
     fast, slow = (
-        crane.Dynamics(mini, formulation="decoupled", path=path)
-        for path in ("compiled", "pinocchio")
+        crane.Dynamics(mini, formulation="decoupled", backend=backend)
+        for backend in ("compiled", "pinocchio")
     )
     for quantity in QUANTITIES:
         q = mini.closure.solve(q_a)
@@ -154,7 +154,7 @@ def test_a_machine_of_one_chain_has_one_formulation():
 
 def test_a_simulation_follows_its_formulation(mini):
     """It drives the machine without tracking error where its own inverse gives the forces."""
-    path = crane.task_path(mini, "lift")
+    path = crane.task_trajectory(mini, "lift")
     ideal = crane.Dynamics(mini, formulation="decoupled")
 
     def drive(time, q_a, v_a):

@@ -8,7 +8,7 @@ import pytest
 import crane
 from crane.control import Sampled, Signals, TipVelocity, ValveDrive, ValvePD, joystick
 from crane.hydraulics.circuit import BALANCES
-from crane.motion.trajectories import task_path
+from crane.motion.trajectories import task_trajectory
 
 LOAD = {"payload.mass": 211.4}
 LIFT = 1  # column of X_lift
@@ -131,7 +131,7 @@ def test_stiff_oil_moves_with_its_flow(loaded):
 
 @pytest.mark.parametrize("task", ["reach", "swing"])
 def test_halving_the_step_changes_nothing(loaded, task):
-    control = ValvePD(loaded, task_path(loaded, task))
+    control = ValvePD(loaded, task_trajectory(loaded, task))
     whole = crane.simulate(loaded, control)
     half = crane.simulate(loaded, control, step=5e-4)
     assert np.abs(half.q[::2] - whole.q).max() < 1e-6
@@ -145,7 +145,7 @@ def test_machine_code_agrees_with_scipy_on_pinocchio(patu):
     """Another method, another path of the dynamics, formulas in floats."""
     opening = Signals(patu, [0.0, 0.1, 0.2], {"X_lift": [5.8, 5.8, 4.6]})
     fast = crane.simulate(patu, opening, duration=0.4, step=1e-2)
-    slow = crane.simulate(patu, opening, duration=0.4, step=1e-2, path="pinocchio")
+    slow = crane.simulate(patu, opening, duration=0.4, step=1e-2, backend="pinocchio")
     assert np.ptp(fast.q[:, LIFT]) > 3e-3
     assert np.abs(fast.q - slow.q).max() < 1e-7
     for joint in fast.joints:
@@ -187,7 +187,7 @@ def test_tip_velocity_is_the_commanded_one(loaded):
 
 def test_a_path_of_the_tip_serves_as_velocity(loaded):
     """Out and up along a line; a valve that is not needed stays where it is."""
-    control = TipVelocity(loaded, task_path(loaded, "push"))
+    control = TipVelocity(loaded, task_trajectory(loaded, "push"))
     recording = crane.simulate(loaded, control)
     channels = recording.channels
     assert channels["spool_slew"][0] == 0.0

@@ -10,8 +10,8 @@ import crane
 from crane.common.errors import InputError, RecordingError
 from crane.hydraulics.components import Counterbalance, Valve
 from crane.identification.hydraulics.cylinder_friction import (
-    cylinder_friction,
     direction_difference,
+    identify_cylinder_friction,
 )
 from crane.identification.hydraulics.cylinder_signals import (
     cylinder_signals,
@@ -693,7 +693,7 @@ SPEEDS = [1e-3, 2e-3, 3e-3, 4.5e-3, 6e-3, 8e-3, 0.012, 0.02, 0.04, 0.06]
 
 
 def test_friction_without_noise(machine):
-    found = cylinder_friction(machine, strokes(SPEEDS, 0, None), "boom")
+    found = identify_cylinder_friction(machine, strokes(SPEEDS, 0, None), "boom")
     assert found.names == tuple(LAW) and not found.note
     np.testing.assert_allclose(found.values, list(LAW.values()), rtol=0.02)
     assert found.friction.smoothing == 2e-4
@@ -709,25 +709,27 @@ def test_friction_intervals_cover(machine):
     inside = np.zeros(5)
     for _ in range(draws):
         run = strokes(SPEEDS, 60.0, rng, step=2e-2)
-        low, high = cylinder_friction(machine, run, "boom", stribeck=True).interval().T
+        low, high = identify_cylinder_friction(machine, run, "boom", stribeck=True).interval().T
         truth = np.array(list(LAW.values()))
         inside += (low < truth) & (truth < high)
     assert (inside >= 0.88 * draws).all() and (inside <= 0.995 * draws).all(), inside
 
 
 def test_fast_speeds_tell_no_stiction(machine):
-    found = cylinder_friction(machine, strokes([0.02, 0.03, 0.045, 0.06], 0, None), "boom")
+    found = identify_cylinder_friction(
+        machine, strokes([0.02, 0.03, 0.045, 0.06], 0, None), "boom"
+    )
     assert found.names == ("coulomb", "coulomb_offset", "viscous")
     assert "Coulomb and viscous friction only" in found.note and found.note in found.to_text()
     np.testing.assert_allclose(found.values, [210, 25, 3300], rtol=0.02)
     with pytest.raises(RecordingError, match="stiction of 'boom' cannot be told: speeds from"):
-        cylinder_friction(
+        identify_cylinder_friction(
             machine, strokes([0.02, 0.03, 0.045, 0.06], 0, None), "boom", stribeck=True
         )
 
 
 def test_slow_speeds_alone_tell_no_stiction(machine):
-    found = cylinder_friction(machine, strokes([1e-3, 2e-3, 4e-3, 6e-3], 0, None), "boom")
+    found = identify_cylinder_friction(machine, strokes([1e-3, 2e-3, 4e-3, 6e-3], 0, None), "boom")
     assert "do not exceed the Stribeck velocity twofold, record faster ones" in found.note
 
 
@@ -737,11 +739,11 @@ def test_friction_needs_both_ways(machine):
     q = -0.05 + np.cumsum(v) * 5e-3
     run = recording(time, q, v, MASS * 9.81 + friction_force(v))
     with pytest.raises(RecordingError, match="'boom' never retracts steadily at two speeds"):
-        cylinder_friction(machine, run, "boom")
+        identify_cylinder_friction(machine, run, "boom")
     with pytest.raises(RecordingError, match="no stroke that it passes both ways"):
         direction_difference(run, "boom")
     with pytest.raises(InputError, match="'tip' is not an active joint, known: boom"):
-        cylinder_friction(machine, run, "tip")
+        identify_cylinder_friction(machine, run, "tip")
 
 
 def test_difference_of_directions():

@@ -27,8 +27,8 @@ from crane.identification.mechanics.model import (
     default_terms,
     friction,
 )
-from crane.identification.mechanics.payload import estimate_payload
-from crane.identification.mechanics.write import write_machine, write_parameters
+from crane.identification.mechanics.payload import identify_payload
+from crane.identification.mechanics.write import write_identified, write_parameters
 from crane.identification.signals.motion import Motion
 from crane.view.page.identification import write_report
 
@@ -87,7 +87,7 @@ def random_states(machine, count=40):
 
 
 def test_the_written_machine_is_the_identified_one(mini, found, tmp_path):
-    file = write_machine(found, tmp_path / "out")
+    file = write_identified(found, tmp_path / "out")
     assert file == tmp_path / "out" / "mini_forwarder.yaml"
     assert len(list(file.parent.iterdir())) == 6
     written = crane.load(file)
@@ -98,7 +98,7 @@ def test_the_written_machine_is_the_identified_one(mini, found, tmp_path):
 
 
 def test_only_inertials_change_in_a_urdf(mini, found, tmp_path):
-    write_machine(found, tmp_path)
+    write_identified(found, tmp_path)
     for chain in mini.chains:
         before, after = (
             etree.parse(str(file)).getroot() for file in (chain.urdf, tmp_path / chain.urdf.name)
@@ -155,9 +155,9 @@ def test_one_urdf_with_a_loop_becomes_a_machine_file(tmp_path):
     given = Motion(time[:, 0], q, v, a, 1.1 * tau + 0.1 * noise)
     result = identify(arm, given, prior=0.3, feasible=True)
     with pytest.raises(OutputError) as caught:
-        write_machine(result, tmp_path / "sub" / "..")
+        write_identified(result, tmp_path / "sub" / "..")
     assert "is what 'arm' was read from" in str(caught.value)
-    written = crane.load(write_machine(result, tmp_path / "out"))
+    written = crane.load(write_identified(result, tmp_path / "out"))
     at = result.model.samples(q, v, a)
     wanted = result.model.regressor(at) @ result.parameters
     again = crane.Dynamics(written).inverse(q, v, a, friction=True)
@@ -177,7 +177,7 @@ def test_the_load_that_a_machine_names_comes_along(edited, tmp_path):
     tau = crane.Dynamics(machine).inverse(q, v, a, friction=True)
     given = Motion(time[:, 0], q, v, a, tau + 0.1 * np.random.default_rng(0).normal(size=q.shape))
     result = identify(machine, given, prior=0.3, feasible=True)
-    file = write_machine(result, tmp_path / "out")
+    file = write_identified(result, tmp_path / "out")
     assert (file.parent / "load.urdf").read_bytes() == load.read_bytes()
     written, loaded = (crane.load(file, {"payload.mass": mass}) for mass in (0.0, 3.0))
     total = [sum(inertia.mass for inertia in m.model.inertias[1:]) for m in (written, loaded)]
@@ -216,7 +216,7 @@ def test_what_cannot_be_written(mini, found, tmp_path):
         ),
     ):  # fmt: skip
         with pytest.raises(InputError) as caught:
-            write_machine(result, tmp_path / "out")
+            write_identified(result, tmp_path / "out")
         assert str(caught.value).startswith(message), str(caught.value)
         assert list(tmp_path.iterdir()) == []
 
@@ -263,12 +263,12 @@ TRUTH = np.array([0.2, 0.01, -0.03, 0.005])
 
 
 def test_a_load_comes_back_from_exact_forces(mini):
-    estimate = estimate_payload(mini, motion(mini.with_payload(LOAD), noise=0.0))
+    estimate = identify_payload(mini, motion(mini.with_payload(LOAD), noise=0.0))
     np.testing.assert_allclose([estimate.mass, *estimate.com], TRUTH, rtol=1e-8)
     # in another frame of the same body
     frame = mini.model.frames[mini.frame("link7")].placement
     tip = mini.model.frames[mini.frame("link7_tip")].placement
-    other = estimate_payload(mini, motion(mini.with_payload(LOAD), noise=0.0), "link7")
+    other = identify_payload(mini, motion(mini.with_payload(LOAD), noise=0.0), "link7")
     np.testing.assert_allclose(other.com, frame.actInv(tip.act(TRUTH[1:])), rtol=1e-7, atol=1e-9)
 
 
@@ -276,19 +276,19 @@ def test_the_intervals_of_a_load_cover_it(mini):
     loaded = mini.with_payload(LOAD)
     covered = []
     for seed in range(12):
-        low, high = estimate_payload(mini, motion(loaded, seed)).interval().T
+        low, high = identify_payload(mini, motion(loaded, seed)).interval().T
         covered.append((low <= TRUTH) & (high >= TRUTH))
     assert np.mean(covered) > 0.88  # of 48
-    estimate = estimate_payload(mini, motion(loaded, 1))
+    estimate = identify_payload(mini, motion(loaded, 1))
     assert abs(estimate.mass - 0.2) < 2e-3 and estimate.std_mass < 1e-3
     assert re.search(r"^mass +0\.\d+ .* to 0\.\d+ kg$", estimate.to_text(), re.M)
-    bare = estimate_payload(mini, motion(mini, 2))
+    bare = identify_payload(mini, motion(mini, 2))
     assert "the mass may be zero" in bare.to_text()
 
 
 def test_what_a_motion_does_not_tell_of_a_load(mini):
     """Without slewing, nothing at right angles to the crane's plane."""
-    estimate = estimate_payload(mini, motion(mini.with_payload(LOAD), still=[0]))
+    estimate = identify_payload(mini, motion(mini.with_payload(LOAD), still=[0]))
     np.testing.assert_allclose(estimate.com[:2], TRUTH[1:3], atol=3e-3)
     assert np.isnan(estimate.com[2]) and np.isnan(estimate.std_com[2])
     assert estimate.directions.shape == (2, 3) and np.abs(estimate.directions[:, 2]).max() < 1e-9
@@ -299,14 +299,14 @@ def test_no_load_can_be_told(mini):
     given = motion(mini, duration=4.0)
     slewing = motion(mini, duration=4.0, still=[1, 2])
     for call, kind, message in (
-        (lambda: estimate_payload(mini, given, "base"), InputError, "frame 'base' does not move"),
-        (lambda: estimate_payload(mini, given, "tip"), InputError, "frame 'tip' is unknown"),
+        (lambda: identify_payload(mini, given, "base"), InputError, "frame 'base' does not move"),
+        (lambda: identify_payload(mini, given, "tip"), InputError, "frame 'tip' is unknown"),
         (
-            lambda: estimate_payload(mini, dataclasses.replace(given, tau=1e3 * given.tau)),
+            lambda: identify_payload(mini, dataclasses.replace(given, tau=1e3 * given.tau)),
             RecordingError,
             "'q1_force' is 987",
         ),
-        (lambda: estimate_payload(mini, slewing), RecordingError, "this motion does not tell"),
+        (lambda: identify_payload(mini, slewing), RecordingError, "this motion does not tell"),
     ):
         with pytest.raises(kind) as caught:
             call()
@@ -339,7 +339,7 @@ def rougher(machine, factor):
 def test_friction_that_is_not_as_described_is_no_load(mini):
     """Twice the Coulomb friction, motion both ways: the load is the load."""
     rough = rougher(mini, 2.0)
-    estimate = estimate_payload(mini, motion(rough.with_payload(LOAD), 1))
+    estimate = identify_payload(mini, motion(rough.with_payload(LOAD), 1))
     low, high = estimate.interval()[0]
     assert low < 0.2 < high and high - low < 0.02
     for i, joint in enumerate(mini.active):
@@ -351,12 +351,12 @@ def test_motion_one_way_does_not_tell_friction_from_weight(mini):
     """Three times the friction, of which such a motion tells nothing: refused, and why."""
     given = one_way(rougher(mini, 3.0).with_payload(LOAD))
     with pytest.raises(RecordingError) as caught:
-        estimate_payload(mini, given)
+        identify_payload(mini, given)
     text = str(caught.value)
     assert text.startswith("this recording does not tell the mass (") and "\n" not in text
     assert "'X1', 'X2' moved one way only, where friction looks like weight" in text
     assert "the forces at rest hold 0." in text
-    right = estimate_payload(mini, one_way(mini.with_payload(LOAD)))
+    right = identify_payload(mini, one_way(mini.with_payload(LOAD)))
     assert right.interval()[0, 0] < 0.2 < right.interval()[0, 1]
     assert right.friction == {}
 
@@ -366,7 +366,7 @@ def test_a_machine_that_is_not_as_described_widens_the_interval(mini):
     changes = {f"{name}.mass": 1.5 * mass for name, mass in (("link2", 0.1833), ("link5", 0.028))}
     heavy = crane.load("mini_forwarder", changes)
     right, wrong = (
-        estimate_payload(mini, motion(machine.with_payload(LOAD), 1)).interval()[0]
+        identify_payload(mini, motion(machine.with_payload(LOAD), 1)).interval()[0]
         for machine in (mini, heavy)
     )
     assert np.ptp(wrong) > 4 * np.ptp(right)
@@ -385,12 +385,12 @@ def test_forces_at_rest_are_compared(mini):
     tau = crane.Dynamics(mini.with_payload(LOAD)).inverse(q, zero, zero)
     hold["tau"][-rests:] = tau
     time = 4e-3 * np.arange(len(hold["q"]))
-    estimate = estimate_payload(mini, Motion(time, **hold))
+    estimate = identify_payload(mini, Motion(time, **hold))
     mass, band = estimate.static
     assert abs(mass - 0.2) < band and estimate.doubt == ""
     assert re.search(r"^mass by the forces at rest: 0\.\d+ \+- ", estimate.to_text(), re.M)
     hold["tau"][-rests:] = tau * [1, 3, 3]
-    doubted = estimate_payload(mini, Motion(time, **hold))
+    doubted = identify_payload(mini, Motion(time, **hold))
     assert "the forces at rest say" in doubted.doubt and doubted.doubt in doubted.to_text()
 
 
@@ -407,7 +407,7 @@ def test_a_locked_machine_is_written_with_all_its_joints(mini, tmp_path):
     noise = np.random.default_rng(0).normal(size=tau.shape) * NOISE[:2]
     given = Motion(time[:, 0], q, v, a, tau + noise)
     result = identify(locked, given, feasible=True)
-    file = write_machine(result, tmp_path / "out")
+    file = write_identified(result, tmp_path / "out")
     written = crane.load(file)
     assert written.joints == mini.joints and written.active == mini.active
     assert written.friction["X2"] == mini.friction["X2"]
@@ -452,7 +452,7 @@ def simulated(mini, tmp_path_factory):
     """A machine that moves with a load, or without."""
     folder = tmp_path_factory.mktemp("simulated")
     given = motion(mini)
-    path = crane.Path(CubicSpline(given.time[::10], given.q[::10]))
+    path = crane.Trajectory(CubicSpline(given.time[::10], given.q[::10]))
     for name, machine in (("empty", mini), ("loaded", mini.with_payload(LOAD))):
         control = crane.ComputedTorque(machine, path)
         run = crane.simulate(machine, control, path(0.0)[:2])

@@ -17,7 +17,7 @@ from crane.identification.mechanics.base import base_parameters, random_samples
 from crane.identification.mechanics.feasible import pseudo_inertia
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.model import Inertial, Model, friction
-from crane.identification.mechanics.reading import motion_of
+from crane.identification.mechanics.reading import smoothed_motion
 from crane.identification.signals.motion import Motion
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
@@ -89,7 +89,7 @@ def test_intervals_cover_the_truth_of_rigs_as_users_identify_them():
         joint: dataclasses.replace(default_sensors(machine, joint), error=(0.0, 0.0))
         for joint in machine.active
     }
-    path = excite(machine, starts=1).path
+    path = excite(machine, starts=1).trajectory
     covered = []
     for seed in range(100, 112):
         rig = Rig(machine, seed, Tolerances(pins=0.0), sensors)
@@ -124,14 +124,14 @@ def test_what_smoothing_takes_is_not_looked_for(mini):
         units = {joint: mini.unit(joint) for joint in mini.active}
         return crane.Recording(given.time, mini.active, q, 0 * q, noisy(given, 8).tau, units)
 
-    coarse = motion_of(mini, recording(given.q + noise))
+    coarse = smoothed_motion(mini, recording(given.q + noise))
     assert 1.0 < coarse.passed < 20.0
     apart = np.diff(identify(mini, coarse).training.time[:2])[0]
     assert 0.25 / coarse.passed < apart < 0.5 / coarse.passed
     assert np.diff(identify(mini, given).training.time[:2])[0] < 0.1 * apart
     still = given.q + noise
     still[:, 0] = 0.3 + noise[:, 0]
-    assert motion_of(mini, recording(still)).passed > 0.8 * coarse.passed
+    assert smoothed_motion(mini, recording(still)).passed > 0.8 * coarse.passed
 
 
 def test_where_friction_settles_rows_begin_to_count(mini):
@@ -196,7 +196,7 @@ def test_a_resting_joint_is_left_out(mini):
 
 def test_recordings_of_simulations_serve(mini):
     """From strokes and forces alone, velocities by the smoother."""
-    path = crane.task_path(mini, "loading")
+    path = crane.task_trajectory(mini, "loading")
     recording = crane.simulate(mini, crane.ComputedTorque(mini, path), path(0.0)[:2])
     slow = [0.03, 5e-4, 5e-4]
     result = identify(mini, recording, prior=0.1, slow=slow)
@@ -267,7 +267,7 @@ def test_a_constant_recording_is_refused(mini):
 
 @pytest.mark.parametrize("level", [0.0, 1.0])
 def test_feasible_estimates_settle_on_exact_forces_too(mini, level):
-    path = crane.task_path(mini, "loading")
+    path = crane.task_trajectory(mini, "loading")
     time = np.arange(0, 10, 2e-3)
     q, v, a = path(time)
     tau = crane.Dynamics(mini).inverse(q, v, a, friction=True)

@@ -23,7 +23,7 @@ def forwarder():
 
 @pytest.fixture(scope="module")
 def path(forwarder):
-    return crane.task_path(forwarder, "return")
+    return crane.task_trajectory(forwarder, "return")
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ class InPython:
     """A controller that cannot be traced: what `simulate` sees of it is the Python part."""
 
     def __init__(self, control):
-        self._control, self.path = control, control.path
+        self._control, self.reference = control, control.reference
 
     def start(self, q_a):
         return self._control.start(q_a)
@@ -56,7 +56,7 @@ class InPython:
 class Push:
     """Constant forces, traced along."""
 
-    path = None
+    reference = None
     columns = 0
 
     def __init__(self, *forces):
@@ -134,7 +134,7 @@ def test_machine_code_python_and_pinocchio_step_alike(forwarder, path, steps, na
     assert steps == {"compiled": 200, "python": 0}
     python = crane.simulate(forwarder, InPython(plain), **settings)
     assert steps == {"compiled": 200, "python": 200}
-    pinocchio = crane.simulate(forwarder, control, **settings, path="pinocchio")
+    pinocchio = crane.simulate(forwarder, control, **settings, backend="pinocchio")
     assert steps == {"compiled": 200, "python": 400}
     assert np.ptp(compiled.q, axis=0).max() > 1e-4  # it moves
     assert off(compiled, python) < 1e-10
@@ -147,8 +147,8 @@ def test_machine_code_python_and_pinocchio_step_alike(forwarder, path, steps, na
 def test_other_machines_step_alike(name, steps, request):
     machine = crane.load(name) if name == "ur5_robot" else request.getfixturevalue(name)
     runs = [
-        crane.simulate(machine, control, duration=0.05, path=path)
-        for control, path in (
+        crane.simulate(machine, control, duration=0.05, backend=backend)
+        for control, backend in (
             (None, "compiled"),
             (InPython(crane.control.Free(machine)), "compiled"),
             (None, "pinocchio"),
@@ -161,7 +161,7 @@ def test_other_machines_step_alike(name, steps, request):
 def test_energies_are_integrated_alike_and_balance(forwarder, path, steps):
     control = crane.PI(forwarder, path)
     one = crane.simulate(forwarder, control, duration=0.4)
-    two = crane.simulate(forwarder, control, duration=0.4, path="pinocchio")
+    two = crane.simulate(forwarder, control, duration=0.4, backend="pinocchio")
     assert steps == {"compiled": 400, "python": 400}
     for name in ("work", "dissipated", "kinetic", "potential"):
         assert np.ptp(one.channels[name]) > 1e-5
@@ -177,8 +177,8 @@ def test_what_dampers_and_end_stops_take_out_is_integrated_alike(springy, steps)
     machine = springy.replace(end_stops=stops)
     start = (np.array([0.0, 0.0295, 0.0005]), np.array([0.5, 0.3, -0.2]))
     one, two = (
-        crane.simulate(machine, None, start, duration=0.05, step=2e-4, path=path)
-        for path in ("compiled", "pinocchio")
+        crane.simulate(machine, None, start, duration=0.05, step=2e-4, backend=backend)
+        for backend in ("compiled", "pinocchio")
     )
     assert steps == {"compiled": 250, "python": 250}
     assert one.q[:, 1].max() > machine.upper[1] + 1e-4 and one.q[:, 2].min() < -1e-4
@@ -268,8 +268,8 @@ def failing(steps, *arguments, **settings):
 def test_a_branch_that_is_left_is_told_alike(forwarder, steps):
     free = forwarder.replace(friction={}, end_stops=())
     messages = [
-        failing(steps, free, control, duration=1.0, path=path)
-        for control, path in (
+        failing(steps, free, control, duration=1.0, backend=backend)
+        for control, backend in (
             (Push(0.0, 200.0, 0.0), "compiled"),
             (InPython(Push(0.0, 200.0, 0.0)), "compiled"),
             (Push(0.0, 200.0, 0.0), "pinocchio"),
@@ -283,7 +283,7 @@ def test_a_branch_that_is_left_is_told_alike(forwarder, steps):
 
 
 def test_an_explosion_is_told_alike(forwarder, steps):
-    lift = crane.task_path(forwarder, "lift")
+    lift = crane.task_trajectory(forwarder, "lift")
     control = crane.PI(forwarder, lift)
     messages = {
         failing(steps, forwarder, one, duration=0.5, step=5e-3)
@@ -307,7 +307,7 @@ def test_a_first_step_that_fails_is_told_alike(forwarder, steps, speed):
 def test_a_step_that_fails_after_a_whole_chunk_is_told(forwarder, steps, monkeypatch):
     """Wherever the failure falls among the chunks."""
     free = forwarder.replace(friction={}, end_stops=())
-    wanted = failing(steps, free, Push(0.0, 200.0, 0.0), duration=1.0, path="pinocchio")
+    wanted = failing(steps, free, Push(0.0, 200.0, 0.0), duration=1.0, backend="pinocchio")
     before = round(float(wanted.split()[3]) / 1e-3)  # "at t = 0.088 s: .."
     for chunk in (1, 2, 3, before - 1, before):
         monkeypatch.setattr("crane.simulation.integration.steps._CHUNK", chunk)

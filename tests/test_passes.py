@@ -10,7 +10,7 @@ from crane.cli.runs import read_run
 from crane.dynamics import Dynamics
 from crane.identification.mechanics import delays
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.payload import estimate_payload
+from crane.identification.mechanics.payload import identify_payload
 from crane.recordings import Recording
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
@@ -58,7 +58,7 @@ def test_a_sample_is_closed_once_on_its_way_to_the_payload(mini, recording, monk
     """The machine's own forces and the load's are computed at the same postures."""
     N = len(recording.time)
     with passes(monkeypatch) as count:
-        estimate_payload(mini, recording)
+        identify_payload(mini, recording)
     assert N <= count["closed"] <= N + ASIDE
     assert N <= count["inverse with friction"] <= N + ASIDE
     assert N <= count["regressor"] <= N + ASIDE
@@ -93,9 +93,9 @@ def test_a_file_is_read_once(mini, recording, tmp_path, monkeypatch):
         assert len(parsed) == 1
 
 
-@pytest.mark.parametrize("path", ["compiled", "pinocchio"])
-def test_quantities_at_closed_postures_are_those_of_their_strokes(mini, path):
-    given, dynamics = motion(mini, 0.2), Dynamics(mini, path=path)
+@pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
+def test_quantities_at_closed_postures_are_those_of_their_strokes(mini, backend):
+    given, dynamics = motion(mini, 0.2), Dynamics(mini, backend=backend)
     q = mini.closure.solve(given.q)
     found = dynamics.at("inverse with friction", q, given.v, given.a)
     wanted = dynamics.inverse(given.q, given.v, given.a, friction=True)

@@ -15,7 +15,7 @@ MM = 1e-3
 
 @pytest.fixture(scope="module")
 def tasks(mini):
-    return {name: crane.task_path(mini, name) for name in ("loading", "return", "lift")}
+    return {name: crane.task_trajectory(mini, name) for name in ("loading", "return", "lift")}
 
 
 # --- the facts of the paper ------------------------------------------------------------------
@@ -113,7 +113,9 @@ def test_fast_tip_paths_are_followed_too(mini):
     """Half a second: the curve between knots bends a thousand times more."""
     kinematics = crane.Kinematics(mini)
     start, end = kinematics.position([[0.0, 0.006, 0.005], [0.8, 0.024, 0.02]])
-    path = crane.tip_path(mini, crane.point_to_point(start, end, 0.5), guess=[0.0, 0.006, 0.005])
+    path = crane.tip_trajectory(
+        mini, crane.point_to_point(start, end, 0.5), guess=[0.0, 0.006, 0.005]
+    )
     time = np.linspace(0, 0.5, 333)
     q_a, v_a, _ = path(time)
     assert np.abs(q_a[0] - [0.0, 0.006, 0.005]).max() < 1e-10
@@ -127,20 +129,20 @@ def test_paths_out_of_reach_name_the_sample(mini):
     start = crane.Kinematics(mini).position([0.0, 0.015, 0.015])
     line = crane.point_to_point(start, start + [0.5, 0, 0], 1.0)
     with pytest.raises(UnreachableTipError, match=r"cannot reach .*\(sample \d+\)"):
-        crane.tip_path(mini, line)
+        crane.tip_trajectory(mini, line)
 
 
 def test_task_in_active_coordinates(edited):
     task = "tip: rod_middle\ntasks:\n  turn: {{duration: 2, active: {{theta: [{}]}}}}"
     machine = edited("slider_crank.yaml", "tip: rod_middle", task.format("0.5, 1.0"))
-    path = crane.task_path(machine, "turn")
+    path = crane.task_trajectory(machine, "turn")
     assert path(1.0)[0] == pytest.approx([1.5]) and path(1.0)[1] == pytest.approx([1.0])
     assert path.tip is None
     with pytest.raises(InputError, match="no task 'tern', did you mean 'turn'"):
-        crane.task_path(machine, "tern")
+        crane.task_trajectory(machine, "tern")
     machine = edited("slider_crank.yaml", "tip: rod_middle", task.format("0.5, 2.0"))
     with pytest.raises(LimitError, match=r"task 'turn': the reference of 'theta' goes to"):
-        crane.task_path(machine, "turn")
+        crane.task_trajectory(machine, "turn")
 
 
 # --- polynomials -----------------------------------------------------------------------------
@@ -196,8 +198,11 @@ def test_bad_arguments(mini):
             (lambda: crane.point_to_point([0, 0], [1, 1, 1], 1.0), r"end has the shape \(3,\)"),
             (lambda: crane.point_to_point([0, np.nan], [1, 1], 1.0), "start is nan"),
             (lambda: crane.point_to_point("ab", [1, 1], 1.0), "start is not made of real numbers"),
-            (lambda: crane.task_path(mini, "dance"), "no task 'dance', known: lift, loading"),
-            (lambda: crane.tip_path(mini, crane.polynomial([[0.3], [0.0]], 1.0)), "shape"),
+            (
+                lambda: crane.task_trajectory(mini, "dance"),
+                "no task 'dance', known: lift, loading",
+            ),
+            (lambda: crane.tip_trajectory(mini, crane.polynomial([[0.3], [0.0]], 1.0)), "shape"),
         ):
             with pytest.raises(InputError, match=text):
                 call()
@@ -210,7 +215,7 @@ def test_redundant_arms_move_smoothly():
     q_a = np.array([0.3, -1.2, 1.4, -0.5, 0.4, 0.2])
     start = kinematics.position(q_a)
     line = crane.point_to_point(start, start + [0.05, 0.1, -0.08], 1.0)
-    path = crane.tip_path(arm, line, guess=q_a)
+    path = crane.tip_trajectory(arm, line, guess=q_a)
     time = np.linspace(0, 1, 997)
     position, velocity, acceleration = path(time)
     np.testing.assert_allclose(kinematics.position(position), line(time)[0], atol=1e-7)

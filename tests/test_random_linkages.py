@@ -138,7 +138,7 @@ def test_random_linkages_move_as_constraint_dynamics_says(plan):
     assert len(structure.rows) == model.nv - n == len(closure.passive)
     assert len(structure.rows) + len(structure.redundant) == 5 * len(closure.equations.loops)
     random = np.random.default_rng(plan[-1])
-    dynamics = crane.Dynamics(machine, path="pinocchio")
+    dynamics = crane.Dynamics(machine, backend="pinocchio")
     tested = 0
     for reach in (0.1, 0.03, 0.01, 0.003, 0.0):
         q_a = reach * random.uniform(-1, 1, n)

@@ -49,7 +49,7 @@ def real(mini):
 
 @pytest.fixture(scope="module")
 def recording(real, path):
-    return real.run(path, task="there")
+    return real.run(path, label="there")
 
 
 # --- the motion ------------------------------------------------------------------------------

@@ -73,7 +73,7 @@ def test_agrees_with_an_adaptive_method_of_another_order(springy):
 
 
 def test_power_balance_with_friction_and_control(forwarder):
-    path = crane.task_path(forwarder, "return")
+    path = crane.task_trajectory(forwarder, "return")
     recording = crane.simulate(forwarder, crane.PI(forwarder, path), duration=1.5)
     assert imbalance(recording) < 1e-6
     assert recording.channels["dissipated"][-1] > 0.1  # [J], so there was something to balance
@@ -88,7 +88,7 @@ def test_power_balance_at_the_end_stops(forwarder):
 
 
 def test_loops_stay_closed(forwarder):
-    path = crane.task_path(forwarder, "return")
+    path = crane.task_trajectory(forwarder, "return")
     recording = crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.3)
     columns = [
         recording.q[:, forwarder.active.index(joint)]
@@ -100,8 +100,8 @@ def test_loops_stay_closed(forwarder):
 
 
 def test_channels_are_those_of_the_machine(forwarder):
-    path = crane.task_path(forwarder, "lift")
-    recording = crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.05, task="lift")
+    path = crane.task_trajectory(forwarder, "lift")
+    recording = crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.05, label="lift")
     kinematics, dynamics = crane.Kinematics(forwarder), crane.Dynamics(forwarder)
     tip = np.column_stack([recording.channels[f"tip_{axis}"] for axis in "xyz"])
     np.testing.assert_allclose(tip, kinematics.position(recording.q), atol=1e-12)
@@ -151,10 +151,10 @@ def test_progress_ends_at_one(forwarder):
 
 @pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 def test_a_step_that_is_too_long_is_told(forwarder):
-    path = crane.task_path(forwarder, "return")
+    path = crane.task_trajectory(forwarder, "return")
     with pytest.warns(CraneWarning, match="step of 0.005 s is too long"):
         crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.5, step=5e-3)
-    path = crane.task_path(forwarder, "lift")
+    path = crane.task_trajectory(forwarder, "lift")
     with pytest.raises(SimulationError, match="explodes .* shorten the step"):
         crane.simulate(forwarder, crane.PI(forwarder, path), duration=0.5, step=5e-3)
 
@@ -176,7 +176,7 @@ def test_leaving_the_limits_without_an_end_stop_is_told(forwarder):
 @pytest.mark.parametrize(
     ("arguments", "error", "text"),
     [
-        ({}, InputError, "no duration and no path"),
+        ({}, InputError, "no duration and no reference"),
         ({"duration": -1.0}, InputError, "the duration is -1.0 s"),
         ({"duration": np.nan}, InputError, "the duration is nan s"),
         ({"duration": 1.0, "step": 0.0}, InputError, "the step is 0.0 s"),

@@ -36,7 +36,7 @@ def test_measures_are_those_of_the_inverse_dynamics(mini):
     for row, mass in zip(found.rows, (0.0, 0.1), strict=True):
         machine = mini.with_payload(crane.Payload(mini.tip, mass)) if mass else mini
         time = np.linspace(0, 10, 20001)
-        q_a, v_a, a_a = crane.task_path(machine, "lift")(time)
+        q_a, v_a, a_a = crane.task_trajectory(machine, "lift")(time)
         tau = crane.Dynamics(machine).inverse(q_a, v_a, a_a, friction=True)
         power = tau * v_a
         assert row["peak_X2"] == pytest.approx(np.abs(tau[:, 2]).max(), rel=1e-5)

@@ -121,9 +121,9 @@ def _valve(machine: "Machine", run: "Recording", joint: str) -> "tuple[str, Figu
 
 
 def _friction(machine: "Machine", run: "Recording", joint: str) -> "tuple[str, Figure]":
-    from crane.identification.hydraulics.cylinder_friction import cylinder_friction
+    from crane.identification.hydraulics.cylinder_friction import identify_cylinder_friction
     from crane.view.plots.hydraulics import friction_figure
 
-    found = cylinder_friction(machine, run, joint)
+    found = identify_cylinder_friction(machine, run, joint)
     unit = machine.unit(joint)
     return found.to_text(unit), friction_figure(found, unit)

@@ -6,7 +6,7 @@ from crane.cli.runs import SUMMARY, write_run, write_views
 from crane.common.output import staging
 from crane.control import PI
 from crane.formats import load
-from crane.motion.trajectories import task_path
+from crane.motion.trajectories import task_trajectory
 from crane.simulation import Progress, simulate
 
 MACHINE = "mini_forwarder"
@@ -36,8 +36,8 @@ def run_demo(folder: Path, progress: Progress) -> str:
             def report(share: float, done: int = done) -> None:
                 progress((done + _SIMULATED * share) / len(machine.tasks))
 
-            control = PI(machine, task_path(machine, task))
-            recording = simulate(machine, control, task=task, progress=report)
+            control = PI(machine, task_trajectory(machine, task))
+            recording = simulate(machine, control, label=task, progress=report)
             texts.append(write_run(part / task, recording))
             write_views(part / task, machine, recording)
         text = "\n".join(texts)

@@ -193,11 +193,11 @@ def payload(
 ) -> None:
     """Estimate mass and centre of mass of what a machine carries from a recording."""
     from crane.cli.runs import read_run
-    from crane.identification.mechanics.payload import estimate_payload
+    from crane.identification.mechanics.payload import identify_payload
 
     loaded = load(machine, lock)
     with status(f"reading {recording.name}"):
         carried = read_run(recording, loaded)
     with progress_bar("estimating") as progress:
-        estimate = estimate_payload(loaded, carried, frame, method, trust=trust, progress=progress)
+        estimate = identify_payload(loaded, carried, frame, method, trust=trust, progress=progress)
     print(estimate.to_text(), end="")

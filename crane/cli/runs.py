@@ -166,10 +166,10 @@ def write_identification(
 
 
 def _write_machine(result: "Identification", folder: Path) -> None:
-    from crane.identification.mechanics.write import write_machine
+    from crane.identification.mechanics.write import write_identified
 
     try:
-        write_machine(result, folder)
+        write_identified(result, folder)
     except InputError as error:
         if result.feasible:
             raise

@@ -63,7 +63,7 @@ def simulate(
         duration = loaded.tasks[task].duration
     with progress_bar("simulating") as progress:
         recording = run(
-            loaded, control, duration=duration, step=step, task=task or "free motion",
+            loaded, control, duration=duration, step=step, label=task or "free motion",
             progress=progress,
         )  # fmt: skip
     print(write_run(out, recording), end="")
@@ -74,7 +74,7 @@ def _control(
     machine: "Machine", task: str | None, name: str | None
 ) -> "Controller | Command | None":
     from crane.control import controller, joystick, usual
-    from crane.motion.trajectories import task_path
+    from crane.motion.trajectories import task_trajectory
 
     if task is None:
         if name is not None:
@@ -88,7 +88,7 @@ def _control(
         if name is not None:
             raise InputError(f"task '{task}' moves levers, leave --controller out")
         return joystick(machine, task)
-    return controller(name or usual(machine), machine, task_path(machine, task))
+    return controller(name or usual(machine), machine, task_trajectory(machine, task))
 
 
 def _replay(machine: "Machine", inputs: Path, out: Path, step: float) -> None:

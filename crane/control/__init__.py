@@ -1,6 +1,6 @@
 """Controllers: forces of the active joints, or signals of valves, from time and motion."""
 
-from crane.control.base import At, Controller, Feedback, Free, Law, TracedController, path_of
+from crane.control.base import At, Controller, Feedback, Free, Law, TracedController, reference_of
 from crane.control.drive import ValveDrive
 from crane.control.forces import PI, ComputedTorque
 from crane.control.names import CONTROLLERS, controller, usual
@@ -10,5 +10,5 @@ from crane.control.valves import Command, Sampled, Signals, ValvePD, joystick
 __all__ = [
     "CONTROLLERS", "PI", "At", "Command", "ComputedTorque", "Controller", "Feedback", "Free",
     "Law", "Sampled", "Signals", "TipVelocity", "TracedController", "ValveDrive", "ValvePD",
-    "controller", "joystick", "path_of", "usual",
+    "controller", "joystick", "reference_of", "usual",
 ]  # fmt: skip

@@ -10,13 +10,13 @@ from crane.codegen import Number
 from crane.common.samples import Array, as_sample
 from crane.dynamics import Dynamics
 from crane.machine import Machine
-from crane.motion.trajectories import Path
+from crane.motion.trajectories import Trajectory
 
 
 class Controller(Protocol):
     """What `simulate` asks of a controller; a plain function (t, q_a, v_a) -> tau_a serves too.
 
-    It may have a `path`, the reference motion, which gives `simulate` start and duration.
+    It may have a `reference`, the reference motion, which gives `simulate` start and duration.
     """
 
     def start(self, q_a: Array) -> Array:
@@ -73,19 +73,20 @@ class TracedController(Controller, Protocol):
 class Law:
     """A controller whose law is written once, and called in numbers as well as traced.
 
-    A law writes `law`, and `begin`, `references`, `settings`, `path` where it has states, depends
-    on time, has numbers that change from one to the next, follows a motion. The rest follows.
+    A law writes `law`, and `begin`, `references`, `settings`, `reference` where it has states,
+    depends on time, has numbers that change from one to the next, follows a motion. The rest
+    follows.
 
     Args:
         machine: The machine.
 
     Attributes:
-        path: The reference motion, or None.
+        reference: The reference motion, or None.
         settings: (s,) numbers that machine code is not made anew for when they change. All other
             numbers of a law become part of the code.
     """
 
-    path: Path | None = None
+    reference: Trajectory | None = None
     settings: Array = np.zeros(0)
 
     def __init__(self, machine: Machine):
@@ -106,7 +107,7 @@ class Law:
     def start(self, q_a: Array) -> Array:
         """See `Controller`."""
         # nothing is worth compiling for one posture
-        dynamics = Dynamics(self.machine, path="pinocchio")
+        dynamics = Dynamics(self.machine, backend="pinocchio")
         return self.start_at(dynamics, self.machine.closure.solve(q_a))
 
     def start_at(self, dynamics: Dynamics, q: Array) -> Array:
@@ -182,6 +183,6 @@ class Feedback:
         return as_sample(forces, len(self._active), what, self._active), state
 
 
-def path_of(controller: Controller) -> Path | None:
+def reference_of(controller: Controller) -> Trajectory | None:
     """The reference motion of a controller, if it has one."""
-    return getattr(controller, "path", None)
+    return getattr(controller, "reference", None)

@@ -36,7 +36,7 @@ class ValveDrive(Law):
         pressures: Mapping[str, tuple[float, float]] | None = None,
     ):
         super().__init__(machine)
-        self.command, self.path, self.period = command, command.path, command.period
+        self.command, self.reference, self.period = command, command.reference, command.period
         hydraulics = circuit_of(machine)
         self._which = [machine.active.index(joint) for joint in hydraulics.joints]
         self._lower = machine.lower[self._which]

@@ -13,7 +13,7 @@ from crane.common.samples import Array, as_number, as_sample
 from crane.control.base import At, Law
 from crane.description import PIGains
 from crane.machine import Machine
-from crane.motion.trajectories import Path
+from crane.motion.trajectories import Trajectory
 
 
 class PI(Law):
@@ -23,7 +23,7 @@ class PI(Law):
 
     Args:
         machine: The machine.
-        path: Reference of the active joints.
+        reference: Reference of the active joints.
         gains: By active joint; those of the machine file if not given.
         integral: (n,) int e dt at the start [m s], [rad s]. If not given, it carries the
             machine's weight, as it does when a machine under control stands still; with zeros
@@ -36,7 +36,7 @@ class PI(Law):
     def __init__(
         self,
         machine: Machine,
-        path: Path,
+        reference: Trajectory,
         gains: Mapping[str, PIGains] | None = None,
         integral: ArrayLike | None = None,
     ):
@@ -48,8 +48,8 @@ class PI(Law):
                     "under 'control' of the machine file"
                 )
         super().__init__(machine)
-        self.path = path
-        self._reference, names = path, machine.active
+        self.reference: Trajectory = reference
+        names = machine.active
         self._integral = (
             None if integral is None else as_sample(integral, len(names), "integral", names)
         )
@@ -68,7 +68,7 @@ class PI(Law):
 
     def references(self, times: Array) -> Array:
         """See `TracedController`."""
-        return self._reference.position(times)
+        return self.reference.position(times)
 
     def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
         """See `Law`; the states are the integrals of the errors."""
@@ -90,28 +90,29 @@ class ComputedTorque(Law):
     tau = inverse(q_A, v_A, a_ref + 2 w (v_ref - v_A) + w^2 (q_ref - q_A)) with friction.
 
     It moves all active joints. Where nothing is said to drive one (`Machine.undriven`), a warning
-    names it and the force that it takes along the path.
+    names it and the force that it takes along the reference.
 
     Args:
         machine: The machine.
-        path: Reference of the active joints.
+        reference: Reference of the active joints.
         bandwidth: w [rad/s].
     """
 
-    def __init__(self, machine: Machine, path: Path, bandwidth: float = 20.0):
+    def __init__(self, machine: Machine, reference: Trajectory, bandwidth: float = 20.0):
         super().__init__(machine)
-        self.path = path
-        self._reference = path
+        self.reference: Trajectory = reference
         self.settings = np.array([as_number(bandwidth, "the bandwidth", "rad/s", above=0)])
         if machine.undriven:
             warnings.warn(self._needed(machine), CraneWarning, stacklevel=2)
 
     def _needed(self, machine: Machine) -> str:
         """What to say of joints that are moved though nothing drives them."""
-        path = self._reference
+        reference = self.reference
         try:
             peaks = np.abs(
-                self._dynamics.inverse(*path(np.linspace(0.0, path.duration, 201)), friction=True)
+                self._dynamics.inverse(
+                    *reference(np.linspace(0.0, reference.duration, 201)), friction=True
+                )
             ).max(axis=0)
         except ClosureError:  # the simulation will say where
             peaks = np.full(len(machine.active), np.nan)
@@ -128,7 +129,7 @@ class ComputedTorque(Law):
 
     def references(self, times: Array) -> Array:
         """See `TracedController`."""
-        return np.concatenate(self._reference(times), axis=1)
+        return np.concatenate(self.reference(times), axis=1)
 
     def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
         """See `Law`."""

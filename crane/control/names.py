@@ -8,9 +8,9 @@ from crane.control.forces import PI, ComputedTorque
 from crane.control.tip import TipVelocity
 from crane.control.valves import Command, ValvePD
 from crane.machine import Machine
-from crane.motion.trajectories import Path
+from crane.motion.trajectories import Trajectory
 
-CONTROLLERS: Mapping[str, Callable[[Machine, Path], Controller | Command]] = {
+CONTROLLERS: Mapping[str, Callable[[Machine, Trajectory], Controller | Command]] = {
     "pi": PI,
     "computed-torque": ComputedTorque,
     "valve-pd": ValvePD,
@@ -25,7 +25,7 @@ def usual(machine: Machine) -> str:
     return "pi" if machine.control else "computed-torque"
 
 
-def controller(name: str, machine: Machine, path: Path) -> Controller | Command:
+def controller(name: str, machine: Machine, reference: Trajectory) -> Controller | Command:
     """A built-in controller by name.
 
     Raises:
@@ -33,4 +33,4 @@ def controller(name: str, machine: Machine, path: Path) -> Controller | Command:
     """
     if name not in CONTROLLERS:
         raise InputError(f"controller '{name}' is unknown, {known(CONTROLLERS, name)}")
-    return CONTROLLERS[name](machine, path)
+    return CONTROLLERS[name](machine, reference)

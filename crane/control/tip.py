@@ -10,7 +10,7 @@ from crane.common.samples import Array, as_sample
 from crane.control.valves import Sampled, circuit_of
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
-from crane.motion.trajectories import Path
+from crane.motion.trajectories import Trajectory
 
 _EASE = 1e-3  # opening over which the dead band is jumped
 _NEAR = 1e-3  # of a stroke: a joint so close to its limit goes no further
@@ -32,24 +32,24 @@ class TipVelocity(Sampled):
 
     Args:
         machine: The machine, its tip given.
-        velocity: (t) -> (3,) of the tip in the world [m/s], or a path of the tip.
+        velocity: (t) -> (3,) of the tip in the world [m/s], or a trajectory of the tip.
         period: [s].
 
     Raises:
-        InputError: No tip, no valves, or a path that was not given for the tip.
+        InputError: No tip, no valves, or a trajectory that was not given for the tip.
     """
 
     def __init__(
         self,
         machine: Machine,
-        velocity: Callable[[float], ArrayLike] | Path,
+        velocity: Callable[[float], ArrayLike] | Trajectory,
         period: float = 0.01,
     ):
         super().__init__(self._signals, machine, period)
-        if isinstance(velocity, Path):
+        if isinstance(velocity, Trajectory):
             if velocity.tip is None:
-                raise InputError("the path is not one of the tip, give one in x, y, z")
-            self.path = velocity
+                raise InputError("the trajectory is not one of the tip, give one in x, y, z")
+            self.reference = velocity
             curve = velocity.tip
             self._velocity: Callable[[float], ArrayLike] = lambda time: curve(time)[1]
         else:

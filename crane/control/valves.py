@@ -14,7 +14,7 @@ from crane.common.samples import Array, as_number, as_sample
 from crane.control.base import At
 from crane.hydraulics import Hydraulics, PDGains
 from crane.machine import Machine
-from crane.motion.trajectories import Path
+from crane.motion.trajectories import Trajectory
 
 _LONGEST = 4000.0  # of levers [s], what a simulation can have of milliseconds
 _JUMP = 0.01  # of the spool's stroke, over which the feedforward jumps the dead band
@@ -27,13 +27,13 @@ class Command(Protocol):
     What is written here is what those have that say nothing else.
 
     Attributes:
-        path: The reference motion, or None.
+        reference: The reference motion, or None.
         measured: Whether the last two references are the pressures of supply and tank.
         settings: (s,) its numbers.
         period: Time between calls of `update` [s]; 0 if it wants none.
     """
 
-    path: Path | None = None
+    reference: Trajectory | None = None
     measured: bool = False
     settings: Array = np.zeros(0)
     period: float = 0.0
@@ -206,14 +206,16 @@ class ValvePD(Command):
 
     Args:
         machine: The machine.
-        path: Reference of the active joints.
+        reference: Reference of the active joints.
         gains: By joint; those of the machine file if not given.
 
     Raises:
         InputError: No valves, or no gains for one.
     """
 
-    def __init__(self, machine: Machine, path: Path, gains: Mapping[str, PDGains] | None = None):
+    def __init__(
+        self, machine: Machine, reference: Trajectory, gains: Mapping[str, PDGains] | None = None
+    ):
         circuit = circuit_of(machine)
         gains = circuit.control if gains is None else gains
         for joint in circuit.joints:
@@ -222,8 +224,7 @@ class ValvePD(Command):
                     f"no gains for the valve of '{joint}' of '{machine.name}', give kp and kd "
                     "under 'control' of its 'hydraulics'"
                 )
-        self.path = path
-        self._reference = path
+        self.reference: Trajectory = reference
         self._which = [machine.active.index(joint) for joint in circuit.joints]
         valves = circuit.valves.values()
         numbers = [
@@ -237,7 +238,7 @@ class ValvePD(Command):
 
     def references(self, times: Array) -> Array:
         """See `Command`."""
-        q, v = self._reference.position(times), self._reference.velocity(times)
+        q, v = self.reference.position(times), self.reference.velocity(times)
         return np.hstack([q[:, self._which], v[:, self._which]])
 
     def signals(self, at: At) -> Sequence[Number]:

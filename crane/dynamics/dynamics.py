@@ -13,7 +13,7 @@ from crane.dynamics.traced import numbers_of
 from crane.dynamics.tree import TreeDynamics
 from crane.machine import Machine
 
-PATHS = ("compiled", "pinocchio")
+BACKENDS = ("compiled", "pinocchio")
 
 
 class Dynamics:
@@ -39,31 +39,31 @@ class Dynamics:
         formulation: "exact", or "decoupled": every sub-chain on a base held still, as published.
             It lacks the forces of a chain on the chain that carries it, so it does not keep
             energy; `docs/validation/mini_forwarder.md` shows how much that is.
-        path: "compiled" or "pinocchio".
+        backend: "compiled" or "pinocchio".
 
     Raises:
-        InputError: Unknown formulation or path.
+        InputError: Unknown formulation or backend.
     """
 
-    def __init__(self, machine: Machine, formulation: str = "exact", path: str = "compiled"):
-        if path not in PATHS:
-            raise InputError(f"path '{path}' is unknown, {known(PATHS, path)}")
+    def __init__(self, machine: Machine, formulation: str = "exact", backend: str = "compiled"):
+        if backend not in BACKENDS:
+            raise InputError(f"backend '{backend}' is unknown, {known(BACKENDS, backend)}")
         if not isinstance(machine, Machine):
             raise InputError(f"{machine!r} is not a machine, load it with crane.load")
         self.machine, self.formulation = machine, formulation
         self.carriers = carriers(machine, formulation)
         self.forces = JointForces(machine)
-        self.path = path if machine.closure.compiled else "pinocchio"
+        self.backend = backend if machine.closure.compiled else "pinocchio"
         self.tree = TreeDynamics(machine, self.forces, self.carriers)
         self._formulas: dict[str, Formula | None] = {}
         self.numbers = np.zeros(0)
-        if self.path == "compiled":
+        if self.backend == "compiled":
             geometry = machine.closure.fast.geometry
             self.numbers = np.ascontiguousarray(numbers_of(machine, geometry, self.forces))
 
     def __repr__(self) -> str:
         """Of what, and how it is computed."""
-        return f"Dynamics of '{self.machine.name}', {self.path}"
+        return f"Dynamics of '{self.machine.name}', {self.backend}"
 
     @property
     def parameters(self) -> Array:
@@ -193,8 +193,8 @@ class Dynamics:
         size = 10 * (self.machine.model.njoints - 1)
         return self._evaluate("regressor", (self._n, size), q_a, v_a, a_a, "a_a")
 
-    def path_of(self, quantity: str = "forward") -> str:
-        """Which path computes a quantity of `crane.dynamics.compiled.QUANTITIES`."""
+    def reference_of(self, quantity: str = "forward") -> str:
+        """Which backend computes a quantity of `crane.dynamics.compiled.QUANTITIES`."""
         return "pinocchio" if self._formula(quantity) is None else "compiled"
 
     def at(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
@@ -224,12 +224,12 @@ class Dynamics:
         return len(self.machine.active)
 
     def _formula(self, quantity: str) -> Formula | None:
-        """Machine code of a quantity, or None on Pinocchio's path."""
+        """Machine code of a quantity, or None on the Pinocchio backend."""
         if quantity not in self._formulas:
             try:
                 self._formulas[quantity] = (
                     Formula(quantity, self.machine, self.numbers, self.carriers)
-                    if self.path == "compiled"
+                    if self.backend == "compiled"
                     else None
                 )
             except TooLongError:

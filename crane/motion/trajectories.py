@@ -15,19 +15,19 @@ LIMIT_SLACK = 1e-6  # [m], [rad] by which a reference may pass a limit between i
 _KNOTS_PER_SECOND = 100
 
 
-class Path:
+class Trajectory:
     """A motion with two derivatives; before its start and after its end it stands still.
 
     Args:
         curve: Piecewise polynomial of time from 0 [s], values (n,).
-        tip: The same motion of the tip, values (3,) [m], where the path was given there.
+        tip: The same motion of the tip, values (3,) [m], where the trajectory was given there.
 
     Attributes:
         duration: [s].
         tip: See above.
     """
 
-    def __init__(self, curve: PPoly, tip: "Path | None" = None):
+    def __init__(self, curve: PPoly, tip: "Trajectory | None" = None):
         self.duration = float(curve.x[-1])
         self.tip = tip
         self._curves = (curve, curve.derivative(), curve.derivative(2))
@@ -41,7 +41,7 @@ class Path:
         return self._rate(1, time)
 
     def _rate(self, order: int, time: ArrayLike) -> Array:
-        """A derivative; zero before and after the path, where it stands still."""
+        """A derivative; zero before and after it, where it stands still."""
         inside = np.clip(time, 0.0, self.duration)
         rate: Array = np.asarray(self._curves[order](inside))
         rate[inside != time] = 0.0
@@ -76,7 +76,7 @@ class Path:
         return self.position(time), self._rate(1, time), self._rate(2, time)
 
 
-def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Path:
+def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Trajectory:
     """Polynomials in time.
 
     Args:
@@ -86,7 +86,7 @@ def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Path
     Raises:
         InputError: No coordinates, not finite, or no duration.
     """
-    as_number(duration, "the path's duration", "s", above=0)
+    as_number(duration, "the trajectory's duration", "s", above=0)
     try:
         rows = [np.asarray(row, dtype=np.float64) for row in coefficients]
     except (TypeError, ValueError):
@@ -94,15 +94,15 @@ def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Path
     size = max((row.size for row in rows if row.ndim == 1), default=0)
     if not size or not all(row.ndim == 1 and np.isfinite(row).all() for row in rows):
         raise InputError(
-            "the path's coefficients are not finite numbers, give a list per coordinate"
+            "the trajectory's coefficients are not finite numbers, give a list per coordinate"
         )
     table = np.zeros((size, 1, len(rows)))
     for column, row in enumerate(rows):
         table[size - len(row) :, 0, column] = row[::-1]
-    return Path(PPoly(table, [0.0, duration]))
+    return Trajectory(PPoly(table, [0.0, duration]))
 
 
-def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Path:
+def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Trajectory:
     """Straight line from rest to rest with least jerk: s = 10 u^3 - 15 u^4 + 6 u^5, u = t/T.
 
     Args:
@@ -113,7 +113,7 @@ def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Path:
     Raises:
         InputError: Different sizes, not finite, or no duration.
     """
-    as_number(duration, "the path's duration", "s", above=0)
+    as_number(duration, "the trajectory's duration", "s", above=0)
     first = as_samples(np.ravel(start), np.size(start), "start")
     last = as_samples(np.ravel(end), len(first), "end")
     shape = np.array([0, 0, 0, 10.0, -15.0, 6.0]) / duration ** np.arange(6)
@@ -122,8 +122,10 @@ def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Path:
     )
 
 
-def tip_path(machine: Machine, tip: Path, guess: ArrayLike | None = None) -> Path:
-    """The motion of the active joints that moves the tip along a path.
+def tip_trajectory(
+    machine: Machine, tip: Trajectory, guess: ArrayLike | None = None
+) -> Trajectory:
+    """The motion of the active joints that moves the tip along a trajectory.
 
     Positions at knots every 10 ms come from inverse kinematics, and so do velocities and
     accelerations, v_A = J^-1 x', a_A = J^-1 (x'' - bias); quintics join them. A machine with more
@@ -132,14 +134,14 @@ def tip_path(machine: Machine, tip: Path, guess: ArrayLike | None = None) -> Pat
 
     Args:
         machine: The machine.
-        tip: Path of the tip in the world [m].
+        tip: Trajectory of the tip in the world [m].
         guess: (n,) active coordinates near the start.
 
     Returns:
-        Path of q_A, with `tip` set.
+        Trajectory of q_A, with `tip` set.
 
     Raises:
-        UnreachableTipError: The path leaves the reach.
+        UnreachableTipError: The trajectory leaves the reach.
     """
     kinematics = Kinematics(machine)
     count = max(6, int(np.ceil(tip.duration * _KNOTS_PER_SECOND)) + 1)
@@ -148,11 +150,11 @@ def tip_path(machine: Machine, tip: Path, guess: ArrayLike | None = None) -> Pat
     q_a = kinematics.inverse(x, guess)
     if q_a.shape[1] > x.shape[1]:
         spline = make_interp_spline(time, q_a, k=5)
-        return Path(_quintics(time, q_a, spline(time, 1), spline(time, 2)), tip)
+        return Trajectory(_quintics(time, q_a, spline(time, 1), spline(time, 2)), tip)
     jacobian = np.linalg.pinv(kinematics.jacobian(q_a))
     v_a = np.einsum("ijk,ik->ij", jacobian, x_rate)
     a_a = np.einsum("ijk,ik->ij", jacobian, x_second - kinematics.bias(q_a, v_a))
-    return Path(_quintics(time, q_a, v_a, a_a), tip)
+    return Trajectory(_quintics(time, q_a, v_a, a_a), tip)
 
 
 def _quintics(time: Array, x: Array, v: Array, a: Array) -> PPoly:
@@ -179,8 +181,8 @@ def _quintics(time: Array, x: Array, v: Array, a: Array) -> PPoly:
     return PPoly(np.array(rows), time)
 
 
-def task_path(machine: Machine, task: str) -> Path:
-    """Path of the active joints of a named task of the machine.
+def task_trajectory(machine: Machine, task: str) -> Trajectory:
+    """Trajectory of the active joints of a named task of the machine.
 
     Raises:
         InputError: The machine has no such task.
@@ -193,31 +195,31 @@ def task_path(machine: Machine, task: str) -> Path:
         )
     chosen = machine.tasks[task]
     if chosen.space == "joystick":
-        raise InputError(f"task '{task}' moves levers, it has no path")
+        raise InputError(f"task '{task}' moves levers, it has no trajectory")
     if chosen.space == "tip":
         rows = [chosen.coefficients[axis] for axis in ("x", "y", "z")]
-        return tip_path(machine, polynomial(rows, chosen.duration))
-    path = polynomial([chosen.coefficients[name] for name in machine.active], chosen.duration)
-    if text := beyond_limits(machine, path):
+        return tip_trajectory(machine, polynomial(rows, chosen.duration))
+    found = polynomial([chosen.coefficients[name] for name in machine.active], chosen.duration)
+    if text := beyond_limits(machine, found):
         raise LimitError(f"task '{task}': {text}")
-    return path
+    return found
 
 
-def beyond_limits(machine: Machine, path: Path, until: float = np.inf) -> str:
+def beyond_limits(machine: Machine, reference: Trajectory, until: float = np.inf) -> str:
     """What to say of a reference that leaves the limits of an active joint, else nothing.
 
     Args:
         machine: The machine.
-        path: Reference of its active joints.
+        reference: Reference of its active joints.
         until: End of what is looked at [s].
     """
-    least, most = path.bounds()
+    least, most = reference.bounds()
     if least.shape != machine.lower.shape:
         return ""  # of another machine, which is told elsewhere
     if (np.maximum(machine.lower - least, most - machine.upper) <= LIMIT_SLACK).all():
         return ""  # without a look where it turns
-    times = np.unique(np.minimum(path.turns(), until))
-    q_a = path.position(times)
+    times = np.unique(np.minimum(reference.turns(), until))
+    q_a = reference.position(times)
     excess = np.maximum(machine.lower - q_a, q_a - machine.upper)
     if not (excess > LIMIT_SLACK).any():
         return ""

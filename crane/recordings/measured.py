@@ -247,7 +247,7 @@ def _span(machine: Machine) -> Array:
     return np.where(np.isfinite(span), span, 1.0)
 
 
-def motion_of(machine: Machine, table: Table) -> tuple[Array, Array]:
+def joint_motion(machine: Machine, table: Table) -> tuple[Array, Array]:
     """Active coordinates and velocities (N, n) of what a table tells of the machine's joints.
 
     Raises:

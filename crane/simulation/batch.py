@@ -67,7 +67,7 @@ def simulate_batch(
         machines: B machines with the same active joints, or one for all initial states.
         controller: Makes the controller of a machine; None for no force.
         initial: B initial states as `simulate` takes them, or None for its default.
-        duration: [s]; that of the controller's path if not given.
+        duration: [s]; that of the controller's reference if not given.
         step: [s].
         threads: Number of threads; one per core if not given.
         progress: Called with the finished share, 0 to 1.

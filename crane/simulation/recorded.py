@@ -8,11 +8,11 @@ import numpy as np
 from crane.codegen import Parts
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
-from crane.control import Controller, Free, Signals, ValveDrive, path_of
+from crane.control import Controller, Free, Signals, ValveDrive, reference_of
 from crane.hydraulics.circuit import BALANCES
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
-from crane.motion.trajectories import Path
+from crane.motion.trajectories import Trajectory
 from crane.recordings.recording import Recording
 
 Column = tuple[str, Array, str]  # name, values, unit
@@ -61,9 +61,9 @@ def _channels(machine: Machine, control: Controller, time: Array, rows: Parts) -
         yield joint, rows.q[:, column], machine.unit(joint)
     if machine.tip is not None:
         yield from _point("tip", Kinematics(machine).positions(rows.q))
-    path = path_of(control)
-    if path is not None:
-        yield from _references(machine, path, time)
+    reference = reference_of(control)
+    if reference is not None:
+        yield from _references(machine, reference, time)
     for i, joint in enumerate(machine.active):
         yield (
             f"friction_{joint}",
@@ -80,15 +80,15 @@ def _channels(machine: Machine, control: Controller, time: Array, rows: Parts) -
             yield name, values, unit
 
 
-def _references(machine: Machine, path: Path, time: Array) -> Iterator[Column]:
-    """What a path asks of the joints, and of the tip where it was given there."""
-    q, v = path.position(time), path.velocity(time)
+def _references(machine: Machine, reference: Trajectory, time: Array) -> Iterator[Column]:
+    """What a reference asks of the joints, and of the tip where it was given there."""
+    q, v = reference.position(time), reference.velocity(time)
     for i, joint in enumerate(machine.active):
         unit = machine.unit(joint)
         yield f"reference_{joint}", q[:, i], unit
         yield f"reference_velocity_{joint}", v[:, i], unit + "/s"
-    if path.tip is not None:
-        yield from _point("reference_tip", path.tip.position(time))
+    if reference.tip is not None:
+        yield from _point("reference_tip", reference.tip.position(time))
 
 
 def _point(name: str, positions: Array) -> Iterator[Column]:

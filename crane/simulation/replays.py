@@ -15,7 +15,7 @@ from crane.recordings import timeseries
 from crane.recordings.measured import (
     check_pressures,
     column,
-    motion_of,
+    joint_motion,
     moved_locks,
     tell_disagreement,
 )
@@ -133,8 +133,10 @@ def replay(
     steps = int(time[-1] / step + 1e-9)
     if steps < 1:
         raise RecordingError(f"{path}: is shorter than a step of {step:g} s, shorten the step")
-    task = Path(path).stem
-    recording = simulate(machine, drive, initial, steps * step, step, task=task, progress=progress)
+    label = Path(path).stem
+    recording = simulate(
+        machine, drive, initial, steps * step, step, label=label, progress=progress
+    )
     try:
         return recording, compare(table, recording)
     except RecordingError as error:
@@ -238,7 +240,7 @@ def _initial(
     for text in moved_locks(machine, _columns(table), table.units):
         raise RecordingError(f"{text}, do not lock it, or lock it where it is")
     tell_disagreement(machine, table)
-    q_a, v_a = motion_of(machine, table)
+    q_a, v_a = joint_motion(machine, table)
     _warn_of_limits(machine, time, q_a)
     steady = time <= _steady(time, signals)
     states = []

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,10 +11,20 @@ from numpy.typing import ArrayLike
 from crane.codegen import Parts, TooLongError
 from crane.common.errors import ClosureError, CraneWarning, InputError, SimulationError, known
 from crane.common.samples import Array, as_number, as_sample
-from crane.control import Command, Controller, Feedback, Free, Law, Signals, ValveDrive, path_of
+from crane.control import (
+    Command,
+    Controller,
+    Feedback,
+    Free,
+    Law,
+    Signals,
+    ValveDrive,
+    reference_of,
+)
 from crane.dynamics import Dynamics
+from crane.formats import load
 from crane.machine import Machine
-from crane.motion.trajectories import Path, beyond_limits
+from crane.motion.trajectories import Trajectory, beyond_limits
 from crane.recordings.recording import Recording
 from crane.simulation.integration.adaptive import ADAPTIVE, AdaptiveSteps
 from crane.simulation.integration.halt import HaltedError, explained
@@ -30,14 +41,14 @@ Progress = Callable[[float], None]
 
 
 def simulate(
-    machine: Machine,
+    machine: Machine | str | Path,
     controller: Controller | Command | Force | None = None,
     initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None = None,
     duration: float | None = None,
     step: float = 1e-3,
     *,
-    task: str = "",
-    path: str = "compiled",
+    label: str = "",
+    backend: str = "compiled",
     method: str | None = None,
     formulation: str = "exact",
     progress: Progress | None = None,
@@ -51,16 +62,16 @@ def simulate(
     rounding.
 
     Args:
-        machine: The machine.
+        machine: The machine, or what `crane.load` takes.
         controller: A controller, a function (t, q_a, v_a) -> tau_a, or what commands the valves
             of a hydraulic machine (`ValvePD`, `joystick`, `Signals`, `Sampled`). None is no
             force, and valves at their neutral signal where the machine has any.
         initial: Active coordinates (n,) to start at rest from, or a pair (q_a, v_a); the start of
-            the controller's path, at rest, or else the home posture.
-        duration: [s]; that of the controller's path if not given.
+            the controller's reference, at rest, or else the home posture.
+        duration: [s]; that of the controller's reference if not given.
         step: [s].
-        task: Name to put into the recording.
-        path: "compiled" or "pinocchio", see `Dynamics`.
+        label: Name of the motion to put into the recording, as its `task`.
+        backend: "compiled" or "pinocchio", see `Dynamics`.
         method: "rk4"; "rosenbrock" for hydraulic machines, see `StiffStepper`; or one of scipy's
             adaptive methods ("DOP853", "Radau", "LSODA", ...) with relative tolerance 1e-9, whose
             dense output is recorded every `step`. If not given, the one that the controller asks
@@ -69,7 +80,7 @@ def simulate(
         progress: Called with the finished share, 0 to 1.
 
     Returns:
-        Recording with channels for every passive joint, the tip, the references of the path,
+        Recording with channels for every passive joint, the tip, the references,
         friction_<joint>, and the energies kinetic, potential, work (of the active forces) and
         dissipated [J]; work = change of (kinetic + potential) + dissipated, of the exact
         formulation only.
@@ -84,19 +95,21 @@ def simulate(
     A reference that leaves the limits of a joint is a warning before the first step: with an end
     stop it can be meant.
     """
-    if not (isinstance(task, str) and task.isprintable()):
-        raise InputError(f"task {task!r} is not one line of text")
+    if not (isinstance(label, str) and label.isprintable()):
+        raise InputError(f"label {label!r} is not one line of text")
+    if not isinstance(machine, Machine):
+        machine = load(machine)
     control = as_controller(controller, machine)
     steps = count_steps(control, duration, step)
     if text := reference_beyond(machine, control, steps * step):
         warnings.warn(text, CraneWarning, stacklevel=2)
-    dynamics = Dynamics(machine, formulation, path)
+    dynamics = Dynamics(machine, formulation, backend)
     time, rows = trajectory(dynamics, control, initial, steps, step, method, progress)
     # the energies are integrated with the motion, so they tell when the step is too long
     text = imbalance(rows, step)
     if text and formulation == "exact":
         warnings.warn(text, CraneWarning, stacklevel=2)
-    return recorded(machine, control, time, rows, task)
+    return recorded(machine, control, time, rows, label)
 
 
 def trajectory(
@@ -122,8 +135,8 @@ def trajectory(
     Returns:
         Times (N,), and what `crane.simulation.integration.row_layout` names, (N, .) each.
     """
-    machine, path = dynamics.machine, path_of(control)
-    q_a, v_a = _start(machine, initial, path)
+    machine, reference = dynamics.machine, reference_of(control)
+    q_a, v_a = _start(machine, initial, reference)
     try:
         posture = machine.closure.solve(q_a)
         own = _own_start(control, dynamics, posture)
@@ -145,7 +158,7 @@ def trajectory(
     except HaltedError as halt:
         finer, done = integration.finer(times[:-1], rows, step), integration.done
         q_a = layout.view(rows[:done]).q[:, machine.closure.active]
-        raise explained(machine, halt, times[:done], q_a, path, finer) from None
+        raise explained(machine, halt, times[:done], q_a, reference, finer) from None
     if progress is not None:
         progress(1.0)
     return times, layout.view(rows)
@@ -177,11 +190,11 @@ def _integration(
 
 def _stiff(dynamics: Dynamics, control: ValveDrive, own: int) -> StiffSteps | AdaptiveSteps:
     """What integrates a circuit: machine code, or scipy where there is none."""
-    if dynamics.path == "compiled":
+    if dynamics.backend == "compiled":
         with suppress(TooLongError):
             return StiffSteps(dynamics, control)
     if control.period:
-        raise InputError("a program with a period runs on the compiled path alone")
+        raise InputError("a program with a period runs on the compiled backend alone")
     return AdaptiveSteps(dynamics, control, own, "BDF")
 
 
@@ -214,16 +227,16 @@ def as_controller(controller: Controller | Command | Force | None, machine: Mach
 
 
 def count_steps(control: Controller, duration: float | None, step: float) -> int:
-    """Steps [s] in a duration [s], that of the controller's path if not given.
+    """Steps [s] in a duration [s], that of the controller's reference if not given.
 
     Raises:
         InputError: There is no duration, there are too many steps, or no whole number of them.
     """
     if duration is None:
-        path = path_of(control)
-        if path is None:
-            raise InputError("no duration and no path to take it from, give a duration")
-        duration = path.duration
+        reference = reference_of(control)
+        if reference is None:
+            raise InputError("no duration and no reference to take it from, give a duration")
+        duration = reference.duration
     duration = as_number(duration, "the duration", "s", above=0)
     step = as_number(step, "the step", "s", above=0)
     if duration / step > _MOST:
@@ -241,17 +254,21 @@ def count_steps(control: Controller, duration: float | None, step: float) -> int
 
 def reference_beyond(machine: Machine, control: Controller, until: float) -> str:
     """What to say of a reference that leaves the limits before a time [s], else nothing."""
-    path = path_of(control)
-    return "" if path is None else beyond_limits(machine, path, until)
+    reference = reference_of(control)
+    return "" if reference is None else beyond_limits(machine, reference, until)
 
 
 def _start(
-    machine: Machine, initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None, path: Path | None
+    machine: Machine,
+    initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None,
+    reference: Trajectory | None,
 ) -> tuple[Array, Array]:
     size, rest = len(machine.active), np.zeros(len(machine.active))
     if initial is None:
-        if path is not None:
-            return machine.check_limits(path.position(0.0), "the start of the path"), rest
+        if reference is not None:
+            return machine.check_limits(
+                reference.position(0.0), "the start of the reference"
+            ), rest
         return np.array(machine.home[machine.closure.active]), rest
     if isinstance(initial, tuple) and len(initial) == 2 and np.ndim(initial[0]) == 1:
         q_a = machine.check_limits(initial[0], "initial q_a")

@@ -11,7 +11,7 @@ from crane.common.samples import Array
 from crane.dynamics import Dynamics
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
-from crane.motion.trajectories import task_path
+from crane.motion.trajectories import task_trajectory
 from crane.motion.workspaces.extremes import farthest
 from crane.motion.workspaces.section import upwards
 from crane.recordings.recording import FORCE_UNITS
@@ -59,7 +59,7 @@ def of_task(machine: Machine, dynamics: Dynamics, task: str) -> tuple[float, dic
     Raises:
         CraneError: The machine cannot do it.
     """
-    path = task_path(machine, task)
+    path = task_trajectory(machine, task)
     time = np.linspace(0.0, path.duration, int(np.ceil(_RATE * path.duration)) + 1)
     q_a, v_a, a_a = path(time)
     tau = dynamics.inverse(q_a, v_a, a_a, friction=True)

@@ -34,6 +34,10 @@ _MOST = 100_000  # variants
 _PER_CORE = 8  # processes: more would wait for each other, and each has the machine in memory
 # Parameters that inverse dynamics does not know, by their first word.
 _IDLE = ("control", "supply", "oil", "cylinder", "valve", "valve_control")
+# What of a machine its files describe.
+_DESCRIBED = (
+    "tree", "active", "friction", "forces", "gas_springs", "end_stops", "tasks", "hydraulics",
+)  # fmt: skip
 
 Progress = Callable[[float], None]
 
@@ -47,18 +51,20 @@ class Job(NamedTuple):
     Attributes:
         machine: What `load` takes.
         changes: Of its parameters.
+        lock: Joints that are fixed.
         tasks: To measure it with.
         strokes: Whether to measure its strokes.
     """
 
     machine: str
     changes: dict[str, float]
+    lock: dict[str, float]
     tasks: tuple[str, ...]
     strokes: bool
 
 
 def study(
-    machine: str | Path,
+    machine: Machine | str | Path,
     vary: Mapping[str, ArrayLike],
     tasks: Sequence[str] | None = None,
     measures: Sequence[str] | None = None,
@@ -76,7 +82,7 @@ def study(
     is loaded afresh, so its row does not depend on where it is computed, or after what.
 
     Args:
-        machine: See `crane.load`.
+        machine: What `crane.load` takes, or what it gave.
         vary: By name of a parameter, see `crane.description.parameters`: values, of which all
             combinations are taken, or with `draws` the two ends of a range.
         tasks: Of the machine; all if not given.
@@ -89,14 +95,15 @@ def study(
         progress: Called with the finished share, 0 to 1.
 
     Raises:
-        InputError: Unknown names, values that do not go together, or no variant can be measured.
+        InputError: Unknown names, values that do not go together, no variant can be measured, or a
+            machine that was changed after it was loaded.
     """
     as_count(processes, "the number of processes", 1, _PER_CORE * (os.cpu_count() or 1))
     seed = as_seed(seed)
-    base = load(machine)
+    base = _base(machine)
     name = base.reference if base.reference == str(machine) else str(base.path.resolve())
     values, grid = _variants(vary, draws, seed)
-    units = _parameter_units(machine, base, vary)
+    units = _parameter_units(base, vary)
     tasks = _chosen("task", base.tasks, tasks)
     of_tasks = task_measures(base) if tasks else {}
     available = of_tasks | stroke_measures(base)
@@ -106,7 +113,8 @@ def study(
     jobs = [
         Job(
             name,
-            dict(zip(vary, row.tolist(), strict=True)),
+            {**base.changes, **dict(zip(vary, row.tolist(), strict=True))},
+            dict(base.locks),
             tasks,
             not set(measures) <= set(of_tasks),
         )
@@ -133,12 +141,25 @@ def study(
     )
 
 
+def _base(machine: Machine | str | Path) -> Machine:
+    """The machine that is varied, as its files and the changes given to `load` describe it."""
+    if not isinstance(machine, Machine):
+        return load(machine)
+    again = load(machine.path, machine.changes, machine.locks)
+    if any(getattr(machine, name) != getattr(again, name) for name in _DESCRIBED):
+        raise InputError(
+            f"'{machine.name}' is not what its files describe, variants are loaded from them: "
+            "write it with write_machine, and load that"
+        )
+    return again
+
+
 def variant(job: Job) -> tuple[dict[str, float], str]:
     """Columns of one variant, and why some are missing."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)  # told of the machine itself
         try:
-            machine = load(job.machine, job.changes)
+            machine = load(job.machine, job.changes, job.lock)
         except CraneError as error:
             return {}, str(error)
         return _measured(machine, job)
@@ -196,9 +217,9 @@ def _chosen(
     return tuple(dict.fromkeys(available if wanted is None else wanted))
 
 
-def _parameter_units(name: str | Path, machine: Machine, vary: Mapping[str, object]) -> dict:
+def _parameter_units(machine: Machine, vary: Mapping[str, object]) -> dict:
     """Units by parameter; refuses those that do not exist or change nothing."""
-    names = parameters(read(name))
+    names = parameters(read(machine.path))
     units = {}
     for wanted in vary:
         if wanted not in names:

@@ -45,7 +45,7 @@ class Pushed(PI):
     """
 
     def __init__(
-        self, machine: crane.Machine, path: crane.Path, smoothing: Array, integral: Array
+        self, machine: crane.Machine, path: crane.Trajectory, smoothing: Array, integral: Array
     ):
         super().__init__(machine, path, integral=integral)
         self._smoothing = smoothing
@@ -119,7 +119,9 @@ def without_active_friction(machine: crane.Machine) -> crane.Machine:
     return machine.replace(friction=others | viscous)
 
 
-def simulate(machine: crane.Machine, path: crane.Path, formulation: str, reading: str) -> Run:
+def simulate(
+    machine: crane.Machine, path: crane.Trajectory, formulation: str, reading: str
+) -> Run:
     """A task under the PI controllers, whose integrals carry the weight at the start."""
     q, v, _ = path(0.0)
     gains = np.array([machine.control[joint].ki for joint in machine.active])
@@ -137,13 +139,13 @@ def simulate(machine: crane.Machine, path: crane.Path, formulation: str, reading
     return run_of(recording, path, tau)
 
 
-def run_of(recording: crane.Recording, path: crane.Path, tau: Array) -> Run:
+def run_of(recording: crane.Recording, path: crane.Trajectory, tau: Array) -> Run:
     """A recording with its reference."""
     tip = np.column_stack([recording.channels[f"tip_{axis}"] for axis in "xyz"])
     return Run(recording.time, recording.q, recording.v, tau, tip, path.tip(recording.time)[0])
 
 
-def tip_errors(machine: crane.Machine, path: crane.Path) -> dict[str, Array]:
+def tip_errors(machine: crane.Machine, path: crane.Trajectory) -> dict[str, Array]:
     """Distance of the tip from its reference (N,) [m], and what remains of it without its causes.
 
     Without inertia and start, K_p e + K_i int e dt = F(t) gives K_p e' + K_i e = F': an error
@@ -189,7 +191,7 @@ def neglected(machine: crane.Machine) -> dict[str, tuple[Array, Array, Array]]:
     tops = []
     for task in TASKS:
         time = STEP * np.arange(round(DURATION / STEP) + 1)
-        _, v, a = crane.task_path(machine, task)(time)
+        _, v, a = crane.task_trajectory(machine, task)(time)
         tops.append((np.abs(v).max(axis=0), np.abs(a).max(axis=0)))
     fastest, hardest = np.max(tops, axis=0)
     found = {}

@@ -11,7 +11,10 @@ import crane
 from crane.common.samples import Array
 from crane.control import Signals
 from crane.hydraulics.components import PDGains
-from crane.identification.hydraulics.cylinder_friction import CylinderFriction, cylinder_friction
+from crane.identification.hydraulics.cylinder_friction import (
+    CylinderFriction,
+    identify_cylinder_friction,
+)
 from crane.identification.hydraulics.cylinder_signals import cylinder_signals
 from crane.identification.hydraulics.orifices import METHODS, Orifices, identify_orifices
 from crane.identification.hydraulics.valve import ValveCurve, identify_valve
@@ -275,7 +278,7 @@ def friction_strokes(folder: Path, share: float, masses: float = 1.0) -> Cylinde
     pieces[2] = start
     pieces[:, :, 0] = rise / 2, v[:-1], start[0] + way[:-1]
     gains = {"X_lift": PDGains(20, 0.1), "X_tilt": PDGains(10, 0.05), "X_ext": PDGains(10, 0.1)}
-    path = crane.Path(PPoly(pieces, t))
+    path = crane.Trajectory(PPoly(pieces, t))
     run = crane.simulate(
         machine, crane.ValvePD(machine, path, gains), duration=round(t[-1], 1), step=STEP
     )
@@ -284,4 +287,4 @@ def friction_strokes(folder: Path, share: float, masses: float = 1.0) -> Cylinde
     if masses != 1.0:
         mass = {"lift_boom.mass": masses * 143.66}
         taken = crane.load("patu655", dict(machine.changes) | mass, {"slew": 0.0})
-    return cylinder_friction(taken, read, JOINT)
+    return identify_cylinder_friction(taken, read, JOINT)

@@ -163,7 +163,7 @@ def perform(plant: Crane, motion: Fourier, step: float = STEP) -> crane.Recordin
     The joints' reference is mapped to strokes by the closed loops.
     """
     time = np.linspace(0.0, motion.duration, round(motion.duration / 0.02) + 1)
-    path = crane.Path(CubicSpline(time, plant.strokes(motion(time)[0])))
+    path = crane.Trajectory(CubicSpline(time, plant.strokes(motion(time)[0])))
     control = crane.ValvePD(plant.machine, path, GAINS)
     whole = crane.simulate(plant.machine, control, step=step)
     first, count = round(motion.lead / step), round(motion.periods * motion.period / step)

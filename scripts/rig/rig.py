@@ -21,7 +21,7 @@ from crane.dynamics import Dynamics
 from crane.formats import load
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
-from crane.motion.trajectories import Path, beyond_limits
+from crane.motion.trajectories import Trajectory, beyond_limits
 from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS, Recording
 from crane.simulation.integration import HaltedError, Steps, explained, row_layout
 from rig.plant import Tolerances, drawn
@@ -104,7 +104,7 @@ class Rig:
             ]
         )
 
-    def run(self, path: Path, step: float = 1e-3, *, task: str = "") -> Recording:
+    def run(self, path: Trajectory, step: float = 1e-3, *, label: str = "") -> Recording:
         """Let the rig follow a path and record it.
 
         Every `step` the controller reads the sensors and sets forces, which hold until the next:
@@ -124,7 +124,7 @@ class Rig:
         Args:
             path: Reference of the active joints; the plant starts on it at rest.
             step: Sampling interval [s].
-            task: Name of the motion to put into the recording.
+            label: Name of the motion to put into the recording.
 
         Returns:
             Recording with the channels reference_, command_ (before the cut-off), current_
@@ -133,13 +133,13 @@ class Rig:
 
         Raises:
             InputError: The path has other joints, the step is no part of its duration or too
-                long for the filter, or the task is not one line of text.
+                long for the filter, or the label is not one line of text.
             LimitError: The path starts outside of the limits.
             SimulationError: The plant reached a posture it cannot go on from.
         """
         machine, plant, n = self.machine, self.plant, len(self.machine.active)
-        if not (isinstance(task, str) and task.isprintable() and task == task.strip()):
-            raise InputError(f"task {task!r} is not one line of text")
+        if not (isinstance(label, str) and label.isprintable() and label == label.strip()):
+            raise InputError(f"label {label!r} is not one line of text")
         step = as_number(step, "the step", "s", above=0)
         count = round(path.duration / step)
         if count < 1 or abs(count * step - path.duration) > 1e-9 * path.duration:
@@ -191,11 +191,11 @@ class Rig:
             channels=channels,
             channel_units=units,
             machine=machine.call,
-            task=": ".join(filter(None, (f"virtual rig, seed {self.seed}", task))),
+            task=": ".join(filter(None, (f"virtual rig, seed {self.seed}", label))),
         )
 
     def _follow(
-        self, path: Path, reference: Array, noise: Array, step: float
+        self, path: Trajectory, reference: Array, noise: Array, step: float
     ) -> tuple[Array, Array, Array, Array, Array]:
         """Measured coordinates, commands, forces, postures (., nq) and velocities, all (., n)."""
         control, sensors = PI(self.machine, path), list(self.sensors.values())

@@ -36,7 +36,7 @@ class Excitation(Brief):
     """A reference to identify a machine with.
 
     Attributes:
-        path: The reference, see `Fourier`.
+        trajectory: The reference, see `Fourier`.
         machine: The machine.
         base: What is to be identified.
         nominal: (p,) all parameters by the machine's description.
@@ -51,7 +51,7 @@ class Excitation(Brief):
         step: Of the recording that is counted on [s].
     """
 
-    path: Fourier
+    trajectory: Fourier
     machine: Machine
     base: Base
     nominal: Array
@@ -67,9 +67,9 @@ class Excitation(Brief):
 
     def motion(self) -> tuple[Array, Array, Array, Array, Array]:
         """Times (N,), and q_A, v_A, a_A, tau_A (N, n) of the machine as described."""
-        count = int(self.path.duration / self.step + 1e-9) + 1
+        count = int(self.trajectory.duration / self.step + 1e-9) + 1
         time = self.step * np.arange(count, dtype=np.float64)
-        q, v, a = self.path(time)
+        q, v, a = self.trajectory(time)
         return time, q, v, a, Dynamics(self.machine).inverse(q, v, a, friction=True)
 
     def worst(self, count: int = _WORST) -> list[int]:
@@ -92,10 +92,11 @@ class Excitation(Brief):
                     "_acceleration": f"{unit}/s2",
                     "_force": FORCE_UNITS[unit],
                 }[suffix]
+        lead, period = self.trajectory.lead, self.trajectory.period
         notes = {
             "crane reference": "",
             "machine": self.machine.call,
-            "task": f"excitation, steady from {self.path.lead:g} s, period {self.path.period:g} s",
+            "task": f"excitation, steady from {lead:g} s, period {period:g} s",
         }
         timeseries.write(path, Table(units, np.column_stack(self.motion()), notes))
 
@@ -105,15 +106,15 @@ class Excitation(Brief):
         Raises:
             OutputError: It cannot be written there.
         """
-        K = self.path.harmonics
-        numbers = self.path.coefficients.T.tolist()
+        K = self.trajectory.harmonics
+        numbers = self.trajectory.coefficients.T.tolist()
         text = {
             "machine": self.machine.call,
             "criterion": self.criterion,
             "seed": self.seed,
-            "period": self.path.period,
-            "periods": self.path.periods,
-            "lead": self.path.lead,
+            "period": self.trajectory.period,
+            "periods": self.trajectory.periods,
+            "lead": self.trajectory.lead,
             "coefficients": {
                 joint: {"c": row[0], "a": row[1 : K + 1], "b": row[K + 1 :]}
                 for joint, row in zip(self.machine.active, numbers, strict=True)
@@ -249,12 +250,15 @@ def excite(
         found = search.descend(start, report)
         if (cost := float(search.rate(found[None])[0][0])) < least:
             best, least = found, cost
-    before, path = (Fourier(search.coefficients(x), period, periods) for x in (draws[0], best))
+    before, trajectory = (
+        Fourier(search.coefficients(x), period, periods) for x in (draws[0], best)
+    )
     first, last = (
-        information.quality(model.samples(*one(one.lead + time)), count) for one in (before, path)
+        information.quality(model.samples(*one(one.lead + time)), count)
+        for one in (before, trajectory)
     )
     return Excitation(
-        path=path,
+        trajectory=trajectory,
         machine=machine,
         base=base,
         nominal=model.nominal,
@@ -262,7 +266,7 @@ def excite(
         before=first,
         after=last,
         limits=bounds,
-        used=search.used(path),
+        used=search.used(trajectory),
         noise=deviation,
         criterion=criterion,
         seed=seed,

@@ -5,12 +5,12 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_count, as_number, as_samples
-from crane.motion.trajectories import Path
+from crane.motion.trajectories import Trajectory
 
 _DENSE = 200  # instants in the shortest period
 
 
-class Fourier(Path):
+class Fourier(Trajectory):
     """A finite Fourier series in the active coordinates (Swevers et al., 1997).
 
         q_i = c_i + sum_k a_ik / (w k) sin(w k s) - b_ik / (w k) cos(w k s),   k = 1 ... K,
@@ -52,7 +52,7 @@ class Fourier(Path):
         self.tip = None
 
     def turns(self) -> Array:
-        """See `Path`: so many instants that the largest is missed by 1e-4 of its harmonic's."""
+        """See `Trajectory`: so dense that the largest is missed by 1e-4 of its harmonic's."""
         shortest = self.period / self.harmonics
         return np.linspace(0.0, self.duration, 1 + round(_DENSE * self.duration / shortest))
 
@@ -62,11 +62,11 @@ class Fourier(Path):
         return len(self.coefficients) // 2
 
     def position(self, time: ArrayLike) -> Array:
-        """See `Path`."""
+        """See `Trajectory`."""
         return self(time)[0]
 
     def __call__(self, time: ArrayLike) -> tuple[Array, Array, Array]:
-        """See `Path`: q = f(s), v = f' s', a = f'' s'^2 + f' s''."""
+        """See `Trajectory`: q = f(s), v = f' s', a = f'' s'^2 + f' s''."""
         time = np.asarray(time, dtype=np.float64)
         lead = self.lead
         side = np.clip(np.minimum(time, self.duration - time), 0.0, lead)

@@ -203,17 +203,17 @@ class Search:
         fitted = [x for x, reason in (self.fitted(best), self.fitted(end.x)) if not reason]
         return min(fitted, key=lambda x: float(self.rate(x[None])[0][0]), default=start)
 
-    def used(self, path: Fourier) -> Array:
-        """Largest share of every limit over a whole path, (4, n) as in `QUANTITIES`."""
-        q, v, a = path(self._dense)
+    def used(self, trajectory: Fourier) -> Array:
+        """Largest share of every limit over a whole trajectory, (4, n) as in `QUANTITIES`."""
+        q, v, a = trajectory(self._dense)
         tau = self._dynamics.inverse(q, v, a, friction=True)
         return np.asarray(self._bounds.shares(q, v, a, tau).max(axis=0))
 
     def _excess(self, x: Array) -> str:
         """Which limit a vector's reference exceeds, ways from and to rest included."""
-        path = Fourier(self.coefficients(x), self._period)
+        trajectory = Fourier(self.coefficients(x), self._period)
         try:
-            at = self._information.model.samples(*path(self._dense))
+            at = self._information.model.samples(*trajectory(self._dense))
         except ClosureError:
             return "loops that do not close"
         most = self._shares(at).max(axis=0)

@@ -20,7 +20,7 @@ from crane.dynamics import Dynamics
 from crane.identification.estimation import estimators
 from crane.identification.estimation.estimators import Estimate
 from crane.identification.hydraulics.cylinder_signals import column
-from crane.identification.mechanics.reading import motion_of
+from crane.identification.mechanics.reading import smoothed_motion
 from crane.identification.signals.steady import steady
 from crane.machine import Machine
 from crane.recordings.recording import Recording
@@ -104,7 +104,7 @@ class CylinderFriction(Brief):
         return "\n".join([*lines, *([self.note] if self.note else [])]) + "\n"
 
 
-def cylinder_friction(
+def identify_cylinder_friction(
     machine: Machine,
     recording: Recording,
     joint: str,
@@ -133,7 +133,7 @@ def cylinder_friction(
     if joint not in machine.active:
         raise InputError(f"'{joint}' is not an active joint, {known(machine.active, joint)}")
     index = machine.active.index(joint)
-    motion = motion_of(machine, recording)
+    motion = smoothed_motion(machine, recording)
     load = Dynamics(machine).inverse(motion.q, motion.v, motion.a)[:, index]
     given = machine.friction.get(joint, Friction())
     v = motion.v[:, index]

@@ -9,7 +9,7 @@ import numpy as np
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
 from crane.identification.mechanics.checks import delay, doubt, shifted
-from crane.identification.mechanics.result import Comparison
+from crane.identification.mechanics.result import ForceComparison
 from crane.identification.signals.motion import Motion, sampling
 
 _FACTOR = 30.0  # by which a force may be off from what the model says
@@ -99,7 +99,7 @@ def tell_delays(
         warnings.warn(text, CraneWarning, stacklevel=3)
 
 
-def tell_validation(training: Comparison, validation: Comparison) -> None:
+def tell_validation(training: ForceComparison, validation: ForceComparison) -> None:
     """Warn where a fit predicts far worse than it fits, both relative and in N or N m."""
     told = []
     pairs = zip(

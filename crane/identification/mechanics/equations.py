@@ -11,7 +11,7 @@ from crane.common.samples import Array
 from crane.identification.estimation.regressor import add_rows, triangular
 from crane.identification.mechanics.base import Base
 from crane.identification.mechanics.model import Model
-from crane.identification.mechanics.result import Comparison
+from crane.identification.mechanics.result import ForceComparison
 from crane.identification.signals.motion import Motion, filter_kernel, filter_rows, moving
 
 _FEWEST = 5.0  # periods of the filter's cutoff in a recording
@@ -148,11 +148,11 @@ class Equations:
             out[span] = W @ values
         return out
 
-    def compare(self, values: Array) -> Comparison:
+    def compare(self, values: Array) -> ForceComparison:
         """Measured and modelled forces, for values (r,)."""
         modelled = self.modelled(values) + self.offset
         joints = self._model.machine.active
-        return Comparison(self.time, self.forces, modelled, self.moving, joints)
+        return ForceComparison(self.time, self.forces, modelled, self.moving, joints)
 
     @cached_property
     def _rows(self) -> tuple[np.ndarray, np.ndarray]:

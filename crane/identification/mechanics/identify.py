@@ -24,7 +24,7 @@ from crane.identification.mechanics.equations import Equations, Progress
 from crane.identification.mechanics.model import Model, Term
 from crane.identification.mechanics.possible import possible, prior_of_bodies
 from crane.identification.mechanics.priors import check_told, checked
-from crane.identification.mechanics.reading import motion_of
+from crane.identification.mechanics.reading import smoothed_motion
 from crane.identification.mechanics.result import Identification
 from crane.identification.signals.motion import Motion
 from crane.identification.signals.spectrum import below
@@ -169,7 +169,7 @@ def _motion(
 ) -> Motion:
     if isinstance(recording, Motion):
         return recording
-    return motion_of(machine, recording, trust=trust, progress=progress)
+    return smoothed_motion(machine, recording, trust=trust, progress=progress)
 
 
 def _check_forces(model: Model, motion: Motion, rows: Equations, trust: bool) -> None:

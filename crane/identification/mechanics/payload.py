@@ -22,8 +22,8 @@ from crane.identification.mechanics.model import (
     friction,
     inertial_columns,
 )
-from crane.identification.mechanics.reading import motion_of
-from crane.identification.mechanics.result import Comparison, aligned
+from crane.identification.mechanics.reading import smoothed_motion
+from crane.identification.mechanics.result import ForceComparison, aligned
 from crane.identification.signals.motion import Motion, moving
 from crane.machine import Machine
 from crane.recordings.recording import Recording
@@ -92,7 +92,7 @@ class PayloadEstimate(Brief):
     directions: Array
     friction: dict[str, float]
     static: tuple[float, float] | None
-    fit: Comparison
+    fit: ForceComparison
 
     @property
     def std_mass(self) -> float:
@@ -152,7 +152,7 @@ class PayloadEstimate(Brief):
         return "\n".join(lines) + "\n"
 
 
-def estimate_payload(
+def identify_payload(
     machine: Machine,
     recording: Recording | Motion,
     frame: str | None = None,
@@ -193,7 +193,7 @@ def estimate_payload(
     frame = frame or str(machine.tip)
     motion, progress = recording, in_parts(progress)
     if not isinstance(motion, Motion):
-        motion = motion_of(machine, motion, trust=trust, progress=progress)
+        motion = smoothed_motion(machine, motion, trust=trust, progress=progress)
     load = Load(machine, frame, inertia)
     moves = np.ptp(motion.v, axis=0) > 0
     names = [joint for joint, moved in zip(machine.active, moves, strict=True) if moved]
@@ -240,7 +240,7 @@ def estimate_payload(
     }
     estimate = PayloadEstimate(
         frame, mass, com, covariance, freedom, directions, corrections, None,
-        Comparison(
+        ForceComparison(
             rows.time, rows.forces - rows.offset, rows.modelled(columns @ found.values),
             rows.moving, machine.active,
         ),

@@ -25,7 +25,7 @@ _MOVES = 3.0  # standard deviations of a joint's velocity, above which it moves
 _HUM = 10.0  # times the frequency of the motion, above which a line in a spectrum is hum
 
 
-def motion_of(
+def smoothed_motion(
     machine: Machine,
     recording: Recording,
     derivatives: str = "kalman",

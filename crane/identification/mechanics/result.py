@@ -19,7 +19,7 @@ _SHOWN = 3  # directions that a table names
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Comparison(Brief):
+class ForceComparison(Brief):
     """Measured and modelled forces of one recording, both through the same filter.
 
     Attributes:
@@ -97,10 +97,10 @@ class Identification:
     estimate: Estimate
     method: str
     feasible: bool
-    training: Comparison
+    training: ForceComparison
     magnitude: Array
     advice: str
-    validation: Comparison | None = None
+    validation: ForceComparison | None = None
 
     def __repr__(self) -> str:
         """What was identified, how, and how well it predicts."""

@@ -47,7 +47,7 @@ def write_parameters(result: Identification, path: str | Path) -> None:
             table.writerow([name, *map(repr, numbers), mark, words])
 
 
-def write_machine(result: Identification, folder: str | Path) -> Path:
+def write_identified(result: Identification, folder: str | Path) -> Path:
     """Write the identified machine: a URDF per sub-chain and a machine file beside them.
 
     Each body's parameters stand in the link that its joint moves, and the inertials of links
@@ -256,7 +256,7 @@ def _check(result: Identification, file: Path) -> None:
     assert parameters is not None
     at = random_samples(model, 20)
     wanted = model.regressor(at) @ parameters + model.known(at)
-    dynamics = Dynamics(written, path="pinocchio")
+    dynamics = Dynamics(written, backend="pinocchio")
     found = dynamics.inverse(at.q_a, at.v_a, at.a_a, friction=True)
     off = np.abs(found - wanted).max(axis=0)
     if off.max() <= _SAME * np.abs(wanted).max():

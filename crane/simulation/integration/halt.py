@@ -5,7 +5,7 @@ import numpy as np
 from crane.common.errors import SimulationError
 from crane.common.samples import Array
 from crane.machine import Machine
-from crane.motion.trajectories import LIMIT_SLACK, Path
+from crane.motion.trajectories import LIMIT_SLACK, Trajectory
 
 
 class HaltedError(SimulationError):
@@ -40,7 +40,7 @@ def explained(
     halt: HaltedError,
     times: Array,
     q_a: Array,
-    path: Path | None = None,
+    reference: Trajectory | None = None,
     finer: float = 0.0,
 ) -> SimulationError:
     """A halt with its cause, as far as it can be told.
@@ -50,13 +50,13 @@ def explained(
         halt: What happened.
         times: (N,) of the motion so far [s]; empty where it is not known.
         q_a: (N, n) active coordinates then.
-        path: The reference, if there is one.
+        reference: The reference, if there is one.
         finer: A step with which the motion goes on [s]; 0 where that has not been found.
     """
     if finer:
         hint = f"; with a step of {finer:g} s it goes on: shorten the step, or smooth the friction"
         return SimulationError(f"{halt}{hint} more")
-    passed = _passed(machine, halt, times, q_a, path)
+    passed = _passed(machine, halt, times, q_a, reference)
     within = (
         ", with all active joints within their limits: keep away from there, 'crane workspace' "
     )
@@ -64,7 +64,7 @@ def explained(
 
 
 def _passed(
-    machine: Machine, halt: HaltedError, times: Array, q_a: Array, path: Path | None
+    machine: Machine, halt: HaltedError, times: Array, q_a: Array, reference: Trajectory | None
 ) -> str:
     """The active joint that is farthest beyond its limit, and since when; perhaps nothing."""
     lower, upper = machine.lower, machine.upper
@@ -84,8 +84,8 @@ def _passed(
         text += f" since t = {since:.4g} s"
     stopped = any(stop.joint == joint for stop in machine.end_stops)
     remedy = "stiffen its end stop" if stopped else "give it an end stop"
-    if path is not None:
-        reference = float(path.position(halt.time)[i])
-        if not lower[i] - LIMIT_SLACK <= reference <= upper[i] + LIMIT_SLACK:
-            remedy = f"keep its reference ({reference:.6g} {unit}) within the limits, or {remedy}"
+    if reference is not None:
+        wanted = float(reference.position(halt.time)[i])
+        if not lower[i] - LIMIT_SLACK <= wanted <= upper[i] + LIMIT_SLACK:
+            remedy = f"keep its reference ({wanted:.6g} {unit}) within the limits, or {remedy}"
     return f"{text}: {remedy}"

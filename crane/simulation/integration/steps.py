@@ -34,7 +34,7 @@ class Steps:
         self.slow = PythonStepper(dynamics, control, own)
         self.done = 0
         self._fast: CompiledStepper | None = None
-        if isinstance(control, ValveDrive) or dynamics.path != "compiled":
+        if isinstance(control, ValveDrive) or dynamics.backend != "compiled":
             return
         if isinstance(control, TracedController):
             with suppress(TooLongError):

@@ -17,7 +17,7 @@ Progress = Callable[[int], None] | None
 
 
 class PythonStepper:
-    """One step at a time, for any controller and on any path of `Dynamics`.
+    """One step at a time, for any controller and on any backend of `Dynamics`.
 
     Args:
         dynamics: The machine.

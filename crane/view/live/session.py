@@ -70,7 +70,7 @@ class Session:
     def __init__(self, machine: Machine):
         self.machine = machine
         self.payload = 0.0
-        self._dynamics = Dynamics(machine, path="pinocchio")
+        self._dynamics = Dynamics(machine, backend="pinocchio")
         self._kinematics = None if machine.tip is None else Kinematics(machine)
         home = machine.home[machine.closure.active]
         ways = np.array([_TURN if machine.unit(x) == "rad" else _WAY for x in machine.active])
@@ -156,7 +156,7 @@ class Session:
         if self.machine.tip is None:
             raise InputError(f"machine '{self.machine.name}' has no tip to hang a load on")
         loaded = self.machine.with_payload(Payload(self.machine.tip, mass))
-        self._dynamics = Dynamics(loaded, path="pinocchio")
+        self._dynamics = Dynamics(loaded, backend="pinocchio")
         self.payload = float(mass)
         self.posture = replace(self._measured(self.posture.q), refused=self.posture.refused)
         return self.posture

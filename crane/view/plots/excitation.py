@@ -39,7 +39,7 @@ def _draw_joint(
     column: Sequence[Axes], excitation: Excitation, motion: tuple[Array, ...], i: int
 ) -> None:
     """Stroke, velocity and force of an active joint below each other."""
-    machine, reference, bounds = excitation.machine, excitation.path, excitation.limits
+    machine, reference, bounds = excitation.machine, excitation.trajectory, excitation.limits
     time, q, v, _, tau = motion
     joint = machine.active[i]
     unit, scale = READING_UNITS[machine.unit(joint)]

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from crane.common.samples import Array
-from crane.identification.mechanics.result import Comparison
+from crane.identification.mechanics.result import ForceComparison
 from crane.view.plots.recording import DASHED, INK
 from crane.view.plots.text import plain
 from crane.view.plots.thinning import envelope
@@ -17,7 +17,7 @@ from crane.view.plots.thinning import envelope
 _SEGMENTS = 8  # of a recording, whose periodograms are averaged
 
 
-def time_figure(fit: Comparison, i: int, unit: str, name: str) -> Figure:
+def time_figure(fit: ForceComparison, i: int, unit: str, name: str) -> Figure:
     """Measured and modelled force of drive i over time, and their difference below."""
     figure = Figure(figsize=(5.8, 3.3))
     grid = {"height_ratios": (2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
@@ -38,7 +38,7 @@ def time_figure(fit: Comparison, i: int, unit: str, name: str) -> Figure:
     return figure
 
 
-def spectrum_figure(fits: list[tuple[str, Comparison, str]], i: int, unit: str) -> Figure:
+def spectrum_figure(fits: list[tuple[str, ForceComparison, str]], i: int, unit: str) -> Figure:
     """Spectral densities of the residuals of drive i, averaged (Welch 1967).
 
     Rows that are left out count as zero.
