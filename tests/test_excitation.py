@@ -79,6 +79,14 @@ def test_a_machine_follows_it(mini, found):
     assert np.abs(recording.q - found.trajectory(recording.time)[0]).max() < 1e-6
 
 
+def test_bounds_enclose_a_series_and_its_velocity_is_its_rate(series):
+    time = np.linspace(-1.0, series.duration + 1.0, 5000)
+    q, v, _ = series(time)
+    least, most = series.bounds()
+    assert (least <= q.min(axis=0)).all() and (q.max(axis=0) <= most).all()
+    np.testing.assert_array_equal(series.velocity(time), v)
+
+
 # --- limits ----------------------------------------------------------------------------------
 
 

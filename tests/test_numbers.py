@@ -126,7 +126,7 @@ def test_a_place_is_told_once():
 def test_a_task_of_levers_in_a_study_is_named_once():
     """Its row says why once, not that the task's task moves levers."""
     found, reason = variant(Job("patu655", {}, {}, ("stir",), False))
-    assert not found and reason == "task 'stir' moves levers, it has no path"
+    assert not found and reason == "task 'stir' moves levers, it has no trajectory"
 
 
 def test_titles():

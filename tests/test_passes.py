@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_blocks import motion
+from motions import motion
 from work import passes
 
 import crane
@@ -24,7 +24,7 @@ def mini():
 
 @pytest.fixture(scope="module")
 def recording(mini):
-    given = motion(mini, 24.0)
+    given = motion(mini, duration=24.0)
     units = {joint: mini.unit(joint) for joint in mini.active}
     return Recording(given.time, mini.active, given.q, given.v, given.tau, units)
 
@@ -95,7 +95,7 @@ def test_a_file_is_read_once(mini, recording, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
 def test_quantities_at_closed_postures_are_those_of_their_strokes(mini, backend):
-    given, dynamics = motion(mini, 0.2), Dynamics(mini, backend=backend)
+    given, dynamics = motion(mini, duration=0.2), Dynamics(mini, backend=backend)
     q = mini.closure.solve(given.q)
     found = dynamics.at("inverse with friction", q, given.v, given.a)
     wanted = dynamics.inverse(given.q, given.v, given.a, friction=True)

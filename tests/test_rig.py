@@ -447,7 +447,7 @@ def test_errors_of_a_rig_are_one_line(mini, make, text):
 
 
 @pytest.mark.parametrize(
-    ("end", "step", "task", "error", "text"),
+    ("end", "step", "label", "error", "text"),
     [
         ([0.5, 0.020, 0.014], 0.3, "", InputError, "the step of 0.3 s is no part of 1 s"),
         ([0.5, 0.020, 0.014], 0.1, "", InputError, "give less than 0.05 s"),
@@ -456,9 +456,9 @@ def test_errors_of_a_rig_are_one_line(mini, make, text):
         ([0.5, 0.020], 1e-3, "", InputError, "the path is of 2 joints"),
     ],
 )
-def test_errors_of_a_run_are_one_line(real, end, step, task, error, text):
+def test_errors_of_a_run_are_one_line(real, end, step, label, error, text):
     with pytest.raises(error) as caught:
-        real.run(crane.point_to_point(START[: len(end)], end, 1.0), step, task=task)
+        real.run(crane.point_to_point(START[: len(end)], end, 1.0), step, label=label)
     assert text in str(caught.value) and "\n" not in str(caught.value)
 
 

@@ -61,9 +61,20 @@ class Fourier(Trajectory):
         """K."""
         return len(self.coefficients) // 2
 
+    def bounds(self) -> tuple[Array, Array]:
+        """See `Trajectory`: every harmonic is as large as its amplitude at once."""
+        middle, (a, b) = self.coefficients[0], np.split(self.coefficients[1:], 2)
+        wk = 2 * np.pi / self.period * np.arange(1, self.harmonics + 1)
+        reach = (np.hypot(a, b) / wk[:, None]).sum(axis=0)
+        return middle - reach, middle + reach
+
     def position(self, time: ArrayLike) -> Array:
         """See `Trajectory`."""
         return self(time)[0]
+
+    def velocity(self, time: ArrayLike) -> Array:
+        """See `Trajectory`."""
+        return self(time)[1]
 
     def __call__(self, time: ArrayLike) -> tuple[Array, Array, Array]:
         """See `Trajectory`: q = f(s), v = f' s', a = f'' s'^2 + f' s''."""

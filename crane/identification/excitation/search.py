@@ -16,6 +16,7 @@ from crane.identification.mechanics.model import Samples
 DENSE = 64  # samples per period of the highest harmonic, to see that limits hold
 COARSE = 12  # the same to optimise with
 _WITHIN = float(np.cos(np.pi / DENSE))  # at samples, so that nothing exceeds 1 in between
+_CLOSE = 33  # instants between the neighbours of the one with the largest share
 _DRAWS, _TRIALS = 20, 200  # random references: how many within the limits, of how many at most
 _HALVINGS = 10  # of the interval in which the largest amplitude lies
 _NORM = 80  # takes the place of the maximum over time, which has no derivative
@@ -205,18 +206,36 @@ class Search:
 
     def used(self, trajectory: Fourier) -> Array:
         """Largest share of every limit over a whole trajectory, (4, n) as in `QUANTITIES`."""
-        q, v, a = trajectory(self._dense)
-        tau = self._dynamics.inverse(q, v, a, friction=True)
-        return np.asarray(self._bounds.shares(q, v, a, tau).max(axis=0))
+
+        def shares(times: Array) -> Array:
+            q, v, a = trajectory(times)
+            tau = self._dynamics.inverse(q, v, a, friction=True)
+            return self._bounds.shares(q, v, a, tau)
+
+        dense = shares(self._dense)
+        peaks = shares(self._around(dense.reshape(len(dense), -1)))
+        return np.maximum(dense.max(axis=0), peaks.max(axis=0))
+
+    def _around(self, shares: Array) -> Array:
+        """Times [s] close around where each of (N, c) shares is largest at the dense instants.
+
+        Where a joint turns, friction steps within milliseconds, and a force's peak is beside it.
+        """
+        largest = np.unique(shares.argmax(axis=0))
+        before = self._dense[np.maximum(largest - 1, 0)]
+        after = self._dense[np.minimum(largest + 1, len(self._dense) - 1)]
+        return np.unique(np.linspace(before, after, _CLOSE))
 
     def _excess(self, x: Array) -> str:
         """Which limit a vector's reference exceeds, ways from and to rest included."""
         trajectory = Fourier(self.coefficients(x), self._period)
         try:
-            at = self._information.model.samples(*trajectory(self._dense))
+            shares = self._shares(self._information.model.samples(*trajectory(self._dense)))
+            times = self._around(shares)
+            peaks = self._shares(self._information.model.samples(*trajectory(times)))
         except ClosureError:
             return "loops that do not close"
-        most = self._shares(at).max(axis=0)
+        most = np.maximum(shares.max(axis=0), peaks.max(axis=0))
         return self._names[int(most.argmax())] if most.max() > _WITHIN * (1 + 1e-12) else ""
 
     def _shares(self, at: Samples) -> Array:
