@@ -1,7 +1,5 @@
 """Everything that `crane check` finds, line by line."""
 
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +19,7 @@ from broken import (
     whole,
     with_line,
 )
+from typed import typed
 from work import TooMuchWorkError, at_most
 
 import crane
@@ -794,19 +793,7 @@ def test_published_robots_load_where_they_are_not_refused():
 
 
 def run(*arguments, cwd=None):
-    return subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            "from crane.cli import main; main()",
-            "check",
-            *map(str, arguments),
-        ],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        timeout=300,
-    )
+    return typed("check", *arguments, cwd=cwd)
 
 
 def test_status_and_counts_of_a_clean_machine(tmp_path):

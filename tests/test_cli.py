@@ -8,19 +8,9 @@ from pathlib import Path
 
 import pytest
 from broken import MINI, copy_machine
+from typed import MAIN, typed
 
 import crane
-
-
-def run(*arguments, cwd=None):
-    """The command line in a process of its own, as a user has it."""
-    return subprocess.run(
-        [sys.executable, "-c", MAIN, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        cwd=cwd,
-        timeout=300,
-    )
 
 
 def one_error(result) -> str:
@@ -32,40 +22,37 @@ def one_error(result) -> str:
     return lines[0]
 
 
-MAIN = "from crane.cli import main; main()"
-
-
 @pytest.fixture(scope="module")
 def free_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "fall"
-    result = run("simulate", "mini_forwarder", "--duration", "0.02", "--out", folder)
+    result = typed("simulate", "mini_forwarder", "--duration", "0.02", "--out", folder)
     assert result.returncode == 0, result.stderr
     return folder, result
 
 
 def test_help_names_every_command_and_imports_nothing_heavy():
-    result = run("--help")
+    result = typed("--help")
     assert result.returncode == 0
     for command in (
         "list", "info", "check", "simulate", "study", "excite", "identify", "payload", "view",
         "plot", "demo",
     ):  # fmt: skip
         assert re.search(rf"\b{command}\b", result.stdout)
-    assert run("-h").stdout == result.stdout
+    assert typed("-h").stdout == result.stdout
     code = "import sys, crane.cli; print([m for m in ('numpy', 'pinocchio') if m in sys.modules])"
     imported = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert imported.stdout.strip() == "[]"
 
 
 def test_list():
-    result = run("list")
+    result = typed("list")
     assert result.returncode == 0
     assert "  mini_forwarder\n" in result.stdout and "ur5_robot" in result.stdout
     assert "some are refused" in result.stdout
 
 
 def test_info_says_what_the_machine_is():
-    result = run("info", "mini_forwarder")
+    result = typed("info", "mini_forwarder")
     assert result.returncode == 0
     assert "11, of which 3 active; moving mass 1.287 kg" in result.stdout
     assert "4: 8 independent equations, 12 redundant" in result.stdout
@@ -74,7 +61,7 @@ def test_info_says_what_the_machine_is():
 
 
 def test_info_has_the_whole_home_posture_and_the_path(mini):
-    lines = run("info", "mini_forwarder").stdout.splitlines()
+    lines = typed("info", "mini_forwarder").stdout.splitlines()
     told = dict(
         re.match(r"    (\w+) .* home (\S+)", line).groups() for line in lines if " home " in line
     )
@@ -85,8 +72,8 @@ def test_info_has_the_whole_home_posture_and_the_path(mini):
 
 
 def test_version_and_units_in_help():
-    assert run("--version").stdout == f"crane {crane.__version__}\n"
-    text = " ".join(run("simulate", "-h").stdout.split())
+    assert typed("--version").stdout == f"crane {crane.__version__}\n"
+    text = " ".join(typed("simulate", "-h").stdout.split())
     assert "In seconds; that of the task" in text and "integration in seconds" in text
 
 
@@ -133,14 +120,14 @@ def test_interrupt_is_one_line_and_leaves_nothing(tmp_path, delay):
 
 
 def test_check_tells_warnings_by_its_status(tmp_path):
-    result = run("check", copy_machine(MINI, tmp_path))
+    result = typed("check", copy_machine(MINI, tmp_path))
     assert result.returncode == 1
     assert "3 degrees of freedom" in result.stdout
     assert result.stdout.startswith("mini_forwarder.yaml:")
     assert result.stdout.endswith("no errors, 1 warning\n")
     assert result.stderr == ""
-    assert run("check", "mini_forwarder").returncode == 0
-    assert run("check", "ur5_robot").returncode == 0
+    assert typed("check", "mini_forwarder").returncode == 0
+    assert typed("check", "ur5_robot").returncode == 0
 
 
 def test_simulate_writes_recording_and_summary(free_run):
@@ -152,7 +139,7 @@ def test_simulate_writes_recording_and_summary(free_run):
 
 
 def test_simulate_a_task(tmp_path):
-    result = run(
+    result = typed(
         "simulate", "mini_forwarder", "--task", "lift", "--duration", "0.01",
         "--controller", "computed-torque", "--out", tmp_path / "run",
     )  # fmt: skip
@@ -165,27 +152,27 @@ def test_nothing_is_overwritten_without_force(free_run):
     folder, _ = free_run
     before = (folder / "recording.csv").read_bytes()
     again = ("simulate", "mini_forwarder", "--duration", "0.01", "--out", folder)
-    assert "is not empty, choose another folder or add --force" in one_error(run(*again))
+    assert "is not empty, choose another folder or add --force" in one_error(typed(*again))
     assert (folder / "recording.csv").read_bytes() == before
-    assert run(*again, "--force").returncode == 0
+    assert typed(*again, "--force").returncode == 0
     assert (folder / "recording.csv").read_bytes() != before
 
 
 def test_plot_and_view_of_a_run(free_run, tmp_path):
     folder, _ = free_run
-    assert run("plot", folder, "--out", tmp_path / "a.svg").returncode == 0
+    assert typed("plot", folder, "--out", tmp_path / "a.svg").returncode == 0
     assert (tmp_path / "a.svg").read_text().lstrip().startswith("<?xml")
-    result = run("view", folder, "--out", tmp_path / "a.html", "--no-open")
+    result = typed("view", folder, "--out", tmp_path / "a.html", "--no-open")
     assert result.returncode == 0, result.stderr
     assert "<html" in (tmp_path / "a.html").read_text()[:200].lower()
-    again = run("view", folder, "--out", tmp_path / "a.html", "--no-open")
+    again = typed("view", folder, "--out", tmp_path / "a.html", "--no-open")
     assert "exists already, choose another name or add --force" in one_error(again)
-    bad = run("plot", folder, "--out", tmp_path / "a.xyz")
+    bad = typed("plot", folder, "--out", tmp_path / "a.xyz")
     assert "a.xyz" in one_error(bad)
 
 
 def test_view_of_a_machine_goes_to_the_working_folder(tmp_path):
-    assert run("view", "mini_forwarder", "--no-open", cwd=tmp_path).returncode == 0
+    assert typed("view", "mini_forwarder", "--no-open", cwd=tmp_path).returncode == 0
     assert (tmp_path / "mini_forwarder.html").is_file()
 
 
@@ -194,14 +181,14 @@ def test_view_of_a_run_whose_machine_has_moved(tmp_path):
     machine = Path(shutil.copy(data / "slider_crank.yaml", tmp_path))
     shutil.copytree(data / "slider_crank", tmp_path / "slider_crank")
     simulate = ("simulate", machine, "--duration", "0.01", "--out", tmp_path / "run")
-    assert run(*simulate).returncode == 0
+    assert typed(*simulate).returncode == 0
     machine.unlink()
     page = tmp_path / "run" / "view.html"
     view = ("view", tmp_path / "run", "--no-open")
-    error = one_error(run(*view))
+    error = one_error(typed(*view))
     assert "slider_crank.yaml: no such file" in error and "add --machine" in error
     assert not page.exists()
-    result = run(*view, "--machine", data / "slider_crank.yaml")
+    result = typed(*view, "--machine", data / "slider_crank.yaml")
     assert result.returncode == 0, result.stderr
     assert page.is_file()
 
@@ -212,7 +199,7 @@ def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
     assert "name: slider_crank" in text
     text = text.replace("name: slider_crank", "name: 'a/b: <c>'")
     (tmp_path / "named.yaml").write_text(text)
-    result = run("view", "named.yaml", "--no-open", cwd=tmp_path)
+    result = typed("view", "named.yaml", "--no-open", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "a_b_c.html").is_file()
 
@@ -262,12 +249,12 @@ def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
     ],
 )
 def test_errors_are_one_line_and_write_nothing(arguments, text, tmp_path):
-    assert text in one_error(run(*arguments, cwd=tmp_path))
+    assert text in one_error(typed(*arguments, cwd=tmp_path))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_debug_shows_where_an_error_comes_from():
-    result = run("info", "nothing", "--debug")
+    result = typed("info", "nothing", "--debug")
     assert "Traceback" in result.stderr and "DescriptionError" in result.stderr
 
 
@@ -276,7 +263,7 @@ def test_demo(tmp_path):
     (tmp_path / "demo" / "lift").mkdir(parents=True)
     for name in ("notes.txt", "lift/view.html"):
         (tmp_path / "demo" / name).write_text("old")
-    result = run("demo", "--out", tmp_path / "demo", "--force")
+    result = typed("demo", "--out", tmp_path / "demo", "--force")
     assert result.returncode == 0, result.stderr
     names = {path.name for path in (tmp_path / "demo").iterdir()}
     assert names == {"loading", "return", "lift", "summary.md", "notes.txt"}
@@ -292,12 +279,12 @@ def test_study(tmp_path):
         "study", "mini_forwarder", "--vary", "payload.mass=0:0.1:3", "--task", "lift",
         "--measure", "peak_X1", "--processes", "1", "--out", "study",
     )  # fmt: skip
-    result = run(*command, cwd=tmp_path)
+    result = typed(*command, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "*                 0      60.90" in result.stdout
     assert "3 variants, best peak_X1 first" in result.stdout
     assert {path.name for path in (tmp_path / "study").iterdir()} == {"study.csv", "study.png"}
-    assert "is not empty" in one_error(run(*command, cwd=tmp_path))
+    assert "is not empty" in one_error(typed(*command, cwd=tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -316,7 +303,7 @@ def test_study(tmp_path):
 )
 def test_wrong_studies_are_one_line_and_write_nothing(arguments, text, tmp_path):
     assert text in one_error(
-        run("study", "mini_forwarder", "--out", "s", *arguments, cwd=tmp_path)
+        typed("study", "mini_forwarder", "--out", "s", *arguments, cwd=tmp_path)
     )
     assert list(tmp_path.iterdir()) == []
 

@@ -1,10 +1,8 @@
 """References for identification: what they are, that they keep limits, and what they tell."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
+from typed import typed
 
 import crane
 from crane.common.errors import InputError
@@ -282,20 +280,11 @@ def test_errors(mini, slider_crank, edited):
         excite(weak, **QUICK)
 
 
-def run(*arguments):
-    return subprocess.run(
-        [sys.executable, "-c", "from crane.cli import main; main()", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-
-
 def test_command(tmp_path):
     machine = crane.load(__file__.replace("test_excitation.py", "data/slider_crank.yaml"))
     out = tmp_path / "found"
     arguments = ("excite", machine.path, "--harmonics", 2, "--periods", 1, "--out", out)
-    result = run(*arguments)
+    result = typed(*arguments)
     assert result.returncode == 0, result.stderr
     assert "random  optimised" in result.stdout and "share of limits used" in result.stdout
     names = ["coefficients.yaml", "reference.csv", "reference.png"]
@@ -305,6 +294,6 @@ def test_command(tmp_path):
         (("--force", "--noise", "5"), "--noise is '5', write JOINT=VALUE, as in X1=0.5"),
         (("--force", "--criterion", "cond"), "criterion 'cond' is unknown, known: condition"),
     ):
-        result = run(*arguments, *extra)
+        result = typed(*arguments, *extra)
         assert result.returncode == 2 and result.stdout == ""
         assert len(result.stderr.splitlines()) == 1 and text in result.stderr

@@ -3,14 +3,13 @@
 import dataclasses
 import itertools
 import re
-import subprocess
-import sys
 import warnings
 
 import numpy as np
 import pytest
 from broken import DATA
 from linkages import MACHINES, WRITERS, assert_same, loaded, postures, rewritten
+from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
@@ -311,11 +310,7 @@ def test_frames_of_a_chain_that_hangs_from_another(tmp_path):
 
 
 def convert(*arguments):
-    program = "from crane.cli import main; main()"
-    return subprocess.run(
-        [sys.executable, "-c", program, "convert", *map(str, arguments)],
-        capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+    return typed("convert", *arguments)
 
 
 def test_convert(tmp_path):

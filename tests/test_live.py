@@ -312,7 +312,7 @@ def test_a_port_that_is_taken_is_told():
         process, line = begin("tx40", "--port", port)
         _, err = process.communicate(timeout=300)
     assert (process.returncode, line) == (2, "")
-    assert f"127.0.0.1: port {port} can" in err and err.endswith("choose another --port\n")
+    assert f"127.0.0.1: port {port} can" in err and err.endswith("choose another port\n")
 
 
 def test_without_viser_it_says_how_to_get_it():

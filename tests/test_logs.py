@@ -1,11 +1,11 @@
 """Logs of other programs as recordings."""
 
-import subprocess
-import sys
+import functools
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typed import typed
 
 import crane
 from crane.common.errors import RecordingError
@@ -126,12 +126,7 @@ def test_logs_that_cannot_be_read(log, tmp_path):
 
 
 def test_command_line(log, tmp_path):
-    def run(*arguments):
-        code = "from crane.cli import main; main()"
-        return subprocess.run(
-            [sys.executable, "-c", code, "import", *map(str, arguments)],
-            capture_output=True, text=True, timeout=300,
-        )  # fmt: skip
+    run = functools.partial(typed, "import")
 
     given = log, columns(tmp_path, GOOD), "--out", tmp_path / "run.csv"
     done = run(*given)

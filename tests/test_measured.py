@@ -1,13 +1,12 @@
 """Recordings of a real crane: strokes from angles, forces from pressures."""
 
-import subprocess
-import sys
 import warnings
 
 import numpy as np
 import oracles
 import pytest
 from broken import MINI, copy_machine, swap
+from typed import typed
 
 import crane
 from crane.cli.runs import read_run
@@ -286,12 +285,12 @@ BROKEN = {
     "no pressures": (
         without("pressure_X2_a [bar]", "pressure_X2_b [bar]"),
         "column 'X2_force' is missing, give it in [N], or 'pressure_X2_a [Pa]' and "
-        "'pressure_X2_b [Pa]', or lock the joint if it was held (--lock X2=VALUE)",
+        "'pressure_X2_b [Pa]', or lock the joint if it was held (lock X2=VALUE)",
     ),
     "no torque of the slewing motor": (
         without("q1_force [N m]"),
         "column 'q1_force' is missing, give it in [N m], or lock the joint if it was held "
-        "(--lock q1=VALUE)",
+        "(lock q1=VALUE)",
     ),
     "pressures without a cylinder": (
         lambda columns, truth: columns.update(
@@ -306,12 +305,12 @@ BROKEN = {
     ),
     "no slewing angle": (
         without("q1 [deg]"),
-        "nothing tells where 'q1' is, give 'q1 [rad]', or lock what was held (--lock q1=VALUE)",
+        "nothing tells where 'q1' is, give 'q1 [rad]', or lock what was held (lock q1=VALUE)",
     ),
     "one angle too few": (
         without("q2 [deg]"),
         "nothing tells where 'X1' is, give 'X1 [m]', or a joint that moves with it "
-        "(q4, q9, q2), or lock what was held (--lock X1=VALUE)",
+        "(q4, q9, q2), or lock what was held (lock X1=VALUE)",
     ),
     "angle without a unit": (
         renamed("q3 [deg]", "q3"),
@@ -354,7 +353,7 @@ def test_everything_that_is_missing_is_told_at_once(machine, columns, tmp_path):
         read_measured(machine, write(tmp_path, columns))
     line = str(caught.value)
     assert "nothing tells where 'q1', 'X1' are, give 'q1 [rad]', 'X1 [m]', or a joint" in line
-    assert "(--lock q1=VALUE --lock X1=VALUE); column 'q1_force' is missing, give it in" in line
+    assert "(lock q1=VALUE, X1=VALUE); column 'q1_force' is missing, give it in" in line
     assert line.endswith(
         "'pressure_X2_a' is missing beside 'pressure_X2_b', give it, or 'X2_force [N]'"
     )
@@ -450,25 +449,17 @@ class TestRuns:
             read_run(file)
 
 
-def run(*arguments, cwd):
-    code = "from crane.cli import main; main()"
-    return subprocess.run(
-        [sys.executable, "-c", code, *map(str, arguments)],
-        capture_output=True, text=True, cwd=cwd, timeout=300,
-    )  # fmt: skip
-
-
 def test_command_line(path, columns, tmp_path):
     """One way to read files: plot with a machine, identify with a joint locked."""
     del columns["q1 [deg]"]
     file = write(tmp_path, columns)
     identify = ("identify", path, file, "--out", "found")
-    result = run(*identify, cwd=tmp_path)
+    result = typed(*identify, cwd=tmp_path)
     assert result.returncode == 2 and not (tmp_path / "found").exists()
     assert f"error: {file}: nothing tells where 'q1' is, give 'q1 [rad]', or lock" in result.stderr
-    result = run(*identify, "--lock", "q1=0", cwd=tmp_path)
+    result = typed(*identify, "--lock", "q1=0", cwd=tmp_path)
     assert "nothing tells" not in result.stderr
     columns["q1 [rad]"] = columns["time [ms]"] * 1e-4
-    result = run("plot", write(tmp_path, columns), "--machine", path, cwd=tmp_path)
+    result = typed("plot", write(tmp_path, columns), "--machine", path, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "figure.png").is_file()

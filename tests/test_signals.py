@@ -420,7 +420,7 @@ def test_forces_against_a_model(factor, message):
     with pytest.raises(RecordingError) as error:
         check_forces(times(motion, factor), modelled, JOINTS[:1])
     line = str(error.value)
-    assert message in line and line.endswith("trust it (trust=True, --trust)")
+    assert message in line and line.endswith("trust it (trust)")
     found = float(line.split(" is ")[1].split(" times")[0])
     assert abs(found / factor - 1) < 0.02
     with pytest.warns(CraneWarning, match="'q1_force' is .*: trusted"):

@@ -1,8 +1,6 @@
 """Sketches: pins where forward kinematics puts them, every name once, no words on others."""
 
 import re
-import subprocess
-import sys
 import warnings
 from itertools import combinations
 
@@ -11,6 +9,7 @@ import pinocchio as pin
 import pytest
 from conftest import DATA
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from typed import typed
 
 import crane
 from crane.common.errors import CraneWarning, InputError, LimitError, OutOfReachError, OutputError
@@ -20,7 +19,6 @@ from crane.view.sketch.plane import find_plane
 from crane.view.sketch.sheet import symbol
 
 PLANAR = ["four_bar.yaml", "slider_crank.yaml", "five_bar.urdf"]
-MAIN = "from crane.cli import main; main()"
 
 
 @pytest.fixture(scope="module")
@@ -208,16 +206,10 @@ def test_wrong_requests(mini, stewart, slider_crank, tmp_path):
     assert (tmp_path / "a.png").is_file()
 
 
-def run(*arguments, cwd):
-    return subprocess.run(
-        [sys.executable, "-c", MAIN, *arguments], capture_output=True, text=True, cwd=cwd
-    )
-
-
 def test_command(tmp_path):
-    result = run("sketch", "tx40", cwd=tmp_path)
+    result = typed("sketch", "tx40", cwd=tmp_path)
     assert (result.returncode, result.stdout) == (0, "written to tx40_sketch.png\n")
-    result = run("sketch", "kr300", "--at", "q1=0.1,q2=-1.2", "--out", "a.svg", cwd=tmp_path)
+    result = typed("sketch", "kr300", "--at", "q1=0.1,q2=-1.2", "--out", "a.svg", cwd=tmp_path)
     assert result.returncode == 0, result.stderr
     assert "loop rod_eye" in (tmp_path / "a.svg").read_text()  # artists keep their names
 
@@ -234,7 +226,7 @@ def test_command(tmp_path):
     ],
 )
 def test_errors_are_one_line_and_write_nothing(arguments, text, tmp_path):
-    result = run("sketch", *arguments, cwd=tmp_path)
+    result = typed("sketch", *arguments, cwd=tmp_path)
     assert (result.returncode, result.stdout) == (2, "")
     assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
     assert text in result.stderr

@@ -1,10 +1,9 @@
 """Joints that are active because a machine has their freedom, though nothing drives them."""
 
-import subprocess
-import sys
 import warnings
 
 import pytest
+from typed import typed
 
 import crane
 from crane.common.errors import CraneWarning
@@ -98,8 +97,7 @@ def test_the_command_line_tells_it_in_one_line(tmp_path):
     task = "tasks:\n  hold: {duration: 0.01, active: {lift: [0.3], swing: [-0.3]}}\n"
     arm(tmp_path, 'effort="0"', "home: {lift: 0.3, swing: -0.3}\n" + task)
     words = ["simulate", tmp_path / "arm.yaml", "--task", "hold", "--out", tmp_path / "run"]
-    program = [sys.executable, "-c", "from crane.cli import main; main()", *map(str, words)]
-    done = subprocess.run(program, capture_output=True, text=True, timeout=300)
+    done = typed(*words)
     assert done.returncode == 0
     lines = [line for line in done.stderr.splitlines() if "swing" in line]
     assert len(lines) == 1

@@ -189,7 +189,7 @@ def _force(machine: Machine, joint: str, table: Table) -> Array:
         pressures = "" if cylinder is None else f", or '{a} [Pa]' and '{b} [Pa]'"
         raise RecordingError(
             f"column '{joint}{FORCE}' is missing, give it in [{unit}]{pressures}, or lock the "
-            f"joint if it was held (--lock {joint}=VALUE)"
+            f"joint if it was held (lock {joint}=VALUE)"
         )
     if len(there) < 2:
         missing = b if a in there else a
@@ -236,7 +236,7 @@ def _drives(machine: Machine, names: Sequence[str]) -> tuple[str, ...]:
             f"nothing tells where {', '.join(repr(x) for x in missing)} {'is' if one else 'are'}, "
             f"give {', '.join(repr(f'{x} [{machine.unit(x)}]') for x in missing)}"
             + (f", or a joint that moves with {'it' if one else 'them'} ({others})" * bool(others))
-            + f", or lock what was held ({' '.join(f'--lock {x}=VALUE' for x in missing)})"
+            + f", or lock what was held (lock {', '.join(f'{x}=VALUE' for x in missing)})"
         )
     return tuple(drives)
 

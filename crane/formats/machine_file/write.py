@@ -116,7 +116,7 @@ def _content(machine: Machine, chains: _Chains) -> dict[str, Any]:
         if len(coupling.factors) < 2:
             raise InputError(
                 f"coupling '{coupling.name}' holds {next(iter(coupling.factors))} alone, lock "
-                "that joint instead (--lock)"
+                "that joint instead"
             )
         item = {"name": coupling.name, "joints": dict(coupling.factors)}
         data["couplings"].append(item | ({"offset": coupling.offset} if coupling.offset else {}))

@@ -61,7 +61,7 @@ def doubt(text: str, trust: bool) -> None:
         RecordingError: It is not trusted.
     """
     if not trust:
-        raise RecordingError(f"{text}; if the recording is right, trust it (trust=True, --trust)")
+        raise RecordingError(f"{text}; if the recording is right, trust it (trust)")
     warnings.warn(f"{text}: trusted", CraneWarning, stacklevel=3)
 
 

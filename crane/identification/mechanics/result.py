@@ -152,7 +152,7 @@ class Identification:
         """What would determine more."""
         if self.parameters is not None:
             return f"{self.advice}, or leave such terms out"
-        return f"{self.advice}, or give a prior or feasible=True (--prior, --feasible)"
+        return f"{self.advice}, or give a prior, or ask for feasible bodies"
 
     @property
     def doubt(self) -> str:

@@ -125,4 +125,4 @@ def _free_port(host: str, port: int | None) -> int:
             else:
                 return int(probe.getsockname()[1])
     which = f"port {candidates[0]}" if port is not None else f"no port from {_FIRST} on"
-    raise OutputError(f"{host}: {which} can be listened on ({problem}), choose another --port")
+    raise OutputError(f"{host}: {which} can be listened on ({problem}), choose another port")

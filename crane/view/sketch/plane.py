@@ -70,8 +70,7 @@ def find_plane(machine: Machine, q: Array, view: str | None = None) -> Plane:
     if 2 * counts.max(initial=0) < max(len(axes), 1):
         raise InputError(
             f"{machine.name} has no plane: no more than {counts.max(initial=0)} of its "
-            f"{len(axes)} revolute axes are parallel; choose a view with --plane "
-            f"({', '.join(VIEWS)})"
+            f"{len(axes)} revolute axes are parallel; choose the plane ({', '.join(VIEWS)})"
         )
     level = np.abs(axes[:, 2]) < _PARALLEL
     chosen = max(range(len(axes)), key=lambda i: (counts[i], level[i], -i))
