@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from crane.closure.compiled import FastClosure
-from crane.dynamics.compiled import Formula
+from crane.dynamics.compiled import QuantityCode
 
 PACKAGE = str(Path(__file__).parents[1] / "crane")
 
@@ -54,7 +54,7 @@ def passes(monkeypatch):
 
     Keys are "closed" and the names of `crane.dynamics.compiled.QUANTITIES`.
     """
-    count, made, quantities = Counter(), Formula.__init__, {}
+    count, made, quantities = Counter(), QuantityCode.__init__, {}
 
     def named(formula, quantity, *arguments):
         made(formula, quantity, *arguments)
@@ -75,8 +75,8 @@ def passes(monkeypatch):
         return quantities.get(id(formula._program), "other")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Formula, "__init__", named)
+        patch.setattr(QuantityCode, "__init__", named)
         counted(FastClosure, "follow", lambda _: ["closed"], lambda out, _: out)
-        counted(Formula, "each", lambda x: ["closed", quantity(x)], lambda out, _: out)
-        counted(Formula, "along", lambda x: [quantity(x)], lambda _, given: len(given[0]))
+        counted(QuantityCode, "each", lambda x: ["closed", quantity(x)], lambda out, _: out)
+        counted(QuantityCode, "along", lambda x: [quantity(x)], lambda _, given: len(given[0]))
         yield count

@@ -181,9 +181,9 @@ def _describe(machine: "Machine") -> Iterator[str]:
         better = [c for c in closure.proposals if drive > 10 and c.condition < drive / 2]
         others = f"; better with {better[0]}" if better else ""
         yield f"  driven      condition {drive:.3g} at home{others}"
-    path = Dynamics(machine).reference_of("forward")
-    reason = "" if path == "compiled" else ", too large for machine code"
-    yield f"  computed    {path}{reason}"
+    backend = Dynamics(machine).backend_of("forward")
+    reason = "" if backend == "compiled" else ", too large for machine code"
+    yield f"  computed    {backend}{reason}"
     yield f"  tip         {machine.tip or 'none'}"
     if machine.hydraulics is not None:
         supply = machine.hydraulics.supply

@@ -51,6 +51,9 @@ class Expression:
     def __init__(self, tape: Tape, index: int):
         self.tape, self.index = tape, index
 
+    def __bool__(self) -> bool:
+        raise TypeError("a formula is neither true nor false, choose with where_positive")
+
     def __add__(self, other: Number) -> Number:
         if not isinstance(other, Expression) and other == 0:
             return self

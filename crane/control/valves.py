@@ -43,8 +43,8 @@ class Command(Protocol):
         return
 
     def references(self, times: Array) -> Array:
-        """All that depends on time alone, (N, c) at times (N,) [s]."""
-        raise NotImplementedError
+        """All that depends on time alone, (N, c) at times (N,) [s]; nothing yet."""
+        return np.zeros((len(times), 0))
 
     def signals(self, at: At) -> Sequence[Number]:
         """Signals (m,) [V], from floats or as formulas; what it sees are its own settings."""

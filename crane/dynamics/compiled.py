@@ -20,7 +20,9 @@ QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
     "forward": lambda sweep, x: sweep.forward(x, friction=False),
     "forward with friction": lambda sweep, x: sweep.forward(x, friction=True),
     "mass matrix": lambda sweep, x: [entry for row in sweep.mass for entry in row],
-    "bias": lambda sweep, x: [b - f for b, f in zip(sweep.bias, sweep.passive, strict=True)],
+    "bias": lambda sweep, x: [
+        b - f for b, f in zip(sweep.inertial_bias, sweep.passive, strict=True)
+    ],
     "gravity": lambda sweep, x: sweep.weight,
     "friction": lambda sweep, x: sweep.friction,
     "passive": lambda sweep, x: sweep.passive,
@@ -36,7 +38,7 @@ QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
 _FLOAT = np.dtype(np.float64)
 
 
-class Formula:
+class QuantityCode:
     """One quantity as machine code.
 
     Args:

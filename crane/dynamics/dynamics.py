@@ -6,9 +6,9 @@ from numpy.typing import ArrayLike
 from crane.codegen import TooLongError, carefully
 from crane.common.errors import InputError, known
 from crane.common.samples import Array, as_samples, per_sample
-from crane.dynamics.compiled import Formula
-from crane.dynamics.elements import JointForces
+from crane.dynamics.compiled import QuantityCode
 from crane.dynamics.formulation import carriers
+from crane.dynamics.joint_forces import JointForces
 from crane.dynamics.traced import numbers_of
 from crane.dynamics.tree import TreeDynamics
 from crane.machine import Machine
@@ -55,7 +55,7 @@ class Dynamics:
         self.forces = JointForces(machine)
         self.backend = backend if machine.closure.compiled else "pinocchio"
         self.tree = TreeDynamics(machine, self.forces, self.carriers)
-        self._formulas: dict[str, Formula | None] = {}
+        self._formulas: dict[str, QuantityCode | None] = {}
         self.numbers = np.zeros(0)
         if self.backend == "compiled":
             geometry = machine.closure.fast.geometry
@@ -193,7 +193,7 @@ class Dynamics:
         size = 10 * (self.machine.model.njoints - 1)
         return self._evaluate("regressor", (self._n, size), q_a, v_a, a_a, "a_a")
 
-    def reference_of(self, quantity: str = "forward") -> str:
+    def backend_of(self, quantity: str = "forward") -> str:
         """Which backend computes a quantity of `crane.dynamics.compiled.QUANTITIES`."""
         return "pinocchio" if self._formula(quantity) is None else "compiled"
 
@@ -223,12 +223,12 @@ class Dynamics:
     def _n(self) -> int:
         return len(self.machine.active)
 
-    def _formula(self, quantity: str) -> Formula | None:
+    def _formula(self, quantity: str) -> QuantityCode | None:
         """Machine code of a quantity, or None on the Pinocchio backend."""
         if quantity not in self._formulas:
             try:
                 self._formulas[quantity] = (
-                    Formula(quantity, self.machine, self.numbers, self.carriers)
+                    QuantityCode(quantity, self.machine, self.numbers, self.carriers)
                     if self.backend == "compiled"
                     else None
                 )

@@ -20,7 +20,7 @@ from crane.codegen.scalar import (
     times,
 )  # fmt: skip
 from crane.common.samples import Array
-from crane.dynamics.elements import JointForces
+from crane.dynamics.joint_forces import JointForces
 from crane.machine import Machine
 
 BODY, JOINT = 10, 19  # numbers per body and per joint
@@ -138,7 +138,7 @@ class Sweep:
         return out
 
     @cached_property
-    def bias(self) -> Vector:
+    def inertial_bias(self) -> Vector:
         """Sum J_b^T (I_b a_b + v_b x* I_b v_b) at a_A = 0, weights included."""
         velocity, acceleration = self._motion.velocity, self._motion.acceleration
         out: Vector = [0.0] * self._n
@@ -255,12 +255,12 @@ class Sweep:
 
     def inverse(self, a_a: Sequence[Number], friction: bool) -> Vector:
         """M_A a_A + bias - passive [+ friction]."""
-        tau = subtract(add(times(self.mass, a_a), self.bias), self.passive)
+        tau = subtract(add(times(self.mass, a_a), self.inertial_bias), self.passive)
         return add(tau, self.friction) if friction else tau
 
     def forward(self, tau: Sequence[Number], friction: bool) -> Vector:
         """M_A^-1 (tau - bias + passive [- friction])."""
-        right = subtract(add(tau, self.passive), self.bias)
+        right = subtract(add(tau, self.passive), self.inertial_bias)
         if friction:
             right = subtract(right, self.friction)
         return solve_positive(self.mass, right)

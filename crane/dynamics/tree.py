@@ -8,7 +8,7 @@ import pinocchio as pin
 
 from crane.closure.structure import Indices
 from crane.common.samples import Array, solve
-from crane.dynamics.elements import JointForces
+from crane.dynamics.joint_forces import JointForces
 from crane.machine import Machine
 
 

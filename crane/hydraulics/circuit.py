@@ -8,8 +8,8 @@ import numpy as np
 from crane.codegen import Number, maximum
 from crane.common.samples import Array
 from crane.hydraulics.components import Hydraulics
+from crane.hydraulics.driven_cylinder import FIELDS, WIDTH, Chamber, DrivenCylinder, row_of
 from crane.hydraulics.flow import clipped
-from crane.hydraulics.function import FIELDS, WIDTH, Chamber, Function, row_of
 
 _PRESSURE, _OIL = 1.0, 5e-13  # accuracy that matters [Pa], [m3]
 # Integrals that balance: pumped = returned + stored + volume that the joints sweep, and
@@ -199,7 +199,7 @@ class Circuit:
             own = state[self._offsets[i] : self._offsets[i + 1]]
             part = dict(zip(FIELDS, row, strict=False))
             spool, spool_rates = self._spool(i, part, own, signals[i])
-            function = Function(
+            function = DrivenCylinder(
                 common, row, supply, tank, spool, x[i], v[i], own, self._compliant[i]
             )
             spools.append(spool)

@@ -18,8 +18,8 @@ from crane.simulation.run import (
     Progress,
     as_controller,
     count_steps,
+    integrate,
     reference_beyond,
-    trajectory,
 )
 
 _Result = tuple[Array, Array, Array, Array, Array, str]
@@ -101,7 +101,7 @@ def simulate_batch(
         steps = count_steps(control, duration, step)
         if text := reference_beyond(machine, control, steps * step):
             beyond[i] = text
-        time, rows = trajectory(Dynamics(machine), control, starts[i], steps, step)
+        time, rows = integrate(Dynamics(machine), control, starts[i], steps, step)
         energy = np.hstack([rows.kinetic, rows.potential, rows.work, rows.lost])
         q_a = rows.q[:, machine.closure.active]
         return time, q_a, rows.v_a, rows.tau, energy, imbalance(rows, step)

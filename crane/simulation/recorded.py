@@ -29,7 +29,7 @@ def recorded(
         machine: The machine.
         control: What drove it.
         time: (N,) [s].
-        rows: See `trajectory`.
+        rows: See `integrate`.
         task: Name to put into it.
     """
     q_a = rows.q[:, machine.closure.active]
@@ -122,7 +122,7 @@ def imbalance(rows: Parts, step: float) -> str:
     """What to say if a simulation does not keep its energy, else nothing.
 
     Args:
-        rows: See `trajectory`; work, lost, kinetic, potential [J] of it.
+        rows: See `integrate`; work, lost, kinetic, potential [J] of it.
         step: [s].
     """
     change = rows.kinetic + rows.potential - rows.kinetic[0] - rows.potential[0]

@@ -104,7 +104,7 @@ def simulate(
     if text := reference_beyond(machine, control, steps * step):
         warnings.warn(text, CraneWarning, stacklevel=2)
     dynamics = Dynamics(machine, formulation, backend)
-    time, rows = trajectory(dynamics, control, initial, steps, step, method, progress)
+    time, rows = integrate(dynamics, control, initial, steps, step, method, progress)
     # the energies are integrated with the motion, so they tell when the step is too long
     text = imbalance(rows, step)
     if text and formulation == "exact":
@@ -112,7 +112,7 @@ def simulate(
     return recorded(machine, control, time, rows, label)
 
 
-def trajectory(
+def integrate(
     dynamics: Dynamics,
     control: Controller,
     initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None,

@@ -11,7 +11,7 @@ from crane.common.errors import InputError, known
 from crane.common.samples import Array, Brief, as_samples
 from crane.description import Friction
 from crane.dynamics import Dynamics
-from crane.dynamics.elements import JointForces
+from crane.dynamics.joint_forces import JointForces
 from crane.machine import Machine
 
 PER_BODY = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")

@@ -41,7 +41,7 @@ class Chamber:
     slope: Number
 
 
-class Function:
+class DrivenCylinder:
     """One valve and its cylinder at an instant.
 
     Args:
