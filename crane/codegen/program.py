@@ -13,6 +13,9 @@ stop, and arrays of its own. Nothing here is written in a machine's language: an
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from ctypes import addressof, c_char
+from functools import partial
+from struct import pack
 from typing import Any
 
 import numpy as np
@@ -102,18 +105,22 @@ class Program:
         Returns:
             What a routine returns, 0 of a formula.
         """
-        return self.bound(name, *arguments)()
+        answer: int = self._entry(name, arguments)(_addresses(arguments))
+        return answer
 
     def bound(self, name: str, *arguments: "int | np.ndarray") -> "Bound":
-        """A function with its arguments, for calls that must cost little."""
+        """A function with its arguments, for many calls that must cost little."""
+        return Bound(self, self._entry(name, arguments), arguments)
+
+    def _entry(self, name: str, arguments: Sequence["int | np.ndarray"]) -> Any:
         expected = len(self.functions[name].kinds)
         if len(arguments) != expected:
             raise TypeError(f"'{name}' takes {expected} arguments, not {len(arguments)}")
-        return Bound(self, self._code.entry(name), arguments)
+        return self._code.entry(name)
 
 
-class Bound:
-    """A compiled function together with its arguments, which it keeps alive.
+class Bound(partial[int]):
+    """A compiled function together with its arguments, which it keeps alive; see `Program.call`.
 
     One pointer costs a call from Python far less than a dozen.
 
@@ -123,14 +130,26 @@ class Bound:
         arguments: See `Program.call`.
     """
 
-    __slots__ = ("_at", "_entry", "_kept")
+    _kept: tuple[Any, ...]
 
-    def __init__(self, program: Program, entry: Any, arguments: Sequence["int | np.ndarray"]):
-        packed = np.array([x if isinstance(x, int) else x.ctypes.data for x in arguments])
-        self._entry, self._at = entry, packed.ctypes.data
-        self._kept = program, packed, arguments
+    def __new__(
+        cls, program: Program, entry: Any, arguments: Sequence["int | np.ndarray"]
+    ) -> "Bound":
+        """Keep all of it."""
+        addresses = np.frombuffer(_addresses(arguments), dtype=np.int64)
+        self = super().__new__(cls, entry, addresses.ctypes.data)
+        self._kept = program, addresses, arguments
+        return self
 
-    def __call__(self) -> int:
-        """Call it; see `Program.call`."""
-        answer: int = self._entry(self._at)
-        return answer
+
+def _addresses(arguments: Sequence["int | np.ndarray"]) -> bytes:
+    return pack(f"{len(arguments)}q", *map(_address, arguments))
+
+
+def _address(argument: "int | np.ndarray") -> int:
+    if isinstance(argument, int):
+        return argument
+    try:  # takes a tenth of the time of numpy's own way
+        return addressof(c_char.from_buffer(argument.data))
+    except (TypeError, ValueError):  # not writable, or empty
+        return int(argument.ctypes.data)

@@ -58,7 +58,7 @@ class Kinematics:
         Returns:
             (3,) or (N, 3) [m].
         """
-        return self.positions(self.machine.closure.solve(q_a))
+        return self._positions(self.machine.closure.solve(q_a))
 
     def positions(self, q: ArrayLike) -> Array:
         """Position in the world at postures that are closed already.
@@ -69,7 +69,9 @@ class Kinematics:
         Returns:
             (3,) or (N, 3) [m].
         """
-        q = as_samples(q, self._model.nq, "q", self.machine.joints)
+        return self._positions(as_samples(q, self._model.nq, "q", self.machine.joints))
+
+    def _positions(self, q: Array) -> Array:
         if q.ndim == 2 and self._points is not None:
             return self._points.rows(q)
         return per_sample(self.position_at, q)
