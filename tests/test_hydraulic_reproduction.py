@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_cli import one_error, run
+from test_cli import one_error
+from typed import typed
 
 import crane
 from crane.common.errors import RecordingError
@@ -278,7 +279,7 @@ def files(ideal, tmp_path_factory):
 
 def test_circuit_prints_x_and_judges(ideal, files, tmp_path):
     out = tmp_path / "found"
-    result = run(
+    result = typed(
         "circuit", "patu655", files / "2.csv", "--joint", "X_lift", "--method", "chambers",
         "--validation", files / "1.csv", "--out", out, *LOCKED, *sets(ideal[0].machine),
     )  # fmt: skip
@@ -294,7 +295,7 @@ def test_circuit_prints_x_and_judges(ideal, files, tmp_path):
 def test_circuit_finds_the_valve_in_noisy_angles(tmp_path):
     """Speeds come from the smoother: differences of the strokes would be noise."""
     circuit.staircase("X_ext", circuit.LEVEL, tmp_path)
-    result = run(
+    result = typed(
         "circuit", "patu655", tmp_path / "logger.csv", "--joint", "X_ext", "--model", "valve",
         *LOCKED,
     )  # fmt: skip
@@ -307,7 +308,7 @@ def test_circuit_finds_the_valve_in_noisy_angles(tmp_path):
 
 def test_circuit_finds_friction(tmp_path):
     circuit.friction_strokes(tmp_path, 0.0)
-    result = run(
+    result = typed(
         "circuit", "patu655", tmp_path / "logger.csv", "--joint", "X_lift", "--model", "friction",
         "--set", f"payload.mass={experiment.LOAD}", *LOCKED,
     )  # fmt: skip
@@ -331,7 +332,7 @@ def test_circuit_finds_friction(tmp_path):
 )
 def test_circuit_s_errors_are_one_line(files, arguments, line):
     joint = [] if "--joint" in arguments else ["--joint", "X_lift"]
-    result = run("circuit", "patu655", "1.csv", *LOCKED, *joint, *arguments, cwd=files)
+    result = typed("circuit", "patu655", "1.csv", *LOCKED, *joint, *arguments, cwd=files)
     assert line in one_error(result)
 
 
