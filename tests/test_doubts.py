@@ -222,7 +222,10 @@ def test_clean_rigs_raise_no_alarm_and_late_ones_do(mini, rig, seed):
 @recorded
 @pytest.mark.slow
 def test_measured_arms_run_through(tmp_path):
-    """Their doubts are the joints where friction and rotors outweigh, and some outliers."""
+    """Doubts are the joints where friction and rotors outweigh, and some outliers.
+
+    KR300's q6 is 10.6 +- 2.4 times its model, by the regression beside friction: no doubt of units.
+    """
     from crane.recordings import timeseries
 
     runs = {}
@@ -231,7 +234,7 @@ def test_measured_arms_run_through(tmp_path):
         timeseries.write(tmp_path / f"{log}.csv", table)
         runs[log] = read_measured(crane.load(name), tmp_path / f"{log}.csv")
     for name, learn, judge, doubtful in (
-        ("kr300", "kr300_A", "kr300_B", ["'q6_force'"]),
+        ("kr300", "kr300_A", "kr300_B", []),
         ("tx40", "tx40_recording", None, ["'q5_force'", "'q6_force'"]),
     ):
         judge = None if judge is None else runs[judge]
@@ -239,6 +242,6 @@ def test_measured_arms_run_through(tmp_path):
             lambda n=name, x=learn, y=judge: identify(crane.load(n), runs[x], y, prior=0.3)
         )
         doubts = [x for x in lines if "this recording cannot say" in x]
-        assert {w for x in doubts for w in x.split() if w.startswith("'")} <= set(doubtful)
+        assert [w for x in doubts for w in x.split() if w.startswith("'")] == doubtful
         others = [x for x in lines if x not in doubts and not x.startswith("outliers")]
         assert all(x.startswith("errors on the validation") for x in others), others

@@ -102,3 +102,6 @@ def test_quantities_at_closed_postures_are_those_of_their_strokes(mini, backend)
     assert np.abs(found - wanted).max() < 1e-12 * np.abs(wanted).max()
     one = dynamics.at("inverse with friction", q[3], given.v[3], given.a[3])
     assert np.abs(one - found[3]).max() <= 1e-14 * np.abs(wanted).max()
+    # columns of a table that was solved or transposed stand the other way round
+    turned = dynamics.at("inverse with friction", *map(np.asfortranarray, (q, given.v, given.a)))
+    np.testing.assert_array_equal(turned, found)

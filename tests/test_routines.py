@@ -39,6 +39,19 @@ def test_a_loop_goes_through_rows_with_strides():
     assert program.call("all", 0, inputs, out) == 0
 
 
+def test_arrays_that_are_not_contiguous_are_refused():
+    program = squares()
+    program.compile()
+    wide, out = np.ones((2, 6)), np.empty(2)
+    for array in (wide[0, ::3], np.asfortranarray(np.ones((2, 2)))):
+        with pytest.raises(TypeError, match="not contiguous"):
+            program.call("square", array, out)
+    fixed = np.array([2.0, 5.0])
+    fixed.setflags(write=False)
+    program.call("square", fixed, out)
+    np.testing.assert_array_equal(out, [9.0, 5.0])
+
+
 def test_loops_within_loops_and_what_leaves_them():
     """For every row the index of the first entry above a bound, -1 where there is none."""
     program = Program()

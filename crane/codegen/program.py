@@ -152,4 +152,6 @@ def _address(argument: "int | np.ndarray") -> int:
     try:  # takes a tenth of the time of numpy's own way
         return addressof(c_char.from_buffer(argument.data))
     except (TypeError, ValueError):  # not writable, or empty
+        if not argument.flags.c_contiguous:
+            raise TypeError("an array is not contiguous, machine code would read others") from None
         return int(argument.ctypes.data)

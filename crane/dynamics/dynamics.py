@@ -212,7 +212,7 @@ class Dynamics:
         formula = self._formula(quantity)
         if formula is None:
             return per_sample(lambda *one: self.tree.at(quantity, *one), q, v_a, x)
-        inputs = np.concatenate([v_a, x], axis=-1)
+        inputs = np.ascontiguousarray(np.concatenate([v_a, x], axis=-1))
         if q.ndim == 1:
             return formula.at(np.ascontiguousarray(q), inputs)
         out = np.empty((len(q), formula.size))
