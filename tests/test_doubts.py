@@ -224,7 +224,8 @@ def test_clean_rigs_raise_no_alarm_and_late_ones_do(mini, rig, seed):
 def test_measured_arms_run_through(tmp_path):
     """Doubts are the joints where friction and rotors outweigh, and some outliers.
 
-    KR300's q6 is 10.6 +- 2.4 times its model, by the regression beside friction: no doubt of units.
+    KR300's q6 is 10.6 +- 2.4 times its model, by the regression beside friction: its unit is
+    not in doubt.
     """
     from crane.recordings import timeseries
 
