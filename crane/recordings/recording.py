@@ -265,9 +265,9 @@ def check_finite(columns: Mapping[str, Array]) -> None:
 def _array(
     what: str, value: ArrayLike, shape: tuple[int, ...], copy: bool, names: Sequence[str] = ()
 ) -> Array:
-    """A contiguous float64 array of that shape, a copy where asked for or needed."""
+    """A float64 array of that shape: a contiguous copy, or as it lies where none is asked for."""
     try:
-        array = np.array(value, dtype=np.float64, order="C", copy=copy or None)
+        array = np.array(value, dtype=np.float64, order="C" if copy else "K", copy=copy or None)
     except (TypeError, ValueError):
         raise RecordingError(f"{what} is not an array of numbers, give {shape}") from None
     if array.shape != shape:
