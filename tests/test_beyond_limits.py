@@ -142,13 +142,14 @@ def test_batches_say_it_of_each(mini, free):
     assert not inside.failures and TOLD not in inside.warnings.get(0, "")
 
 
+@pytest.mark.slow
 def test_the_rig_says_it_too(free):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         rig = Rig(free, 1)
-    told = "'X1' goes to 0.06 m at t = 2 s"
+    told = "'X1' goes to 0.06 m at t = 1 s"
     with pytest.warns(CraneWarning, match=told), pytest.raises(SimulationError) as error:
-        rig.run(to(0.06, 2.0))
+        rig.run(to(0.06, 1.0))
     assert "beyond its limit 0.03 m" in str(error.value)
 
 

@@ -19,12 +19,12 @@ def run(kind, first, count, program="fuzz.py"):
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_some_changed_files(kind):
-    run(kind, 0, 150)
+    run(kind, 0, 60)
 
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_some_odd_graphs(kind):
-    run(kind, 0, 100, "graphs.py")
+    run(kind, 0, 40, "graphs.py")
 
 
 @pytest.mark.slow
