@@ -43,7 +43,7 @@ MISPRINTS = (
      "0.0817 g m2"),
     ("Table 4(h)", "the actuators' mass is lost, values shifted by one row",
      "0.034 kg assumed; its influence is below"),
-    ("before (13)", "A_2^0, A_3^0 count links on the left, rows of Table 3(a) on the right: "
+    ("before (13)", "A_2^0 and A_3^0 count links on the left, rows of Table 3(a) on the right: "
      "read literally, poses are off by 5 cm", "CM3 stands on rows 1 to 3, CM7 on rows 1 to 5"),
     ("(13), Table 4(b)", "PCY3 in the equation, PCZ3 in the table", "the same length, 0.0109 m"),
     ("(15)", "a fifth column in the matrix of CMA2", "four"),
