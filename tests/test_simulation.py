@@ -225,3 +225,15 @@ def test_unknown_method(springy):
 def test_too_many_steps(forwarder):
     with pytest.raises(InputError, match="1e[+]15 steps of 0.001 s, at most 4000000"):
         crane.simulate(forwarder, duration=1e12)
+
+
+@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+def test_a_machine_may_be_given_by_its_name():
+    found, wanted = (
+        crane.simulate(machine, duration=0.01)
+        for machine in ("mini_forwarder", crane.load("mini_forwarder"))
+    )
+    np.testing.assert_array_equal(found.q, wanted.q)
+    for nothing in (None, 5):
+        with pytest.raises(crane.CraneError, match="names no machine, give a name or the path"):
+            crane.simulate(nothing, duration=0.01)

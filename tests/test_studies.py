@@ -114,6 +114,19 @@ def test_rows_do_not_depend_on_what_was_computed_before(pins, tmp_path):
     assert text_of(apart, tmp_path) == text_of(pins, tmp_path)
 
 
+def test_a_machine_is_varied_as_it_was_loaded():
+    given = {"tasks": ["lift"], "measures": ["peak_X1"]}
+    loaded = crane.load("mini_forwarder", {"link7.mass": 0.3})
+    found = crane.study(loaded, {"payload.mass": [0.0, 0.1]}, **given)
+    both = {"payload.mass": [0.0, 0.1], "link7.mass": [0.3]}
+    wanted = crane.study("mini_forwarder", both, **given)
+    plain = crane.study("mini_forwarder", {"payload.mass": [0.0, 0.1]}, **given)
+    np.testing.assert_array_equal(found.columns["peak_X1"], wanted.columns["peak_X1"])
+    assert (found.columns["peak_X1"] != plain.columns["peak_X1"]).all()
+    with pytest.raises(InputError, match="is not what its files describe"):
+        crane.study(loaded.replace(friction={}), {"payload.mass": [0.0]}, **given)
+
+
 def test_draws_come_from_their_seed():
     vary = {"payload.mass": (0.0, 0.2), "link7.mass": (0.1, 0.2)}
     one, two, other = (

@@ -61,6 +61,10 @@ def find(name: str | Path) -> Path:
     Raises:
         DescriptionError: There is none.
     """
+    if not isinstance(name, str | Path):
+        raise DescriptionError(
+            f"{type(name).__name__} names no machine, give a name or the path of a file"
+        )
     path, text = Path(name), str(name)
     try:
         is_file, is_folder = path.is_file(), path.is_dir()
