@@ -234,10 +234,6 @@ def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
             "controller 'pid' is unknown",
         ),
         (
-            ["simulate", "mini_forwarder", "--out", "x", "--controller", "pi", "--duration", "1"],
-            "has nothing to follow, name a --task",
-        ),
-        (
             ["simulate", "mini_forwarder", "--out", "x", "--duration", "1", "--step", "0"],
             "the step is 0.0 s",
         ),

@@ -344,7 +344,8 @@ class TestWords:
             (1.0, (-0.01, 1, 1), "negative principal moment"),
             (1.0, (0, 0, 0), "no inertia"),
             (0.0, (0, 0, 0), None),
-            (0.0, (1, 1, 1), "no mass"),
+            (0.0, (1, 1, 1), None),  # a rotor whose mass stands elsewhere
+            (0.0, (1, 1, 3), "no possible body"),
             (np.inf, (1, 1, 1), "beyond all numbers"),
             (1.0, (1, np.nan, 1), "beyond all numbers"),
         ],

@@ -1,7 +1,7 @@
 """Every line that a user sees for a broken URDF, with the loops of URDF+ too."""
 
 import pytest
-from broken import GROUND, LOOPED, ROCKER, Broken, assert_refused, case, swap, whole
+from broken import GROUND, LOOPED, Broken, assert_refused, case, swap, whole
 
 import crane
 
@@ -212,11 +212,6 @@ BODIES = [
         swap('<mass value="1.5"/>', '<mass value="1.5"/><mass value="1.5"/>', GROUND),
     ),
     case(
-        "inertia without mass",
-        "ground.urdf:21: link 'crank_arm' has an inertia but no mass, give it a mass",
-        swap('<mass value="1.5"/>', '<mass value="0"/>', GROUND),
-    ),
-    case(
         "zero inertia",
         "ground.urdf:21: link 'crank_arm' has a mass but no inertia, give at least "
         "a small sphere's",
@@ -278,45 +273,6 @@ BODIES = [
             '<inertia ixx="0.001" ixy="0" ixz="0" iyy="0.006" iyz="0" izz="0.006"/>',
             '<inertia ixx="0.001" ixy="0" ixz="0" iyy="0.006" iyz="0"/>',
             GROUND,
-        ),
-    ),
-    case(
-        "moving link without inertial",
-        "ground.urdf:17: joint 'crank' moves link 'crank_arm', which has no mass, "
-        "give it an <inertial>",
-        swap(
-            "    <inertial>\n"
-            '      <origin xyz="0.1 0 0" rpy="0 0 0"/>\n'
-            '      <mass value="1.5"/>\n'
-            '      <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.006" iyz="0" izz="0.006"/>\n'
-            "    </inertial>\n",
-            "",
-            GROUND,
-        ),
-    ),
-    case(
-        "moving link with zeros",
-        "ground.urdf:17: joint 'crank' moves link 'crank_arm', which has no mass, "
-        "give it an <inertial>",
-        swap('<mass value="1.5"/>', '<mass value="0"/>', GROUND),
-        swap(
-            '<inertia ixx="0.001" ixy="0" ixz="0" iyy="0.006" iyz="0" izz="0.006"/>',
-            '<inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>',
-            GROUND,
-        ),
-    ),
-    case(
-        "massless chain",
-        "rocker.urdf:8: joint 'rocker' moves link 'rocker_arm', which has no mass, "
-        "give it an <inertial>",
-        swap(
-            "    <inertial>\n"
-            '      <origin xyz="0.15 0 0"/>\n'
-            '      <mass value="1.0"/>\n'
-            '      <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/>\n'
-            "    </inertial>\n",
-            "",
-            ROCKER,
         ),
     ),
     case(
@@ -389,21 +345,6 @@ JOINTS = [
             '<limit lower="1" upper="1"/>',
             GROUND,
         ),
-    ),
-    case(
-        "limits without range",
-        "ground.urdf:14: lower and upper limit of joint 'crank' are both 0, widen "
-        "them or make it fixed",
-        swap(
-            '<limit lower="-1.5" upper="2.5" effort="10" velocity="5"/>',
-            '<limit effort="10" velocity="5"/>',
-            GROUND,
-        ),
-    ),
-    case(
-        "no limit",
-        "ground.urdf:10: joint 'crank' is revolute and has no <limit>, add one",
-        swap('<limit lower="-1.5" upper="2.5" effort="10" velocity="5"/>', "", GROUND),
     ),
     case(
         "infinite limit",
@@ -588,22 +529,6 @@ TREE = [
 # Loops in the way of URDF+.
 LOOPS = [
     case(
-        "no driven joint",
-        "four_bar_loop.urdf:45: 1 degree of freedom and no active joints, name one: try "
-        "[crank] (condition 1.6), or [coupler] (condition 1.46), and mark what you choose with "
-        'independent="true"',
-        swap(' independent="true"', "", LOOPED),
-        machine=LOOPED,
-    ),
-    case(
-        "no joint is independent",
-        "four_bar_loop.urdf:45: 1 degree of freedom and no active joints, name one: try "
-        "[crank] (condition 1.6), or [coupler] (condition 1.46), and mark what you choose with "
-        'independent="true"',
-        swap(' independent="true"', ' independent="false"', LOOPED),
-        machine=LOOPED,
-    ),
-    case(
         "independent yes",
         "four_bar_loop.urdf:5: independent=\"yes\" of joint 'crank' is neither true nor false",
         swap(' independent="true"', ' independent="yes"', LOOPED),
@@ -622,32 +547,6 @@ LOOPS = [
         swap(
             'name="coupler" type="continuous"',
             'name="coupler" type="fixed" independent="true"',
-            LOOPED,
-        ),
-        machine=LOOPED,
-    ),
-    case(
-        "too many independent joints",
-        "four_bar_loop.urdf: 2 active joints (crank, coupler) for 1 degree of freedom: name "
-        "only 1 of them, such as [crank] (condition 1.6), or [coupler] (condition 1.46)",
-        swap(
-            'name="coupler" type="continuous"',
-            'name="coupler" type="continuous" independent="true"',
-            LOOPED,
-        ),
-        machine=LOOPED,
-    ),
-    case(
-        "too few independent joints",
-        "four_bar_loop.urdf: 1 active joint (crank) for 3 degrees of freedom: "
-        "activate coupler, rocker too",
-        swap(
-            '  <loop name="pin" type="continuous">\n'
-            '    <predecessor link="coupler_arm"><origin xyz="0.4 0 0"/></predecessor>\n'
-            '    <successor link="rocker_arm"><origin xyz="0.3 0 0"/></successor>\n'
-            '    <axis xyz="0 0 2"/>\n'
-            "  </loop>\n",
-            "",
             LOOPED,
         ),
         machine=LOOPED,

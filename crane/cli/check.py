@@ -2,15 +2,15 @@
 
 import typer
 
-from crane.cli.shared import MachineName, app
+from crane.cli.shared import Active, Free, MachineName, app, names
 
 
 @app.command()
-def check(file: MachineName) -> None:
+def check(file: MachineName, active: Active = None, free: Free = None) -> None:
     """Say all that is wrong with a machine; exit status 0, 1 with warnings only, 2 with errors."""
     from crane.formats.check import check as check_machine
 
-    report = check_machine(file)
+    report = check_machine(file, names(active), names(free))
     for finding in report.findings:
         print(finding)
     if report.summary is not None:

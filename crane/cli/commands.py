@@ -6,7 +6,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crane.cli.shared import Force, MachineName, NoOpen, Out, OutFile, app, load, progress_bar
+from crane.cli.shared import (
+    Active,
+    Force,
+    Free,
+    MachineName,
+    NoOpen,
+    Out,
+    OutFile,
+    app,
+    load,
+    progress_bar,
+)
 from crane.common.errors import InputError
 
 if TYPE_CHECKING:
@@ -39,6 +50,8 @@ def info(
         bool,
         typer.Option("--parameters", help="List the names that --set changes, and their values."),
     ] = False,
+    active: Active = None,
+    free: Free = None,
 ) -> None:
     """Show what a machine consists of."""
     if parameters:
@@ -50,7 +63,7 @@ def info(
         for name, value in values.items():
             print(f"{name:{width}}  {value:.6g}")
         return
-    for line in _describe(load(machine)):
+    for line in _describe(load(machine, active=active, free=free)):
         print(line)
 
 
@@ -153,9 +166,10 @@ def _describe(machine: "Machine") -> Iterator[str]:
     width = max(10, 1 + max(map(len, (*machine.joints, *closure.equations.names))))
     for i, joint in enumerate(machine.active):
         home = machine.home[closure.active[i]]
+        free = ", free" if joint in machine.free else ""
         yield (
             f"    {joint:<{width}}{machine.lower[i]:.5g} to {machine.upper[i]:.5g} "
-            f"{machine.unit(joint)}, home {home:.5g}"
+            f"{machine.unit(joint)}, home {home:.5g}{free}"
         )
     for i in closure.passive:
         joint = machine.joints[i]
@@ -176,14 +190,18 @@ def _describe(machine: "Machine") -> Iterator[str]:
             for _, columns in structure.blocks
         ]
         yield f"  solved as   {', then '.join(order)}"
+    for motor in machine.motors:
+        terms = " + ".join(f"{factor:g} {joint}" for joint, factor in motor.factors.items())
+        yield f"  drive       {motor.name}, along {terms}"
     if loops:
         drive = float(closure.condition(machine.home))
         better = [c for c in closure.proposals if drive > 10 and c.condition < drive / 2]
         others = f"; better with {better[0]}" if better else ""
         yield f"  driven      condition {drive:.3g} at home{others}"
-    backend = Dynamics(machine).backend_of("forward")
-    reason = "" if backend == "compiled" else ", too large for machine code"
-    yield f"  computed    {backend}{reason}"
+    if mass:
+        backend = Dynamics(machine).backend_of("forward")
+        reason = "" if backend == "compiled" else ", too large for machine code"
+        yield f"  computed    {backend}{reason}"
     yield f"  tip         {machine.tip or 'none'}"
     if machine.hydraulics is not None:
         supply = machine.hydraulics.supply

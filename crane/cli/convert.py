@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from crane.cli.shared import Change, Force, Lock, MachineName, _place, app, load
+from crane.cli.shared import Active, Change, Force, Free, Lock, MachineName, _place, app, load
 from crane.common.errors import InputError, known
 
 _FORMATS = ("urdf+", "mjcf", "machine")
@@ -27,6 +27,8 @@ def convert(
     ] = None,
     change: Change = None,
     lock: Lock = None,
+    active: Active = None,
+    free: Free = None,
     force: Force = False,
 ) -> None:
     """Write a machine as one URDF with loops, as MJCF, or as machine file with sub-chains."""
@@ -42,7 +44,7 @@ def convert(
         check_folder(out, force)
     else:
         check_free(out, force)
-    loaded = load(machine, lock, change)
+    loaded = load(machine, lock, change, active, free)
     if kind == "machine":
         written = write_machine(loaded, out)
     else:

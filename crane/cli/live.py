@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from crane.cli.shared import Change, Lock, app, load
+from crane.cli.shared import Active, Change, Free, Lock, app, load
 from crane.common.errors import InputError
 
 
@@ -30,6 +30,8 @@ def live(
     ] = None,
     change: Change = None,
     lock: Lock = None,
+    active: Active = None,
+    free: Free = None,
 ) -> None:
     """Move a machine with sliders in a browser, its loops closed at every move."""
     from crane.cli.runs import machine_of, read_run
@@ -41,15 +43,17 @@ def live(
     if Path(what).is_dir() or Path(what).suffix.lower() in (".csv", ".npz"):
         if run is not None:
             raise InputError(f"'{what}' is a run already, leave --run out")
-        if change or lock:
-            raise InputError("--set and --lock are for machines, name the run with --run")
+        if change or lock or active or free:
+            raise InputError(
+                "--set, --lock, --active and --free are for machines, name the run with --run"
+            )
         given = None if machine is None else load(machine)
         recording = read_run(Path(what), given)
         loaded = given or machine_of(what, recording.machine)
     elif machine is not None:
         raise InputError(f"--machine is for runs, and '{what}' is none, leave it out")
     else:
-        loaded = load(what, lock, change)
+        loaded = load(what, lock, change, active, free)
         if run is not None:
             recording = read_run(run, loaded)
     playback = None if recording is None else Playback(loaded, recording)

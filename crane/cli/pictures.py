@@ -5,7 +5,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crane.cli.shared import Change, Force, Lock, MachineName, OutFile, app, by_joint, load
+from crane.cli.shared import (
+    Active,
+    Change,
+    Force,
+    Free,
+    Lock,
+    MachineName,
+    OutFile,
+    app,
+    by_joint,
+    load,
+)
 from crane.common.errors import InputError, known
 
 if TYPE_CHECKING:
@@ -31,6 +42,8 @@ def sketch(
     out: OutFile = None,
     change: Change = None,
     lock: Lock = None,
+    active: Active = None,
+    free: Free = None,
     force: Force = False,
 ) -> None:
     """Draw the mechanism of a machine (png, svg or pdf)."""
@@ -38,7 +51,7 @@ def sketch(
     from crane.common.output import file_name
     from crane.view.sketch.draw import sketch as draw
 
-    loaded = load(machine, lock, change)
+    loaded = load(machine, lock, change, active, free)
     figure = out or Path(file_name(loaded.name) + "_sketch.png")
     check_free(figure, force)
     draw(loaded, figure, posture(loaded, at), plane, com)

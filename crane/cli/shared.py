@@ -59,6 +59,14 @@ Lock = Annotated[
     list[str] | None,
     typer.Option(metavar="JOINT=VALUE", help="A joint that is held, and where, in m or rad."),
 ]
+Active = Annotated[
+    str | None,
+    typer.Option(metavar="JOINTS", help="Driven joints, as lift,tilt, if not those of the file."),
+]
+Free = Annotated[
+    str | None,
+    typer.Option(metavar="JOINTS", help="Coordinates that nothing drives, as swing,sway."),
+]
 Trust = Annotated[
     bool,
     typer.Option(
@@ -93,12 +101,23 @@ def by_joint(
     return out
 
 
-def load(name: str, lock: list[str] | None = None, change: list[str] | None = None) -> "Machine":
-    """The machine of that name or path, some joints locked, some numbers changed."""
+def load(
+    name: str,
+    lock: list[str] | None = None,
+    change: list[str] | None = None,
+    active: str | None = None,
+    free: str | None = None,
+) -> "Machine":
+    """The machine of that name or path with what options say of it."""
     from crane.formats import load as load_machine
 
     changes = by_joint("--set", change, "NAME=VALUE, as in payload.mass=200")
-    return load_machine(name, changes, by_joint("--lock", lock))
+    return load_machine(name, changes, by_joint("--lock", lock), names(active), names(free))
+
+
+def names(words: str | None) -> list[str] | None:
+    """Joints of a list with commas."""
+    return None if words is None else [word.strip() for word in words.split(",") if word.strip()]
 
 
 @contextmanager

@@ -5,7 +5,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crane.cli.shared import Change, Force, Lock, MachineName, Out, app, load, progress_bar
+from crane.cli.shared import (
+    Active,
+    Change,
+    Force,
+    Free,
+    Lock,
+    MachineName,
+    Out,
+    app,
+    load,
+    progress_bar,
+)
 from crane.common.errors import InputError, known
 
 if TYPE_CHECKING:
@@ -22,7 +33,7 @@ def simulate(
         str | None,
         typer.Option(
             help="pi, computed-torque, valve-pd, tip-velocity; if not given, the one that the "
-            "machine has gains for."
+            "machine has gains for. Without a task it holds the home posture."
         ),
     ] = None,
     inputs: Annotated[
@@ -38,6 +49,8 @@ def simulate(
     step: Annotated[float, typer.Option(help="Step of the integration in seconds.")] = 1e-3,
     change: Change = None,
     lock: Lock = None,
+    active: Active = None,
+    free: Free = None,
     force: Force = False,
 ) -> None:
     """Simulate a task, measured inputs, or the motion from the home posture on its own."""
@@ -45,7 +58,7 @@ def simulate(
     from crane.simulation import simulate as run
 
     check_folder(out, force)
-    loaded = load(machine, lock, change)
+    loaded = load(machine, lock, change, active, free)
     if inputs is not None:
         named = {"--task": task, "--controller": controller}
         given = [option for option, value in named.items() if value is not None]
@@ -61,11 +74,11 @@ def simulate(
         raise InputError(f"no task: name a --task ({tasks}), or a --duration to let it go")
     if duration is None and task is not None:
         duration = loaded.tasks[task].duration
+    label = task or ("hold" if control else "free motion")
     with progress_bar("simulating") as progress:
         recording = run(
-            loaded, control, duration=duration, step=step, label=task or "free motion",
-            progress=progress,
-        )  # fmt: skip
+            loaded, control, duration=duration, step=step, label=label, progress=progress
+        )
     print(write_run(out, recording), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")
 
@@ -74,12 +87,13 @@ def _control(
     machine: "Machine", task: str | None, name: str | None
 ) -> "Controller | Command | None":
     from crane.control import controller, joystick, usual
-    from crane.motion.trajectories import task_trajectory
+    from crane.motion.trajectories import point_to_point, task_trajectory
 
     if task is None:
-        if name is not None:
-            raise InputError(f"controller '{name}' has nothing to follow, name a --task")
-        return None
+        if name is None:
+            return None
+        home = machine.home[machine.closure.active]
+        return controller(name, machine, point_to_point(home, home, 1.0))
     if task not in machine.tasks:
         raise InputError(
             f"machine '{machine.name}' has no task '{task}', {known(machine.tasks, task)}"

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from crane.cli.shared import Change, Force, Lock, MachineName, Out, app, load, status
+from crane.cli.shared import Active, Change, Force, Free, Lock, MachineName, Out, app, load, status
 
 
 @app.command()
@@ -19,6 +19,8 @@ def workspace(
     seed: Annotated[int, typer.Option(help="Of what is drawn for many strokes.")] = 0,
     change: Change = None,
     lock: Lock = None,
+    active: Active = None,
+    free: Free = None,
     force: Force = False,
 ) -> None:
     """Map what the tip reaches, which strokes close, and where they are singular."""
@@ -26,7 +28,7 @@ def workspace(
     from crane.motion.workspaces import workspace as explore
 
     check_folder(out, force)
-    loaded = load(machine, lock, change)
+    loaded = load(machine, lock, change, active, free)
     with status("exploring"):
         space = explore(loaded, samples, frame, seed)
     with status("drawing"):

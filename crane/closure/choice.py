@@ -23,7 +23,7 @@ from crane.common.samples import Array
 
 Indices = NDArray[np.intp]
 
-_DEAD = 1e-5  # sigma_min of a choice that drives nothing at home, see `crane.closure.structure`
+DEAD = 1e-5  # sigma_min of a choice that drives nothing at home, see `crane.closure.structure`
 _FAIR = 100.0  # condition up to which actuators are proposed before better joints
 _SWAPS = 200
 
@@ -118,7 +118,7 @@ def choose(basis: Array, among: Sequence[int], kept: Sequence[int] = ()) -> Indi
     free = [i for i in among if i not in kept]
     rows = basis[free]
     if len(kept):
-        if np.linalg.matrix_rank(basis[list(kept)], _DEAD) < len(kept):
+        if np.linalg.matrix_rank(basis[list(kept)], DEAD) < len(kept):
             return None
         _, _, right = np.linalg.svd(basis[list(kept)])
         rows = rows @ right[len(kept) :].T  # what the kept ones leave free
@@ -129,7 +129,7 @@ def choose(basis: Array, among: Sequence[int], kept: Sequence[int] = ()) -> Indi
     if missing:
         pivots = qr(rows.T, mode="r", pivoting=True)[1]
         chosen += [free[int(i)] for i in pivots[:missing]]
-    if np.linalg.svd(basis[chosen], compute_uv=False).min(initial=1.0) < _DEAD:
+    if np.linalg.svd(basis[chosen], compute_uv=False).min(initial=1.0) < DEAD:
         return None
     for _ in range(_SWAPS if missing else 0):
         moved = np.abs(np.linalg.solve(basis[chosen].T, basis[free].T)).T  # (free, n)
@@ -163,7 +163,7 @@ def proposals(
         kept: Columns that are chosen in any case.
     """
     scale = scales(model)
-    basis = motions(jacobian, scale, _DEAD)
+    basis = motions(jacobian, scale, DEAD)
     names = list(model.names)[1:]
     columns = range(model.nv) if among is None else among
     free = [i for i in columns if i not in followers]

@@ -96,9 +96,9 @@ def analyse(
     followers = [int(i) for i in range(model.nv) if (equations.factors[:, i] != 0).any()]
     if not equations.names:
         if not len(active):
-            raise MechanismError(_unnamed(model.nv) + f"try [{', '.join(names)}]", "active")
+            raise MechanismError(_unnamed(model.nv) + f"try [{', '.join(names)}]", "active", guess)
         if len(passive):
-            raise MechanismError(_miscounted(names, active, passive, model.nv), "active")
+            raise MechanismError(_miscounted(names, active, passive, model.nv), "active", guess)
         none = np.zeros(0, dtype=np.intp)
         return Structure(guess.copy(), none, none, ())
     somewhere = _close(equations, guess, everything)
@@ -140,7 +140,7 @@ def analyse(
             "home",
         )
     if not len(active) and freedom:
-        raise MechanismError(_unnamed(freedom) + proposed("try "), "active")
+        raise MechanismError(_unnamed(freedom) + proposed("try "), "active", somewhere)
     if freedom != len(active):
         stuck = _undetermined(jacobians, passive)
         text = _miscounted(names, active, stuck, freedom)
@@ -148,7 +148,7 @@ def analyse(
             text += proposed(", such as ", among=[int(i) for i in active])
         elif freedom - len(active) < len(stuck):
             text += proposed(", such as ", kept=[int(i) for i in active])
-        raise MechanismError(text, "active")
+        raise MechanismError(text, "active", somewhere if freedom else None)
     drivable = max(_rank(jacobian[:, passive]) for jacobian in jacobians)
     if drivable < rank:
         stuck = _undetermined(jacobians, passive)
@@ -156,6 +156,7 @@ def analyse(
             f"the active joints {_list(names, active)} cannot drive {_list(names, stuck)}: "
             f"choose others{proposed(', such as ')}",
             "active",
+            somewhere,
         )
     home = _close(equations, guess, passive)
     endless = passive[np.isinf(model.upperPositionLimit[passive])]  # pins may have wound up

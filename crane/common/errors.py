@@ -5,6 +5,7 @@ A message is one line that says what is wrong, where, and what to do about it.
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from typing import Any
 
 _WORD, _LINE = 1000, 4000  # characters of a word and of a line that anybody reads
 
@@ -52,11 +53,13 @@ class MechanismError(CraneError):
     Args:
         message: See `CraneError`.
         about: What of the description it is about: "active", "home", or "loop" and its name.
+        posture: (nq,) where the loops close, if that was found.
     """
 
-    def __init__(self, message: str, about: str = ""):
+    def __init__(self, message: str, about: str = "", posture: Any = None):
         super().__init__(message)
         self.about = about
+        self.posture = posture
 
 
 class InputError(CraneError):

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.codegen import Number
-from crane.codegen.scalar import subtract
+from crane.codegen.scalar import add, scale, solve_positive, subtract
 from crane.common.errors import ClosureError, CraneWarning, InputError
 from crane.common.samples import Array, as_number, as_sample
 from crane.control.base import At, Law
@@ -19,7 +19,7 @@ from crane.motion.trajectories import Trajectory
 class PI(Law):
     """One PI controller per active joint, equation (7) of the reduced-scale forwarder paper.
 
-    tau = K_p e + K_i int e dt, e = q_ref(t) - q_A.
+    tau = K_p e + K_i int e dt, e = q_ref(t) - q_A. Free joints get no force.
 
     Args:
         machine: The machine.
@@ -41,7 +41,8 @@ class PI(Law):
         integral: ArrayLike | None = None,
     ):
         gains = machine.control if gains is None else gains
-        for joint in machine.active:
+        driven = [joint for joint in machine.active if joint not in machine.free]
+        for joint in driven:
             if joint not in gains:
                 raise InputError(
                     f"no PI gains for active joint '{joint}' of '{machine.name}', give kp and ki "
@@ -53,6 +54,7 @@ class PI(Law):
         self._integral = (
             None if integral is None else as_sample(integral, len(names), "integral", names)
         )
+        gains = {joint: gains[joint] if joint in driven else PIGains(0.0, 0.0) for joint in names}
         numbers = [[gains[joint].kp for joint in names], [gains[joint].ki for joint in names]]
         self.settings = np.array(numbers, dtype=np.float64).ravel()
 
@@ -89,8 +91,13 @@ class ComputedTorque(Law):
 
     tau = inverse(q_A, v_A, a_ref + 2 w (v_ref - v_A) + w^2 (q_ref - q_A)) with friction.
 
-    It moves all active joints. Where nothing is said to drive one (`Machine.undriven`), a warning
-    names it and the force that it takes along the reference.
+    Free joints get no force and follow no reference. With d the driven and f the free joints, and
+    c = inverse(q_A, v_A, (a_d, 0)), their acceleration and the drives' forces are
+
+        a_f = -M_ff^-1 c_f,    tau_d = c_d + M_df a_f
+
+    (collocated partial feedback linearisation, Spong 1994). Where nothing is said to drive another
+    joint (`Machine.undriven`), a warning names it and the force that it takes along the reference.
 
     Args:
         machine: The machine.
@@ -135,8 +142,27 @@ class ComputedTorque(Law):
         """See `Law`."""
         w, n = at.settings[0], len(at.q_a)
         motion = (at.reference[i * n : (i + 1) * n] for i in range(3))
-        wanted = [
-            a_ref + 2.0 * w * (v_ref - v) + w * w * (q_ref - q)
-            for q_ref, v_ref, a_ref, q, v in zip(*motion, at.q_a, at.v_a, strict=True)
+        driven = self.machine.driven.tolist()
+        wanted: list[Number] = [
+            a_ref + 2.0 * w * (v_ref - v) + w * w * (q_ref - q) if moved else 0.0
+            for q_ref, v_ref, a_ref, q, v, moved in zip(
+                *motion, at.q_a, at.v_a, driven, strict=True
+            )
         ]
-        return at.inverse(wanted, friction=True), ()
+        tau = at.inverse(wanted, friction=True)
+        free = [i for i in range(n) if not driven[i]]
+        return (_without(tau, free, at) if free else tau), ()
+
+
+def _without(tau: list[Number], free: list[int], at: At) -> list[Number]:
+    """Forces of inverse dynamics with those of free joints gone: these accelerate instead."""
+    n = len(tau)
+    still = at.inverse([0.0] * n, friction=False)
+    columns = []  # of M_A
+    for i in free:
+        pushed = at.inverse([float(k == i) for k in range(n)], friction=False)
+        columns.append(subtract(pushed, still))
+    mass = [[column[i] for column in columns] for i in free]
+    falling = solve_positive(mass, [-tau[i] for i in free])
+    moved = add(tau, *(scale(a, column) for a, column in zip(falling, columns, strict=True)))
+    return [0.0 if i in free else x for i, x in enumerate(moved)]

@@ -1,12 +1,13 @@
 """What a machine is described by, whatever file it comes from, and changes of it."""
 
-from crane.description.changes import changed, locked, parameters
+from crane.description.changes import changed, driven, locked, parameters
 from crane.description.inertia import inertia_problem
 from crane.description.sources import bundled, examples
 from crane.description.spec import (
     LOOP_TYPES,
     Chain,
     Coupling,
+    Drive,
     EndStop,
     ForceElement,
     Friction,
@@ -18,7 +19,7 @@ from crane.description.spec import (
 )
 
 __all__ = [
-    "LOOP_TYPES", "Chain", "Coupling", "EndStop", "ForceElement", "Friction", "GasSpring",
-    "LoopSpec", "MachineSpec", "PIGains", "Task", "bundled", "changed", "examples",
+    "LOOP_TYPES", "Chain", "Coupling", "Drive", "EndStop", "ForceElement", "Friction", "GasSpring",
+    "LoopSpec", "MachineSpec", "PIGains", "Task", "bundled", "changed", "driven", "examples",
     "inertia_problem", "locked", "parameters",
 ]  # fmt: skip

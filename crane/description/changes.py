@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Any
@@ -14,7 +14,7 @@ from crane.common.errors import CraneWarning, InputError, known
 from crane.common.magnitudes import doubt
 from crane.common.samples import FARTHEST, as_number
 from crane.description.sources import bundled
-from crane.description.spec import Chain, Coupling, Friction, MachineSpec
+from crane.description.spec import Chain, Coupling, Drive, Friction, MachineSpec
 from crane.description.tree import Joint, Limits, Link, Tree, limit
 from crane.hydraulics.components import Hydraulics, number_names
 
@@ -221,6 +221,8 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
         tree=spec.tree.replacing(*held),
         chains=chains,
         active=active,
+        free=tuple(name for name in spec.free if name not in lock),
+        drives=_without(spec.drives, lock),
         home={joint: value for joint, value in spec.home.items() if joint not in lock},
         friction={joint: value for joint, value in spec.friction.items() if joint not in lock},
         control={joint: value for joint, value in spec.control.items() if joint not in lock},
@@ -236,6 +238,65 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
             if not (task.space == "active" and task.coefficients.keys() & lock.keys())
         },
         couplings=couplings,
+    )
+
+
+def _without(drives: tuple[Drive, ...], lock: Mapping[str, float]) -> tuple[Drive, ...]:
+    """Drives of what still moves."""
+    rest = (
+        dataclasses.replace(
+            drive, factors={x: f for x, f in drive.factors.items() if x not in lock}
+        )
+        for drive in drives
+    )
+    return tuple(drive for drive in rest if drive.factors)
+
+
+def driven(
+    spec: MachineSpec, active: Sequence[str] | None, free: Sequence[str] | None
+) -> MachineSpec:
+    """A machine whose drives, or whose free coordinates, are others than its file says.
+
+    Circuits, gains and tasks of joints that are not driven any more go.
+
+    Args:
+        spec: The machine as read.
+        active: Driven joints, in the order of q_A; None for those of the file.
+        free: Coordinates that nothing drives; None for those of the file.
+
+    Raises:
+        InputError: No such joint, or one in both.
+    """
+    names = [joint.name for joint in spec.tree.moving]
+    for what, given in (("active", active), ("free", free)):
+        for joint in given or ():
+            if joint not in names:
+                raise InputError(f"{what} joint '{joint}' is unknown, {known(names, joint)}")
+            if list(given or ()).count(joint) > 1:
+                raise InputError(f"{what} joint '{joint}' is named twice, once will do")
+            if joint in (active or ()) and joint in (free or ()):
+                raise InputError(f"joint '{joint}' is active and free, keep one of the two")
+    undriven = tuple(spec.free if free is None else free)
+    if active is None:
+        drives = _without(spec.drives, dict.fromkeys(undriven, 0.0))
+        now = spec.active and tuple(name for name in spec.active if name not in undriven)
+    else:
+        drives, now = (), tuple(active)
+    undriven = tuple(name for name in undriven if name not in (now or ()))
+    kept = names if now is None else now
+    same = now == spec.active
+    return dataclasses.replace(
+        spec,
+        active=now,
+        free=undriven,
+        drives=drives,
+        control={x: gains for x, gains in spec.control.items() if x in kept and x not in undriven},
+        hydraulics=spec.hydraulics and spec.hydraulics.only(kept),
+        tasks={
+            name: task
+            for name, task in spec.tasks.items()
+            if task.space == "tip" or same or not task.coefficients.keys() - set(kept)
+        },
     )
 
 

@@ -11,7 +11,8 @@ _NO_INERTIA = 1e-15  # [kg m2]
 def inertia_problem(mass: float, tensor: np.ndarray) -> str | None:
     """What makes a mass [kg] and an inertia about the COM (3, 3) [kg m2] impossible, if anything.
 
-    The principal moments of a body are non-negative and none exceeds the sum of the others.
+    The principal moments of a body are non-negative and none exceeds the sum of the others. A mass
+    of zero with an inertia is a rotor whose mass stands elsewhere.
     """
     if not (np.isfinite(mass) and np.isfinite(tensor).all()):
         return "a mass or an inertia beyond all numbers, give smaller ones"
@@ -19,8 +20,6 @@ def inertia_problem(mass: float, tensor: np.ndarray) -> str | None:
     largest = float(np.abs(moments).max())
     if largest < _NO_INERTIA:
         return "a mass but no inertia, give at least a small sphere's" if mass > 0 else None
-    if mass == 0:
-        return "an inertia but no mass, give it a mass"
     if moments[0] < -_ROUNDING * largest:
         return f"the negative principal moment of inertia {moments[0]:.4g} kg m2, correct it"
     if moments[0] + moments[1] < moments[2] * (1 - _ROUNDING):

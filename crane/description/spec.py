@@ -88,6 +88,21 @@ class Coupling:
     where: str
 
 
+@dataclass(frozen=True)
+class Drive:
+    """What a motor or cylinder acts along: its length, L = sum factor q.
+
+    A force u along L is the force factor u at each of its joints.
+
+    Attributes:
+        name: Its name.
+        factors: By joint; the one joint of a motor with factor 1.
+    """
+
+    name: str
+    factors: Mapping[str, float]
+
+
 def places(loops: Iterable[LoopSpec], couplings: Iterable[Coupling]) -> dict[str, str]:
     """Where loops and couplings were written, as errors about them look it up."""
     written: list[LoopSpec | Coupling] = [*loops, *couplings]
@@ -297,4 +312,5 @@ class MachineSpec:
     couplings: tuple[Coupling, ...] = ()
     where: Mapping[str, str] = field(default_factory=dict)  # section -> "file:line"
     payload: Load | None = None  # what payload.mass hangs on the tip; None: a point mass
-    motors: tuple[str, ...] = ()  # joints that the format itself says motors drive
+    free: tuple[str, ...] = ()  # independent coordinates that nothing drives
+    drives: tuple[Drive, ...] = ()  # what the format says motors act on; (): the active joints

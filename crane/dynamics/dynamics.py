@@ -1,17 +1,20 @@
 """The equations of motion in the active coordinates."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.codegen import TooLongError, carefully
-from crane.common.errors import InputError, known
-from crane.common.samples import Array, as_samples, per_sample
+from crane.common.errors import InputError, MechanismError, known
+from crane.common.samples import Array, as_number, as_samples, per_sample
 from crane.dynamics.compiled import QuantityCode
 from crane.dynamics.formulation import carriers
 from crane.dynamics.joint_forces import JointForces
 from crane.dynamics.traced import numbers_of
 from crane.dynamics.tree import TreeDynamics
 from crane.machine import Machine
+from crane.machine.masses import has_mass
 
 BACKENDS = ("compiled", "pinocchio")
 
@@ -43,6 +46,7 @@ class Dynamics:
 
     Raises:
         InputError: Unknown formulation or backend.
+        MechanismError: Nothing that moves has a mass.
     """
 
     def __init__(self, machine: Machine, formulation: str = "exact", backend: str = "compiled"):
@@ -50,6 +54,11 @@ class Dynamics:
             raise InputError(f"backend '{backend}' is unknown, {known(BACKENDS, backend)}")
         if not isinstance(machine, Machine):
             raise InputError(f"{machine!r} is not a machine, load it with crane.load")
+        if not has_mass(machine.model):
+            raise MechanismError(
+                f"no link of '{machine.name}' that moves has a mass, give each an <inertial>: "
+                "without masses there is kinematics, and no dynamics"
+            )
         self.machine, self.formulation = machine, formulation
         self.carriers = carriers(machine, formulation)
         self.forces = JointForces(machine)
@@ -192,6 +201,69 @@ class Dynamics:
         """
         size = 10 * (self.machine.model.njoints - 1)
         return self._evaluate("regressor", (self._n, size), q_a, v_a, a_a, "a_a")
+
+    def drive_forces(
+        self, q_a: ArrayLike, tau_a: ArrayLike, sharing: Mapping[str, float] | None = None
+    ) -> Array:
+        """Forces of the drives that make active forces, also where drives are in surplus.
+
+        With the drives' lengths L = S q + const and B = (S gamma)^T, tau_A = B u. Where there are
+        more drives than freedoms the forces share the load by weights W,
+
+            u = W B^T (B W B^T)^+ tau_A,
+
+        the least sum of u_i^2 / W_i. What no drive moves keeps no force: active forces of free
+        joints are left out, which `active_forces` tells.
+
+        Args:
+            q_a: (n,) or (N, n) [m], [rad].
+            tau_a: The same shape [N], [N m].
+            sharing: Weights W by drive, above 0; all 1 if not given.
+
+        Returns:
+            u (m,) or (N, m) [N], [N m], in the order of `Machine.drives`.
+
+        Raises:
+            InputError: Unknown drive, or a weight that is not above 0.
+        """
+        n, drives = self._n, self.machine.drives
+        names = [drive.name for drive in drives]
+        weights = np.ones(len(drives))
+        for name, given in (sharing or {}).items():
+            if name not in names:
+                raise InputError(f"sharing names the drive '{name}', {known(names, name)}")
+            weights[names.index(name)] = as_number(given, f"the share of '{name}'", "", above=0)
+        reach = self._reach(q_a)
+        tau_a = as_samples(tau_a, n, "tau_a", self.machine.active)
+        shared = weights[:, None] * np.swapaxes(reach, -1, -2)
+        inverse = np.linalg.pinv(reach @ shared, rcond=1e-12, hermitian=True)
+        forces: Array = np.einsum("...ij,...jk,...k->...i", shared, inverse, tau_a)
+        return forces
+
+    def active_forces(self, q_a: ArrayLike, forces: ArrayLike) -> Array:
+        """Active forces of the drives': tau_A = (S gamma)^T u, see `drive_forces`.
+
+        Args:
+            q_a: (n,) or (N, n) [m], [rad].
+            forces: u (m,) or (N, m) [N], [N m], in the order of `Machine.drives`.
+
+        Returns:
+            (n,) or (N, n) [N], [N m].
+        """
+        names = [drive.name for drive in self.machine.drives]
+        u = as_samples(forces, len(names), "forces", names)
+        found: Array = np.einsum("...ij,...j->...i", self._reach(q_a), u)
+        return found
+
+    def _reach(self, q_a: ArrayLike) -> Array:
+        """B = (S gamma)^T, (n, m) or (N, n, m), of the drives."""
+        machine = self.machine
+        lengths = np.zeros((len(machine.drives), machine.model.nv))  # S
+        for row, drive in zip(lengths, machine.drives, strict=True):
+            for joint, factor in drive.factors.items():
+                row[machine.column(joint)] += factor
+        gamma = machine.closure.gamma(machine.closure.solve(q_a))
+        return np.swapaxes(lengths @ gamma, -1, -2)
 
     def backend_of(self, quantity: str = "forward") -> str:
         """Which backend computes a quantity of `crane.dynamics.compiled.QUANTITIES`."""

@@ -1,23 +1,28 @@
 """From a description to a machine."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
+from crane.common.counted import few_warnings
 from crane.common.errors import DescriptionError, InputError
-from crane.description import changed, locked
+from crane.description import changed, driven, locked
 from crane.description.sources import WITH, find
 from crane.formats.ambiguity import warn_of_assemblies
 from crane.formats.machine_file.read import read
 from crane.machine.assemble import assemble, closed, home_guess
+from crane.machine.drives import free_joints, motors
 from crane.machine.machine import Machine, fixed
+from crane.machine.masses import check_masses
 
 
 def load(
     name: str | Path,
     changes: Mapping[str, float] | None = None,
     lock: Mapping[str, float] | None = None,
+    active: Sequence[str] | None = None,
+    free: Sequence[str] | None = None,
 ) -> Machine:
     """Load a machine, perhaps with some of its numbers changed, or joints locked.
 
@@ -27,6 +32,10 @@ def load(
         changes: New values by the names of `crane.description.parameters`, such as
             {"link3_G.x": 0.1, "link7.mass": 0.25, "payload.mass": 0.1}; SI units.
         lock: Coordinates [m], [rad] of joints to be fixed, by name.
+        active: Driven joints in the order of q_A, if not those of the file. Where there are more
+            than degrees of freedom, all of them are drives, see `Dynamics.drive_forces`.
+        free: Coordinates that nothing drives, if not those of the file. What the active joints
+            leave open is free anyway, with a warning.
 
     Returns:
         The machine, its home posture closed.
@@ -36,7 +45,20 @@ def load(
         MechanismError: The parts do not make a machine that can be driven.
         InputError: A change of a parameter that is not there, or to what cannot be.
     """
+    with few_warnings():
+        return _load(name, changes, lock, active, free)
+
+
+def _load(
+    name: str | Path,
+    changes: Mapping[str, float] | None,
+    lock: Mapping[str, float] | None,
+    active: Sequence[str] | None,
+    free: Sequence[str] | None,
+) -> Machine:
     spec = read(name)
+    if active is not None or free is not None:
+        spec = driven(spec, _names(active, "active"), _names(free, "free"))
     if changes:
         spec = changed(spec, changes)
     if lock:
@@ -44,6 +66,7 @@ def load(
     model = assemble(spec)
     guess = home_guess(spec, model)
     closure = closed(spec, model, guess)
+    check_masses(spec, model, closure)
     warn_of_assemblies(spec, closure, guess)
     lower, upper = model.lowerPositionLimit, model.upperPositionLimit
     return Machine(
@@ -65,10 +88,26 @@ def load(
         tasks=MappingProxyType(dict(spec.tasks)),
         control=MappingProxyType(dict(spec.control)),
         hydraulics=spec.hydraulics,
+        chosen=MappingProxyType(
+            {
+                key: tuple(names)
+                for key, names in (("active", active), ("free", free))
+                if names is not None
+            }
+        ),
         changes=MappingProxyType({name: float(value) for name, value in (changes or {}).items()}),
-        motors=spec.motors,
+        free=free_joints(spec, closure.active_names),
+        motors=motors(spec, closure.active_names),
         locks=MappingProxyType({name: float(value) for name, value in (lock or {}).items()}),
     )
+
+
+def _names(given: object, what: str) -> Sequence[str] | None:
+    if given is None:
+        return None
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        raise InputError(f"{what} is {given!r}, give a list of joints such as ['lift', 'tilt']")
+    return tuple(map(str, given))
 
 
 def recalled(call: str) -> Machine:
@@ -87,13 +126,17 @@ def recalled(call: str) -> Machine:
     name, _, text = call.partition(WITH)
     try:
         given = json.loads(text)
-        numbers = [
+        changes, lock = (
             {key: float(value) for key, value in given.pop(kind, {}).items()}
             for kind in ("changes", "lock")
-        ]
+        )
+        active, free = (
+            [str(joint) for joint in given.pop(kind)] if kind in given else None
+            for kind in ("active", "free")
+        )
     except (ValueError, TypeError, AttributeError, RecursionError):
         given = {"": None}
     if given:
         example = '{"changes": {"payload.mass": 200}, "lock": {"slew": 0}}'
         raise InputError(f"'{call}' names no machine, write NAME{WITH}{example}")
-    return load(name, *numbers)
+    return load(name, changes, lock, active, free)

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from crane.common.errors import DescriptionError, known
-from crane.description.spec import Chain, LoopSpec, MachineSpec, places
+from crane.description.spec import Chain, Drive, LoopSpec, MachineSpec, places
 from crane.description.tree import Joint, Link, Tree
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
@@ -78,7 +78,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
         tree=tree.tree,
         loops=loops,
         active=motors,
-        motors=motors,
+        drives=tuple(Drive(joint, {joint: 1.0}) for joint in motors),
         friction=urdf.friction,
         tip=tree.only_leaf(),
         couplings=urdf.couplings,

@@ -7,6 +7,7 @@ import numpy as np
 import pinocchio as pin
 
 from crane.closure import Closure, frame_id
+from crane.closure.equations import LoopEquations
 from crane.common.errors import DescriptionError, MechanismError, at
 from crane.common.samples import Array
 from crane.description import LoopSpec, MachineSpec, inertia_problem
@@ -14,6 +15,7 @@ from crane.description.findings import flag, recoverable
 from crane.description.rigid import inertia, se3
 from crane.description.tree import Joint, Link
 from crane.machine.axes import wrong_axis
+from crane.machine.drives import active_joints, completed, warn_of_completion
 
 _MOST = 1000  # joints that move; closing takes the cube of it
 _SAME = 1e-12  # difference of two directions that is none, as Pinocchio has it
@@ -22,14 +24,6 @@ _ALIGNED = (
     (pin.JointModelRY, pin.JointModelPY),
     (pin.JointModelRZ, pin.JointModelPZ),
 )
-
-
-def active_joints(spec: MachineSpec, model: pin.Model) -> tuple[str, ...]:
-    """The active joints: those named, or all that no coupling moves."""
-    if spec.active is not None:
-        return spec.active
-    followers = {next(iter(coupling.factors)) for coupling in spec.couplings}
-    return tuple(name for name in model.names[1:] if name not in followers)
 
 
 def home_guess(spec: MachineSpec, model: pin.Model) -> Array:
@@ -71,31 +65,42 @@ def closed(
     # while findings are collected, joints that close rings are no part of the tree
     there = tuple(x for x in spec.couplings if all(map(model.existJointName, x.factors)))
     spec = dataclasses.replace(spec, couplings=there)
+    names = active_joints(spec, model)
     try:
-        return _closure(spec, model, guess, loops)
+        return Closure(model, loops, names, guess, there)
     except MechanismError as refused:
         error = refused
 
     def close(changed: MachineSpec, some: Sequence[LoopSpec]) -> object:
         tree = model if changed.tree is spec.tree else assemble(changed)
-        return _closure(changed, tree, guess, some)
+        return Closure(tree, some, names, guess, there)
 
-    if spec.active != () and (error.about == "active" or error.about.startswith("loop ")):
+    if names and (error.about == "active" or error.about.startswith("loop ")):
         suspect = wrong_axis(spec, model, loops, close)
         if suspect is not None:
             raise suspect
-    hint = ""
-    if spec.active == () and spec.path.suffix.lower() == ".urdf":
-        hint = ', and mark what you choose with independent="true"'
-    raise MechanismError(
-        at(spec.where.get(error.about, spec.path.name), error) + hint, error.about
-    )
+    if error.about == "active" and error.posture is not None:
+        closure = _completed(spec, model, loops, error.posture)
+        if closure is not None:
+            return closure
+    raise MechanismError(at(spec.where.get(error.about, spec.path.name), error), error.about)
 
 
-def _closure(
-    spec: MachineSpec, model: pin.Model, guess: Array, loops: Sequence[LoopSpec]
-) -> Closure:
-    return Closure(model, loops, active_joints(spec, model), guess, spec.couplings)
+def _completed(
+    spec: MachineSpec, model: pin.Model, loops: Sequence[LoopSpec], posture: Array
+) -> Closure | None:
+    """The closure with active joints chosen as the file leaves it, None where that is none."""
+    equations = LoopEquations(model, loops, spec.couplings)
+    choice = completed(spec, model, equations, posture)
+    if choice is None:
+        return None
+    names, text = choice
+    try:
+        closure = Closure(model, loops, names, posture, spec.couplings)
+    except MechanismError:
+        return None
+    warn_of_completion(spec, text)
+    return closure
 
 
 def assemble(spec: MachineSpec) -> pin.Model:
@@ -106,7 +111,7 @@ def assemble(spec: MachineSpec) -> pin.Model:
     URDF adds them.
 
     Raises:
-        DescriptionError: The tree is too large, or a body has no mass or an impossible inertia.
+        DescriptionError: The tree is too large, or a body has an impossible inertia.
     """
     tree, below = spec.tree, spec.tree.below()
     if (moving := len(tree.moving)) > _MOST:
@@ -185,15 +190,10 @@ def _check_bodies(spec: MachineSpec, model: pin.Model) -> None:
         if link.between is not None or index in doubtful:
             continue
         with recoverable(harmless=True):
-            _check_body(link, joint.name, model.inertias[index])
+            _check_body(link, model.inertias[index])
 
 
-def _check_body(link: Link, joint: str, inertia: pin.Inertia) -> None:
-    if not inertia.mass > 0:
-        raise DescriptionError(
-            f"{link.where}: joint '{joint}' moves link '{link.name}', which has no mass, give it "
-            "an <inertial>"
-        )
+def _check_body(link: Link, inertia: pin.Inertia) -> None:
     if problem := inertia_problem(inertia.mass, inertia.inertia):
         raise DescriptionError(
             f"{link.where}: link '{link.name}' with what is fixed to it has {problem}"

@@ -17,6 +17,7 @@ from crane.common.errors import InputError, LimitError, known
 from crane.common.samples import Array, as_number, as_sample, as_samples
 from crane.description import (
     Chain,
+    Drive,
     EndStop,
     ForceElement,
     Friction,
@@ -76,9 +77,12 @@ class Machine:
         tasks: Named reference motions.
         control: PI gains by active joint.
         hydraulics: The circuit that drives it, None for a machine without.
-        motors: Joints that the format of its file says motors drive (actuators of a MJCF).
+        free: Active joints that nothing drives: no force but friction, springs and stops.
+        motors: What the file says that motors act on (actuators of a MJCF), or all drives where
+            there are more than freedoms; empty where `drives` are the active joints.
         changes: Numbers that are not those of its files, by name.
         locks: Where joints are held that its files let move, by name [m], [rad].
+        chosen: Active and free joints that are not those of its file, under "active" and "free".
     """
 
     name: str
@@ -99,19 +103,24 @@ class Machine:
     tasks: Mapping[str, Task]
     control: Mapping[str, PIGains]
     hydraulics: Hydraulics | None
-    motors: tuple[str, ...]
+    free: tuple[str, ...]
+    motors: tuple[Drive, ...]
     changes: Mapping[str, float]
     locks: Mapping[str, float]
+    chosen: Mapping[str, tuple[str, ...]]
 
     def __repr__(self) -> str:
         """Name, joints, loops and what drives it."""
-        drives = ", ".join(f"{joint} [{self.unit(joint)}]" for joint in self.active)
+        drives = ", ".join(
+            f"{joint} [{self.unit(joint)}]" for joint in self.active if joint not in self.free
+        )
+        free = f", free {', '.join(self.free)}" if self.free else ""
         loops = len(self.closure.equations.loops)
         circuit = ", hydraulic" if self.hydraulics is not None else ""
         return (
             f"Machine '{self.name}': {len(self.joints)} joints, "
             f"{loops} loop{'' if loops == 1 else 's'}{circuit}, "
-            f"driven by {drives}"
+            f"driven by {drives or 'nothing'}{free}"
         )
 
     @property
@@ -121,23 +130,36 @@ class Machine:
 
     @property
     def undriven(self) -> tuple[str, ...]:
-        """Active joints that nothing is said to drive.
+        """Active joints that are not free, and that nothing is said to drive either.
 
         A joint is driven that has an `effort` above 0 in the `<limit>` of its URDF, a cylinder,
         gains under `control`, or a motor by its file's format. All others are active because the
-        machine has their freedom: a grapple that swings.
+        machine has their freedom: a grapple that swings, which is best named under `free`.
         """
         driven = {
-            *self.motors,
+            *self.free,
+            *self.chosen.get("active", ()),
             *self.control,
             *(self.hydraulics.joints if self.hydraulics else ()),
         }
+        driven |= {joint for motor in self.motors for joint in motor.factors}
         efforts = self.model.effortLimit[self.closure.active]
         return tuple(
             joint
             for joint, effort in zip(self.active, efforts, strict=True)
             if joint not in driven and not (np.isfinite(effort) and effort > 0)
         )
+
+    @cached_property
+    def drives(self) -> tuple[Drive, ...]:
+        """What acts on the machine: its motors, or one drive along each driven active joint."""
+        driven = (joint for joint in self.active if joint not in self.free)
+        return self.motors or tuple(Drive(joint, {joint: 1.0}) for joint in driven)
+
+    @cached_property
+    def driven(self) -> Array:
+        """(n,) whether each active joint is driven, which free ones are not."""
+        return np.array([joint not in self.free for joint in self.active])
 
     @cached_property
     def reference(self) -> str:
@@ -152,8 +174,8 @@ class Machine:
 
         Such as 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
         """
-        given = {"changes": dict(self.changes), "lock": dict(self.locks)}
-        given = {name: numbers for name, numbers in given.items() if numbers}
+        given = {"changes": dict(self.changes), "lock": dict(self.locks), **self.chosen}
+        given = {name: what for name, what in given.items() if what}
         return f"{self.reference}{WITH}{json.dumps(given)}" if given else self.reference
 
     @cached_property
@@ -304,6 +326,8 @@ class Machine:
             ),
             control=self.control if same else MappingProxyType({}),
             hydraulics=self.hydraulics and self.hydraulics.only(names),
+            free=tuple(name for name in names if name in self.free),
+            motors=(),
         )
 
     def with_payload(self, payload: Payload) -> "Machine":
@@ -321,6 +345,8 @@ class Machine:
         if tensor.shape != (3, 3) or not np.allclose(tensor, tensor.T, rtol=1e-9, atol=1e-15):
             raise InputError("the payload's inertia is not a symmetric (3, 3) matrix")
         problem = inertia_problem(mass, tensor)
+        if not mass and tensor.any():
+            problem = "an inertia but no mass, give it a mass"
         if problem and tensor.any():
             raise InputError(f"the payload has {problem}")
         load = pin.Inertia(mass, com, tensor)

@@ -43,7 +43,8 @@ class Kinematics:
         self._model = machine.model
         self._frame = machine.frame(frame)
         span = machine.upper - machine.lower
-        self._scale = np.where(np.isfinite(span), span, 1.0)
+        # free joints stay where they are
+        self._scale = np.where(np.isfinite(span), span, 1.0) * machine.driven
 
     def __repr__(self) -> str:
         """What moves, of what."""
@@ -240,9 +241,9 @@ class Kinematics:
         machine = self.machine
         home = machine.home[machine.closure.active]
         axes = [
-            (low + span * np.array([0.2, 0.5, 0.8]) if np.isfinite(span) else [at])
-            for low, span, at in zip(
-                machine.lower, machine.upper - machine.lower, home, strict=True
+            (low + span * np.array([0.2, 0.5, 0.8]) if driven and np.isfinite(span) else [at])
+            for low, span, at, driven in zip(
+                machine.lower, machine.upper - machine.lower, home, machine.driven, strict=True
             )
         ]
         found = [(np.array(machine.home), self.position_at(machine.home))]

@@ -148,10 +148,10 @@ def tip_trajectory(
     time = np.linspace(0.0, tip.duration, count)
     x, x_rate, x_second = tip(time)
     q_a = kinematics.inverse(x, guess)
-    if q_a.shape[1] > x.shape[1]:
+    if machine.driven.sum() > x.shape[1]:
         spline = make_interp_spline(time, q_a, k=5)
         return Trajectory(_quintics(time, q_a, spline(time, 1), spline(time, 2)), tip)
-    jacobian = np.linalg.pinv(kinematics.jacobian(q_a))
+    jacobian = np.linalg.pinv(kinematics.jacobian(q_a) * machine.driven)
     v_a = np.einsum("ijk,ik->ij", jacobian, x_rate)
     a_a = np.einsum("ijk,ik->ij", jacobian, x_second - kinematics.bias(q_a, v_a))
     return Trajectory(_quintics(time, q_a, v_a, a_a), tip)
@@ -199,7 +199,11 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
     if chosen.space == "tip":
         rows = [chosen.coefficients[axis] for axis in ("x", "y", "z")]
         return tip_trajectory(machine, polynomial(rows, chosen.duration))
-    found = polynomial([chosen.coefficients[name] for name in machine.active], chosen.duration)
+    home = machine.home[machine.closure.active]
+    rows = [  # free joints have no reference
+        chosen.coefficients.get(name, (at,)) for name, at in zip(machine.active, home, strict=True)
+    ]
+    found = polynomial(rows, chosen.duration)
     if text := beyond_limits(machine, found):
         raise LimitError(f"task '{task}': {text}")
     return found

@@ -83,7 +83,8 @@ def _channels(machine: Machine, control: Controller, time: Array, rows: Parts) -
 def _references(machine: Machine, reference: Trajectory, time: Array) -> Iterator[Column]:
     """What a reference asks of the joints, and of the tip where it was given there."""
     q, v = reference.position(time), reference.velocity(time)
-    for i, joint in enumerate(machine.active):
+    for i in np.flatnonzero(machine.driven):
+        joint = machine.active[i]
         unit = machine.unit(joint)
         yield f"reference_{joint}", q[:, i], unit
         yield f"reference_velocity_{joint}", v[:, i], unit + "/s"

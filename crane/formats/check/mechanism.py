@@ -1,7 +1,6 @@
 """Whether the parts make a machine: every loop that does not close or does nothing."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -9,12 +8,13 @@ import pinocchio as pin
 from crane.closure import Closure
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import least_squares_step
-from crane.common.errors import CraneWarning, DescriptionError, MechanismError
+from crane.common.errors import CraneWarning, MechanismError
 from crane.common.samples import Array
 from crane.description import MachineSpec
 from crane.description.findings import Findings, flag
 from crane.formats.ambiguity import warn_of_assemblies
 from crane.machine.assemble import assemble, closed, home_guess
+from crane.machine.masses import check_masses
 
 _OPEN = 1e-6  # [m], [rad] from which on a loop is said to be open
 
@@ -48,6 +48,7 @@ def check_mechanism(spec: MachineSpec, found: Findings) -> Closure | None:
             return None
         flag(error)
         loops.remove(idle[0])
+    check_masses(spec, model, closure)
     _warn_of_limits(spec, closure)
     warn_of_assemblies(spec, closure, guess, thorough=True)
     return closure
@@ -111,41 +112,3 @@ def _warn_of_limits(spec: MachineSpec, closure: Closure) -> None:
                 CraneWarning,
                 stacklevel=2,
             )
-
-
-def massless(spec: MachineSpec) -> Iterator[DescriptionError]:
-    """Errors about bodies without mass in a tree that cannot be assembled."""
-    joints = [joint for joint in spec.tree.joints.values() if not joint.cut]
-    if not all(joint.parent and joint.child for joint in joints):
-        return  # what has no place may be the mass that seems to be missing
-    fixed: dict[str, list[str]] = {}
-    for joint in joints:
-        if not joint.moves:
-            fixed.setdefault(joint.parent, []).append(joint.child)
-    links = spec.tree.links
-    heavy = {
-        link.name
-        for link in links.values()
-        if link.refused or link.between or (link.inertial and link.inertial.mass > 0)
-    }
-    for joint in joints:
-        if not joint.moves or joint.child not in links:
-            continue
-        if not _body(joint.child, fixed) & heavy:
-            yield DescriptionError(
-                f"{links[joint.child].where}: joint '{joint.name}' moves link '{joint.child}', "
-                "which has no mass, give it an <inertial>"
-            )
-
-
-def _body(link: str, fixed: Mapping[str, Sequence[str]]) -> set[str]:
-    """A link, and the links that are fixed to it."""
-    body: set[str] = set()
-    waiting = [link]
-    while waiting:
-        link = waiting.pop()
-        if link in body:
-            continue
-        body.add(link)
-        waiting += fixed.get(link, ())
-    return body

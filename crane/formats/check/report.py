@@ -2,15 +2,16 @@
 
 import re
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from crane.closure import Closure
 from crane.common.errors import CraneWarning
-from crane.description import MachineSpec
-from crane.description.findings import Findings, collecting, flag, recoverable
+from crane.description import MachineSpec, driven
+from crane.description.findings import Findings, collecting, recoverable
 from crane.description.sources import find
-from crane.formats.check.mechanism import check_mechanism, massless
+from crane.formats.check.mechanism import check_mechanism
 from crane.formats.check.plausible import implausible
 from crane.formats.machine_file.read import read
 
@@ -79,16 +80,21 @@ class Report:
         return ", ".join(words) + ("; there is more, mend these first" if self.full else "")
 
 
-def check(name: str | Path) -> Report:
+def check(
+    name: str | Path, active: Sequence[str] | None = None, free: Sequence[str] | None = None
+) -> Report:
     """Read a machine as far as possible, and say all that is wrong or unusual about it.
 
     The first error that `load` would raise is among the findings.
 
     Args:
         name: As for `load`.
+        active: As for `load`.
+        free: As for `load`.
 
     Raises:
         DescriptionError: There is no such file.
+        InputError: A joint is unknown.
     """
     path = find(name)
     spec: MachineSpec | None = None
@@ -97,6 +103,9 @@ def check(name: str | Path) -> Report:
         warnings.simplefilter("always", CraneWarning)
         with recoverable():
             spec = read(path)
+        if spec is not None and (active is not None or free is not None):
+            with recoverable():
+                spec = driven(spec, active, free)
         if spec is not None:
             closure = _closed(spec, found)
         implausible(found.files, spec)
@@ -116,8 +125,6 @@ def check(name: str | Path) -> Report:
 def _closed(spec: MachineSpec, found: Findings) -> Closure | None:
     """The closure of what was read, None where what is wrong with it forbids one."""
     if not found.usable:
-        for error in massless(spec):
-            flag(error)
         return None
     with recoverable():
         return check_mechanism(spec, found)

@@ -37,7 +37,7 @@ from crane.formats.urdf.read import Urdf, is_urdf, read_urdf
 Part = TypeVar("Part")
 
 _KEYS = (
-    "name", "source", "chains", "loops", "active", "home", "friction", "forces",
+    "name", "source", "chains", "loops", "active", "free", "home", "friction", "forces",
     "gas_springs", "end_stops", "couplings",
     "tip", "payload", "tasks", "control", "hydraulics",
 )  # fmt: skip
@@ -111,6 +111,7 @@ def _read_machine(path: Path) -> MachineSpec:
             tree.check_joint(joint, top.where("active"))
     if not all(joint in tree.joints for joint in active):
         active = Anything()
+    free = _free(top, tree, active)
     where = {key: top.where(key) for key in top} | places(loops, couplings)
     home, home_lines = _home(top, tree)
     where |= {f"home {joint}": place for joint, place in home_lines.items()}
@@ -133,8 +134,21 @@ def _read_machine(path: Path) -> MachineSpec:
         control = _part(_control, control, top, active)
     return MachineSpec(
         name, source, path, chains, tree.tree, loops, active, home, friction, forces,
-        gas_springs, end_stops, tip, tasks, control, hydraulics, couplings, where, payload,
+        gas_springs, end_stops, tip, tasks, control, hydraulics, couplings, where, payload, free,
     )  # fmt: skip
+
+
+def _free(top: Section, tree: TreeBuilder, active: Container[str]) -> tuple[str, ...]:
+    """Independent coordinates that nothing drives."""
+    free: tuple[str, ...] = ()
+    with recoverable(harmless=True):
+        free = top.names("free") if "free" in top else ()
+    for joint in free:
+        with recoverable(harmless=True):
+            tree.check_joint(joint, top.where("free"))
+            if joint in active and not isinstance(active, Anything):
+                raise top.fail("free", f"'{joint}' is active and free, keep one of the two")
+    return free
 
 
 def _part(read: Callable[..., Part], nothing: Any, *arguments: object) -> Part:

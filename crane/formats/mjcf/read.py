@@ -8,7 +8,7 @@ import pinocchio as pin
 
 from crane.common.errors import DescriptionError
 from crane.description.rigid import inertial, placement, vector
-from crane.description.spec import Chain, ForceElement, Friction, MachineSpec, places
+from crane.description.spec import Chain, Drive, ForceElement, Friction, MachineSpec, places
 from crane.description.tree import Inertial, Joint, Limits, Link, Tree, limit
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.mjcf.equality import Frames, read_equality
@@ -95,7 +95,7 @@ class _Reader:
             tip=self._tip(tree),
             couplings=couplings,
             where=places(loops, couplings) | homes,
-            motors=active or (),
+            drives=tuple(Drive(joint, {joint: 1.0}) for joint in active or ()),
         )
 
     def _name(self, kind: str, index: int) -> str:

@@ -114,16 +114,19 @@ def _most(xml: XmlFile, element: etree._Element, key: str, what: str) -> float:
 
 
 def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
-    """Limits of a joint that moves.
+    """Limits of a joint that moves; what the file leaves open is open, and warned of.
+
+    Exporters write `<limit effort velocity/>` without lower and upper, which the specification of
+    URDF reads as a range from 0 to 0, or all four as zeros, forms that nobody has filled in.
 
     Raises:
-        DescriptionError: There are none, or they leave it nothing to move.
+        DescriptionError: They leave it nothing to move.
     """
     what, kind = f"joint '{name}'", joint.get("type")
     element = xml.only(joint, "limit", what)
     if element is None:
         if kind != "continuous":
-            raise xml.fail(joint, f"{what} is {kind} and has no <limit>, add one")
+            _warn_of_no_limits(xml, joint, f"{what} is {kind} and has no <limit>")
         return Limits(where=xml.where(joint))
     found: dict[str, float] = {}
     for key in ("effort", "velocity"):
@@ -132,9 +135,15 @@ def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
     limits = Limits(**found, where=xml.where(element))
     if kind == "continuous":
         return limits
+    if element.get("lower") is None and element.get("upper") is None:
+        _warn_of_no_limits(xml, element, f"the limit of {what} has no lower and no upper")
+        return limits
     lower, upper = (
         xml.number(element, key, f"the limit of {what}", 0.0) for key in ("lower", "upper")
     )
+    if lower == upper == 0 and not any(found.values()):
+        _warn_of_no_limits(xml, element, f"all limits of {what} are 0")
+        return Limits(where=limits.where)
     problem = ""
     if lower > upper:
         problem = f"the limits of {what} are reversed ({lower:g} > {upper:g}), swap them"
@@ -144,6 +153,11 @@ def read_limits(xml: XmlFile, name: str, joint: etree._Element) -> Limits:
     if problem:
         flag(xml.fail(element, problem))
     return dataclasses.replace(limits, lower=limit(lower), upper=limit(upper))
+
+
+def _warn_of_no_limits(xml: XmlFile, element: etree._Element, what: str) -> None:
+    text = f"{xml.where(element)}: {what}, taken as unlimited: give it lower and upper"
+    warnings.warn(text, CraneWarning, stacklevel=4)
 
 
 def read_friction(xml: XmlFile, name: str, joint: etree._Element) -> Friction | None:
