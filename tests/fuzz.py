@@ -34,7 +34,7 @@ FOUR_BAR_MJCF = """<mujoco model="bar">
   <compiler angle="radian"/>
   <default><joint axis="0 1 0" damping="0.01"/></default>
   <worldbody>
-    <body name="crank"><joint name="a" range="-2 2" limited="true"/>
+    <body name="crank"><joint name="a" range="-2 2" limited="true" armature="0.03"/>
       <geom type="capsule" size="0.02" fromto="0 0 0 0 0 0.2" contype="0" conaffinity="0"/>
       <body name="rod" pos="0 0 0.2"><joint name="b" stiffness="1.5"/>
         <inertial pos="0.2 0 0.05" mass="0.7" diaginertia="0.01 0.02 0.025"/>
@@ -45,11 +45,13 @@ FOUR_BAR_MJCF = """<mujoco model="bar">
     <body name="wheel" pos="0.9 0 0"><joint name="d" ref="0.5"/>
       <inertial pos="0.01 0 0" mass="0.3" diaginertia="0.001 0.0012 0.0014"/></body>
   </worldbody>
+  <tendon><fixed name="rope" stiffness="3" damping="0.2">
+    <joint joint="d" coef="-1.5"/></fixed></tendon>
   <equality>
     <connect name="pin" site1="end" site2="top"/>
     <joint name="gear" joint1="d" joint2="c" polycoef="0.1 -2 0 0 0"/>
   </equality>
-  <actuator><motor name="drive" joint="a"/></actuator>
+  <actuator><motor name="drive" joint="a" armature="0.2"/></actuator>
   <keyframe><key name="home" qpos="0.05 0 0 0.3"/></keyframe>
 </mujoco>
 """
@@ -127,6 +129,7 @@ def mutated(data, seed):
 
 IGNORED = {  # what a machine does not have
     ("geom", "contype"), ("geom", "conaffinity"), ("motor", "name"), ("mujoco", "model"),
+    ("key", "name"), ("fixed", "name"),  # the only key is home, and nothing refers to the tendon
     ("robot", "name"),
 }  # fmt: skip
 

@@ -73,6 +73,10 @@ RANGES = (
 
 # What each command needs, and words that it understands; {out} is a name that is free.
 CALLS = {
+    "add cylinder": [
+        "slider.yaml --between base:-0.3,0,-0.1 crank:0.15,0,0 --bore 0.02 --rod 0.01 "
+        "--stroke 0.25 --out {out}.yaml",
+    ],
     "list": [""],
     "info": ["slider.yaml", "rig.yaml"],
     "check": ["slider.yaml", "rig.yaml"],
@@ -214,40 +218,49 @@ def names(folder):
     return found
 
 
+def every_command(group, before=""):
+    """Commands by name, those of groups by both their words."""
+    found = {}
+    for name, command in group.commands.items():
+        inner = getattr(command, "commands", None)
+        found |= every_command(command, f"{name} ") if inner else {before + name: command}
+    return found
+
+
 def draw(seed, known, only=None):
     """A call: its words, one of them at the edge."""
     rng = random.Random(seed)
-    program = get_command(entry.app)
-    missing = program.commands.keys() - CALLS.keys()
+    commands = every_command(get_command(entry.app))
+    missing = commands.keys() - CALLS.keys()
     assert not missing, f"say in CALLS what a call of {missing} needs"
     every = [
         (command, parameter)
-        for command in sorted(program.commands)
-        for parameter in program.commands[command].params
+        for command in sorted(commands)
+        for parameter in commands[command].params
         if only in (None, command) and command != "list"
     ]
     command, parameter = every[seed % len(every)] if only is None else rng.choice(every)
     words = [word.format(out=f"out{seed}") for word in rng.choice(CALLS[command]).split()]
     owner = next((known[word] for word in words if word in known), known["slider.yaml"])
-    options = [other for other in program.commands[command].params if other.opts[0][0] == "-"]
+    options = [other for other in commands[command].params if other.opts[0][0] == "-"]
     for other in rng.sample(options, min(len(options), rng.choice((0, 0, 1, 2)))):
         if other is not parameter and other.opts[0] not in words:
             words += [other.opts[0]]
             words += [] if other.is_flag else [sensible(rng, other, owner)]
     if parameter.opts[0][0] == "-":
         if getattr(parameter, "is_flag", False):
-            return [command, *words, parameter.opts[0]]
+            return [*command.split(), *words, parameter.opts[0]]
         if not parameter.multiple and parameter.opts[0] in words:
             at = words.index(parameter.opts[0])
             del words[at : at + 2]
         for _ in range(rng.choice((1, 1, 1, 2))):
             words += [parameter.opts[0], edge(rng, parameter, owner)]
-        return [command, *words]
-    arguments = [p for p in program.commands[command].params if p.opts[0][0] != "-"]
+        return [*command.split(), *words]
+    arguments = [p for p in commands[command].params if p.opts[0][0] != "-"]
     words[arguments.index(parameter)] = rng.choice((*FILES, *TEXTS, *NUMBERS))
     if rng.random() < 0.05:
         words.insert(0, rng.choice((*TEXTS, *NUMBERS)))
-    return [command, *words]
+    return [*command.split(), *words]
 
 
 def edge(rng, parameter, owner):

@@ -782,7 +782,9 @@ def test_status_and_counts_of_a_clean_machine(tmp_path):
     result = run(copy_machine(MACHINE, tmp_path))
     assert (result.returncode, result.stderr) == (0, "")
     assert result.stdout.startswith("four_bar: 3 joints, 1 loops, 1 degrees of freedom, loops ")
-    assert result.stdout.count("\n") == 1
+    next_line = result.stdout.splitlines()[1]
+    assert next_line == f"next: crane simulate {tmp_path / MACHINE} --task swing --out swing"
+    assert result.stdout.count("\n") == 2
 
 
 def test_status_and_counts_with_warnings(tmp_path):
@@ -790,7 +792,8 @@ def test_status_and_counts_with_warnings(tmp_path):
     swap("coulomb: 0.3", "coulomb: 0.3, coulomb_offset: 0.4").apply(tmp_path)
     result = run(path)
     assert (result.returncode, result.stderr) == (1, "")
-    first, summary, counts = result.stdout.splitlines()
+    first, summary, counts, then = result.stdout.splitlines()
+    assert then.startswith("next: crane simulate ")
     assert first.startswith("four_bar.yaml:20: warning: friction of 'crank' drives the joint")
     assert summary.startswith("four_bar: 3 joints")
     assert counts == "no errors, 1 warning"
@@ -803,10 +806,30 @@ def test_status_and_counts_with_errors(tmp_path):
     swap("  crank: 1.2", "  crank: up").apply(tmp_path)
     result = run(path)
     assert (result.returncode, result.stderr) == (2, "")
-    assert [line.split(": ")[1] for line in result.stdout.splitlines()[:-1]] == [
+    assert [line.split(": ")[1] for line in result.stdout.splitlines()[:-2]] == [
         "error", "error", "warning",
     ]  # fmt: skip
-    assert result.stdout.splitlines()[-1] == "2 errors, 1 warning"
+    counts, then = result.stdout.splitlines()[-2:]
+    assert counts == "2 errors, 1 warning"
+    assert then == f"next: crane check {path} again, once the errors are mended"
+
+
+def test_findings_of_one_kind_are_one_line_on_one_screen(tmp_path):
+    """A robot of 30 joints whose exporter left the limits out and the meshes behind."""
+    parts = ['<robot name="many"><link name="l0"/>']
+    for i in range(30):
+        parts.append(
+            f'<link name="l{i + 1}"><visual><geometry><mesh filename="{i}.stl"/></geometry></visual>'
+            '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+            f'</inertial></link>\n<joint name="j{i}" type="revolute"><parent link="l{i}"/>'
+            f'<child link="l{i + 1}"/><limit effort="1" velocity="1"/></joint>'
+        )
+    (tmp_path / "many.urdf").write_text("\n".join(parts) + "</robot>")
+    report = check(tmp_path / "many.urdf")
+    assert len(report.findings) == 60
+    lines = run(tmp_path / "many.urdf").stdout.splitlines()
+    assert len(lines) == 5
+    assert sum("(30 such, lines " in line for line in lines) == 2
 
 
 def test_folder_and_missing_file_are_no_machines(tmp_path):

@@ -141,8 +141,8 @@ TEXT = [
     case(
         "control characters in a key",
         "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, known: "
-        "active, chains, control, couplings, end_stops, forces, free, friction, gas_springs, "
-        "home, hydraulics, loops, name, payload, source, tasks, tip",
+        "active, chains, control, couplings, drives, end_stops, forces, free, friction, "
+        "gas_springs, home, hydraulics, loops, name, payload, rotor_inertia, source, tasks, tip",
         swap("tip: coupler_pin", '"tip\\n\\e[31m": coupler_pin'),
     ),
     case(
@@ -162,8 +162,8 @@ KEYS = [
     case(
         "unknown key far from all",
         "four_bar.yaml:29: unknown key 'gravity' in the machine file, known: "
-        "active, chains, control, couplings, end_stops, forces, free, friction, gas_springs, "
-        "home, hydraulics, loops, name, payload, source, tasks, tip",
+        "active, chains, control, couplings, drives, end_stops, forces, free, friction, "
+        "gas_springs, home, hydraulics, loops, name, payload, rotor_inertia, source, tasks, tip",
         swap("tip: coupler_pin", "gravity: 9.81"),
     ),
     case(

@@ -139,7 +139,6 @@ def test_equality_constraints(tmp_path):
 BAD_MJCF = [
     ("<connect ", "<connekt ", r"bad.xml:15: MuJoCo refuses it (Schema violation: unrecognized "),
     ('polycoef="0.1 -2 0 0 0"', 'polycoef="0.1 -2 0.5 0 0"', "bad.xml:17: the constraint 'gear'"),
-    ('joint="crank"/></act', 'joint="ball"/></act', "the actuator 'drive' drives a joint with 3"),
     ("<worldbody>", '<include file="parts.xml"/><worldbody>', "bad.xml:2: there is no file 'par"),
     ("<mujoco>", "<mujoko>", "bad.xml:22: not XML, Opening and ending tag mismatch"),
     ("anchor=\"0.5 0 0.1", "anchor=\"0.5 0 0,1", "bad.xml:15: MuJoCo refuses it (bad format in"),
@@ -169,49 +168,69 @@ TENDON = (
     [
         ("<mujoco>", '<mujoco><option gravity="0 0 -1.62"/>', "gravity is 0 0 -1.62 m/s2"),
         (
-            'name="wheel" axis',
-            'name="wheel" armature="0.1" axis',
-            "armature of wheel (0.1 kg m2) is left out, a machine has none",
+            '<connect name="side"',
+            '<connect name="side" active="false"',
+            "constraints that are switched off (side)",
         ),
-        ('<connect name="side"', '<connect name="side" active="false"', "'side' is switched off"),
-        ('name="ball" type', 'name="ball" damping="1" type', "of the ball joint 'ball' are left"),
-        ("<mujoco>", '<mujoco><option density="1"/>', "forces of the air are left out"),
+        (
+            'name="ball" type',
+            'name="ball" damping="1" type',
+            "stiffness of ball and free joints (ball)",
+        ),
+        ("<mujoco>", '<mujoco><option density="1"/>', "; forces of the air"),
         ("<mujoco>", f"<mujoco>{OFF.format('gravity')}", "gravity is 0 0 0 m/s2, a machine's is"),
         (
             "<mujoco>",
             f"<mujoco>{OFF.format('equality')}",
             "constraints off, loops are closed here",
         ),
-        ("<mujoco>", f"<mujoco>{OFF.format('actuation')}", "switches its actuators off, the join"),
+        ("<mujoco>", f"<mujoco>{OFF.format('actuation')}", "switches its actuators off, what th"),
         (
             "<mujoco>",
             f'<mujoco>{OFF.format("frictionloss")}<default><joint frictionloss="1"/></default>',
             "the file switches off what it calls frictionloss, it acts here",
         ),
         (
-            'name="crank" axis',
-            'name="crank" range="-90 90" axis',
-            "the limits of crank stop nothing",
+            'name="ball" type',
+            'name="ball" range="0 90" type',
+            "limits of the angle of ball joints",
         ),
-        ('name="ball" type', 'name="ball" range="0 90" type', "the limit of the angle of ball is"),
         (
             'name="crank" axis',
             'name="crank" actuatorfrcrange="-3 3" axis',
-            "limits of the force of crank (actuatorfrcrange) are left out",
+            "limits of the force on joints (actuatorfrcrange) (crank)",
         ),
         (
             'body name="wheel"',
             'body name="wheel" gravcomp="1"',
-            "gravity compensation is left out",
+            "; gravity compensation",
         ),
         (
             "<worldbody>",
             '<worldbody><body name="hand" mocap="true"><site/></body>',
-            "hand stand still, which a program moves in MuJoCo (mocap)",
+            "what a program moves stands still (mocap) (hand)",
         ),
-        ("<actuator>", f"{TENDON}<actuator>", "stiffness, limits of tendons (rope) are left out"),
+        ("<actuator>", f"{TENDON}<actuator>", "limits of tendons (rope)"),
+        (
+            "<actuator>",
+            TENDON.replace("</fixed>", '<joint joint="wheel" coef="1"/></fixed>') + "<actuator>",
+            "stiffness of tendons (rope); limits of tendons (rope)",
+        ),
+        (
+            "<actuator>",
+            '<worldbody><site name="roof" pos="0 0 9"/></worldbody><tendon><spatial name="cable">'
+            '<site site="top"/><site site="roof"/></spatial></tendon>'
+            '<actuator><motor name="winch" tendon="cable"/>',
+            "actuators by sites, bodies and tendons in space (winch); contacts of 5 geoms",
+        ),
+        ("<actuator>", '<sensor><jointpos joint="crank"/></sensor><actuator>', "; 1 sensor"),
+        (
+            'name="ball" type',
+            'name="ball" armature="0.1" type',
+            "armature of ball joints on moving bodies (ball)",
+        ),
         *(
-            ('<motor name="drive"', f'<{kind} name="drive"', "limits of the actuators drive are")
+            ('<motor name="drive"', f'<{kind} name="drive"', "limits of the actuators (drive)")
             for kind in (
                 'motor gear="2"',
                 'motor ctrlrange="-1 1"',
@@ -225,7 +244,7 @@ TENDON = (
             "<worldbody>",
             '<worldbody><geom name="floor" type="plane" size="1 1 1"/>',
             "contacts of 6 geoms (floor, one of crank, one of rod, one of rocker, one of wheel, "
-            "one of plate) are left out, nothing stops the machine there",
+            "one of plate)",
         ),
     ],
 )
@@ -380,3 +399,122 @@ def test_without_mujoco_the_error_says_how_to_install_it(tmp_path, monkeypatch):
 def test_an_xml_may_be_a_urdf(tmp_path):
     (tmp_path / "bar.xml").write_text((DATA / "four_bar_loop.urdf").read_text())
     assert crane.load(tmp_path / "bar.xml").active == ("crank",)
+
+
+def machine_of(text, folder):
+    """A machine of a file, and the lines that loading it says."""
+    (folder / "some.xml").write_text(text)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CraneWarning)
+        machine = crane.load(folder / "some.xml")
+    return machine, [str(one.message) for one in caught]
+
+
+def test_what_is_left_out_is_told_in_three_lines(tmp_path):
+    """Whatever the file has: what is lost, what is taken otherwise, what MuJoCo says."""
+    pytest.importorskip("mujoco")
+    more = (
+        '<mujoco><option gravity="0 0 -1.62" density="1"/><compiler settotalmass="9"/>'
+        '<visual/><sensor><jointpos joint="wheel"/><gyro site="top"/></sensor>'
+    )
+    text = LOOPED.replace("<mujoco>", more).replace("<motor", '<motor gear="3" ctrlrange="0 1"')
+    text = text.replace('name="ball" type', 'name="ball" damping="1" type')
+    text = text.replace("<actuator>", f"{TENDON}<actuator>").replace("<worldbody>", FLOOR, 1)
+    _, lines = machine_of(text, tmp_path)
+    assert len(lines) == 3 and lines[0].startswith("some.xml: MuJoCo says")
+    assert lines[1].startswith("some.xml: left out of what MuJoCo has: damping, friction and stif")
+    for what in ("limits of tendons (rope)", "contacts of 6 geoms (floor", "the air", "2 sensors"):
+        assert what in lines[1]
+    assert lines[2] == (
+        "some.xml: otherwise than in MuJoCo: gravity is 0 0 -1.62 m/s2, a machine's is 0 0 -9.81; "
+        "drives take forces in N and N m, without gains, gears, dynamics and limits of the "
+        "actuators (drive)"
+    )
+
+
+FLOOR = '<worldbody><geom name="floor" type="plane" size="1 1 1"/>'
+KEYS = """<mujoco><worldbody>
+  <body><joint name="hinge" axis="0 1 0" range="-30 30" limited="true"/><geom size="0.1"/>
+    <body><joint name="ball" type="ball"/><geom size="0.1"/></body></body>
+</worldbody><keyframe>{}</keyframe></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("keys", "hinge"),
+    [
+        ("", 0.0),
+        ('<key qpos="0.2 1 0 0 0"/><key qpos="0.3 1 0 0 0"/>', 0.2),
+        ('<key qpos="0.2 1 0 0 0"/><key name="home" qpos="0.3 1 0 0 0"/>', 0.3),
+        ('<key name="far" qpos="0.9 1 0 0 0"/>', np.deg2rad(30)),
+    ],
+)
+def test_home_is_the_key_of_that_name_or_the_first(keys, hinge, tmp_path):
+    pytest.importorskip("mujoco")
+    turned = keys.replace(" 1 0 0 0", " 0.9 0.1 -0.3 0.2")
+    machine, lines = machine_of(KEYS.format(turned), tmp_path)
+    angles = [machine.home[machine.column(f"ball_r{x}")] for x in "xyz"]
+    found = np.eye(3)
+    for axis, angle in zip(np.eye(3), angles, strict=True):
+        found = found @ pin.AngleAxis(angle, axis).toRotationMatrix()
+    wanted = pin.Quaternion(0.9, 0.1, -0.3, 0.2).normalize().toRotationMatrix()
+    np.testing.assert_allclose(found, wanted if keys else np.eye(3), atol=1e-12)
+    assert machine.home[machine.column("hinge")] == pytest.approx(hinge, abs=1e-12)
+    assert ("home is taken within the limits (hinge 0.9 as 0.523599)" in "".join(lines)) == (
+        "far" in keys
+    )
+
+
+BOUND = """<mujoco><worldbody>
+  <body name="a"><joint name="a" axis="0 0 1"/><geom size="0.1"/><body name="tool" pos="1 0 0"/>
+    <body name="b" pos="0.3 0 0"><joint name="b" axis="0 0 1"/><geom size="0.1"/></body></body>
+</worldbody><equality>{}</equality></mujoco>"""
+
+
+def test_constraints_within_one_body_bind_nothing(tmp_path):
+    pytest.importorskip("mujoco")
+    weld = '<weld name="same" body1="a" body2="tool"/>'
+    machine, lines = machine_of(BOUND.format(weld), tmp_path)
+    assert machine.active == ("a", "b") and not machine.closure.equations.loops
+    assert "constraints within one body (same)" in lines[0]
+
+
+@pytest.mark.parametrize(("scale", "kind"), [(0, "spherical"), (0.01, "fixed")])
+def test_a_weld_that_holds_no_torque_is_a_point(scale, kind, tmp_path):
+    pytest.importorskip("mujoco")
+    weld = f'<weld name="spot" body1="b" body2="world" torquescale="{scale}" anchor="0.3 0.2 0"/>'
+    machine, _ = machine_of(BOUND.format(weld), tmp_path)
+    assert [loop.type for loop in machine.closure.equations.loops] == [kind]
+
+
+MESHED = """<mujoco><compiler meshdir="shapes"/>
+  <asset><mesh name="arm" file="arm.stl"/><mesh file="deep/hull.obj"/>
+    <texture name="t" type="2d" file="t.png"/><material name="m" texture="t"/>
+    <hfield name="h" file="ground.png" size="1 1 1 1"/></asset>
+  <worldbody><geom type="hfield" hfield="h"/><geom type="mesh" mesh="arm"/>
+    <body name="arm"><joint name="arm"/><inertial mass="1.5" pos="0.1 0 0" diaginertia="1 1 1"/>
+      <geom type="mesh" mesh="arm" material="m"/>
+      <body name="tool"><geom type="mesh" mesh="hull" {}/></body></body>
+    <body name="other"><joint name="other"/><geom type="mesh" mesh="hull" mass="0"/>{}</body>
+  </worldbody></mujoco>"""  # fmt: skip
+
+
+def test_meshes_that_are_not_there_are_done_without(tmp_path):
+    """Drawn only, or a part of what has a mass: told. The sole mass of a body: refused."""
+    pytest.importorskip("mujoco")
+    ball = '<geom size="0.1"/>'
+    machine, lines = machine_of(MESHED.format('group="2" density="0"', ball), tmp_path)
+    assert [round(x.mass, 12) for x in machine.model.inertias[1:]][0] == 1.5
+    assert lines[0].startswith(
+        "some.xml: left out of what MuJoCo has: meshes and pictures that are not there (arm.stl, "
+        "hull.obj, ground.png)"
+    )
+    assert not any("without the mass" in line for line in lines)
+    same, lines = machine_of(MESHED.format("", ball), tmp_path)
+    assert same.model.inertias[1] == machine.model.inertias[1]
+    assert "bodies without the mass of their meshes, which are not there (tool)" in lines[1]
+    with pytest.raises(CraneError) as caught:
+        machine_of(MESHED.format("", "").replace('mass="0"', 'mass="2"'), tmp_path)
+    assert str(caught.value) == (
+        "some.xml:9: body 'other' has its mass from 'shapes/deep/hull.obj', which is not there: "
+        "put the file there, or give the body an <inertial>"
+    )

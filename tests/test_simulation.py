@@ -2,6 +2,7 @@ import warnings
 
 import numpy as np
 import pytest
+from broken import DATA
 from scipy.integrate import solve_ivp
 
 import crane
@@ -169,8 +170,36 @@ def test_a_machine_that_leaves_its_branch_ends_in_one_line(forwarder):
 
 def test_leaving_the_limits_without_an_end_stop_is_told(forwarder):
     free = forwarder.replace(end_stops=())
-    with pytest.warns(CraneWarning, match="'X1' leaves its limits 0 to 0.03 at t = "):
-        crane.simulate(free, lambda t, q, v: np.array([0.0, 30.0, 0.0]), duration=0.4)
+    with pytest.warns(CraneWarning) as caught:
+        run = crane.simulate(free, lambda t, q, v: np.array([0.0, 30.0, 0.0]), duration=0.4)
+    (line,) = (str(one.message) for one in caught if "passes its limit" in str(one.message))
+    stroke = run.q[:, 1]
+    first = run.time[np.argmax(stroke > 0.03 + 1e-6)]
+    wanted = f"'X1' passes its limit 0.03 m at t = {first:.4g} s, by up to "
+    assert line.startswith(f"{wanted}{max(stroke) - 0.03:.3g}") and "end stop" in line
+
+
+def test_passive_joints_beyond_their_limits_are_told_in_the_same_line(tmp_path):
+    """The rocker, which may swing freely in the file, is given a range; batches tell it, too."""
+    text = (DATA / "four_bar_loop.urdf").read_text()
+    rocker = '<joint name="rocker" type="continuous">'
+    assert text.count(rocker) == 1
+    ranged = f'{rocker.replace("continuous", "revolute")}<limit lower="-3" upper="-0.1"/>'
+    (tmp_path / "bar.urdf").write_text(text.replace(rocker, ranged))
+    machine = crane.load(tmp_path / "bar.urdf")
+
+    def push(t, q, v):
+        return np.array([20.0])
+
+    with pytest.warns(CraneWarning) as caught:
+        run = crane.simulate(machine, push, duration=0.5)
+    (line,) = (str(one.message) for one in caught if "passes its limit" in str(one.message))
+    past = np.max(run.channels["rocker"]) + 0.1
+    assert "'crank' passes its limit" in line
+    assert f"'rocker' passes its limit -0.1 rad at t = 0 s, by up to {past:.3g} rad" in line
+    assert line.endswith("nothing stops them there, give them end stops")
+    batch = crane.simulate_batch([machine], lambda machine: push, duration=0.5)
+    assert batch.warnings[0].startswith(line)
 
 
 @pytest.mark.parametrize(

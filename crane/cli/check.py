@@ -1,20 +1,40 @@
 """The command that says what is wrong with a machine."""
 
+from typing import Annotated
+
 import typer
 
-from crane.cli.shared import Active, Free, MachineName, app, names
+from crane.cli.shared import Active, Floating, Free, MachineName, app, names
 
 
 @app.command()
-def check(file: MachineName, active: Active = None, free: Free = None) -> None:
+def check(
+    file: MachineName,
+    write_home: Annotated[
+        bool,
+        typer.Option(
+            "--write-home", help="Write the closed home posture into the machine's file."
+        ),
+    ] = False,
+    active: Active = None,
+    free: Free = None,
+    floating: Floating = False,
+) -> None:
     """Say all that is wrong with a machine; exit status 0, 1 with warnings only, 2 with errors."""
     from crane.formats.check import check as check_machine
 
-    report = check_machine(file, names(active), names(free))
-    for finding in report.findings:
-        print(finding)
+    driven = names(active), names(free), floating
+    report = check_machine(file, *driven)
+    if write_home and not report.errors:
+        from crane.formats import write_home as write
+
+        print(f"home written to {write(file, *driven[:2])}")
+        report = check_machine(file, *driven)
+    for line in report.lines:
+        print(line)
     if report.summary is not None:
         print(report.summary)
     if report.findings:
         print(report.counts)
+    print(f"next: {report.next}")
     raise typer.Exit(report.status)

@@ -8,6 +8,7 @@ import typer
 
 from crane.cli.shared import (
     Active,
+    Floating,
     Force,
     Free,
     MachineName,
@@ -52,6 +53,7 @@ def info(
     ] = False,
     active: Active = None,
     free: Free = None,
+    floating: Floating = False,
 ) -> None:
     """Show what a machine consists of."""
     if parameters:
@@ -63,7 +65,7 @@ def info(
         for name, value in values.items():
             print(f"{name:{width}}  {value:.6g}")
         return
-    for line in _describe(load(machine, active=active, free=free)):
+    for line in _describe(load(machine, active=active, free=free, floating=floating)):
         print(line)
 
 

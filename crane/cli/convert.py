@@ -5,7 +5,18 @@ from typing import Annotated
 
 import typer
 
-from crane.cli.shared import Active, Change, Force, Free, Lock, MachineName, _place, app, load
+from crane.cli.shared import (
+    Active,
+    Change,
+    Floating,
+    Force,
+    Free,
+    Lock,
+    MachineName,
+    _place,
+    app,
+    load,
+)
 from crane.common.errors import InputError, known
 
 _FORMATS = ("urdf+", "mjcf", "machine")
@@ -29,6 +40,7 @@ def convert(
     lock: Lock = None,
     active: Active = None,
     free: Free = None,
+    floating: Floating = False,
     force: Force = False,
 ) -> None:
     """Write a machine as one URDF with loops, as MJCF, or as machine file with sub-chains."""
@@ -44,7 +56,7 @@ def convert(
         check_folder(out, force)
     else:
         check_free(out, force)
-    loaded = load(machine, lock, change, active, free)
+    loaded = load(machine, lock, change, active, free, floating)
     if kind == "machine":
         written = write_machine(loaded, out)
     else:

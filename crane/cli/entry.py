@@ -10,6 +10,7 @@ import typer
 
 import crane
 from crane.cli import (  # noqa: F401  register their commands
+    add,
     check,
     circuit,
     commands,

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from crane.cli.shared import Active, Change, Free, Lock, app, load
+from crane.cli.shared import Active, Change, Floating, Free, Lock, app, load
 from crane.common.errors import InputError
 
 
@@ -32,6 +32,7 @@ def live(
     lock: Lock = None,
     active: Active = None,
     free: Free = None,
+    floating: Floating = False,
 ) -> None:
     """Move a machine with sliders in a browser, its loops closed at every move."""
     from crane.cli.runs import machine_of, read_run
@@ -43,7 +44,7 @@ def live(
     if Path(what).is_dir() or Path(what).suffix.lower() in (".csv", ".npz"):
         if run is not None:
             raise InputError(f"'{what}' is a run already, leave --run out")
-        if change or lock or active or free:
+        if change or lock or active or free or floating:
             raise InputError(
                 "--set, --lock, --active and --free are for machines, name the run with --run"
             )
@@ -53,7 +54,7 @@ def live(
     elif machine is not None:
         raise InputError(f"--machine is for runs, and '{what}' is none, leave it out")
     else:
-        loaded = load(what, lock, change, active, free)
+        loaded = load(what, lock, change, active, free, floating)
         if run is not None:
             recording = read_run(run, loaded)
     playback = None if recording is None else Playback(loaded, recording)

@@ -8,6 +8,7 @@ import typer
 from crane.cli.shared import (
     Active,
     Change,
+    Floating,
     Force,
     Free,
     Lock,
@@ -44,6 +45,7 @@ def sketch(
     lock: Lock = None,
     active: Active = None,
     free: Free = None,
+    floating: Floating = False,
     force: Force = False,
 ) -> None:
     """Draw the mechanism of a machine (png, svg or pdf)."""
@@ -51,7 +53,7 @@ def sketch(
     from crane.common.output import file_name
     from crane.view.sketch.draw import sketch as draw
 
-    loaded = load(machine, lock, change, active, free)
+    loaded = load(machine, lock, change, active, free, floating)
     figure = out or Path(file_name(loaded.name) + "_sketch.png")
     check_free(figure, force)
     draw(loaded, figure, posture(loaded, at), plane, com)

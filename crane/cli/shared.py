@@ -67,6 +67,9 @@ Free = Annotated[
     str | None,
     typer.Option(metavar="JOINTS", help="Coordinates that nothing drives, as swing,sway."),
 ]
+Floating = Annotated[
+    bool, typer.Option("--floating", help="Let the root float: a vehicle, a humanoid.")
+]
 Trust = Annotated[
     bool,
     typer.Option(
@@ -107,12 +110,14 @@ def load(
     change: list[str] | None = None,
     active: str | None = None,
     free: str | None = None,
+    floating: bool = False,
 ) -> "Machine":
     """The machine of that name or path with what options say of it."""
     from crane.formats import load as load_machine
 
     changes = by_joint("--set", change, "NAME=VALUE, as in payload.mass=200")
-    return load_machine(name, changes, by_joint("--lock", lock), names(active), names(free))
+    held = by_joint("--lock", lock)
+    return load_machine(name, changes, held, names(active), names(free), floating)
 
 
 def names(words: str | None) -> list[str] | None:

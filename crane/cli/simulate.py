@@ -8,6 +8,7 @@ import typer
 from crane.cli.shared import (
     Active,
     Change,
+    Floating,
     Force,
     Free,
     Lock,
@@ -51,6 +52,7 @@ def simulate(
     lock: Lock = None,
     active: Active = None,
     free: Free = None,
+    floating: Floating = False,
     force: Force = False,
 ) -> None:
     """Simulate a task, measured inputs, or the motion from the home posture on its own."""
@@ -58,7 +60,7 @@ def simulate(
     from crane.simulation import simulate as run
 
     check_folder(out, force)
-    loaded = load(machine, lock, change, active, free)
+    loaded = load(machine, lock, change, active, free, floating)
     if inputs is not None:
         named = {"--task": task, "--controller": controller}
         given = [option for option, value in named.items() if value is not None]

@@ -5,7 +5,19 @@ from typing import Annotated
 
 import typer
 
-from crane.cli.shared import Active, Change, Force, Free, Lock, MachineName, Out, app, load, status
+from crane.cli.shared import (
+    Active,
+    Change,
+    Floating,
+    Force,
+    Free,
+    Lock,
+    MachineName,
+    Out,
+    app,
+    load,
+    status,
+)
 
 
 @app.command()
@@ -21,6 +33,7 @@ def workspace(
     lock: Lock = None,
     active: Active = None,
     free: Free = None,
+    floating: Floating = False,
     force: Force = False,
 ) -> None:
     """Map what the tip reaches, which strokes close, and where they are singular."""
@@ -28,7 +41,7 @@ def workspace(
     from crane.motion.workspaces import workspace as explore
 
     check_folder(out, force)
-    loaded = load(machine, lock, change, active, free)
+    loaded = load(machine, lock, change, active, free, floating)
     with status("exploring"):
         space = explore(loaded, samples, frame, seed)
     with status("drawing"):

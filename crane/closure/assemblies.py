@@ -12,9 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
+from crane.closure.anywhere import Search
 from crane.closure.choice import slides, units
 from crane.closure.closure import Closure
+from crane.closure.exactness import DIGITS
 from crane.closure.structure import Indices
 from crane.common.samples import Array, solve
 
@@ -74,6 +78,14 @@ def ambiguities(closure: Closure, guess: Array, named: Indices, most: int) -> li
         others = sorted(search.others(index, most), key=lambda q: search.away(q, block))
         told = (one for q in others if (one := search.judged(q, index)) is not None)
         found += itertools.islice(told, 1)
+    for columns in search.groups() if closure.sought is not None else ():
+        together = (
+            one
+            for q in search.together(columns, most)
+            if (one := search.assessed(q, search.rows_of(columns))) is not None
+            and not any(search.looks_the_same(q, other.q) for other in found)
+        )
+        found += itertools.islice(together, 1)
     return found
 
 
@@ -104,7 +116,8 @@ class _Search:
 
     def within_limits(self, q: Array, columns: Indices) -> bool:
         """Whether some joints are."""
-        lower, upper = self.model.lowerPositionLimit, self.model.upperPositionLimit
+        coordinates = self.equations.coordinates
+        lower, upper = coordinates.lower, coordinates.upper
         return bool(((q >= lower - 1e-9) & (q <= upper + 1e-9))[columns].all())
 
     def others(self, index: int, most: int) -> list[Array]:
@@ -122,6 +135,29 @@ class _Search:
             if pair and self._sign(q, rows, columns) != sign:
                 break  # mirror images, of which there are two
         return found[1:]
+
+    def groups(self) -> list[Indices]:
+        """Columns of passive joints that loops tie together, directly or through others."""
+        passive = self.closure.passive
+        tied = np.vstack([self.equations.sign, self.equations.factors])[:, passive] != 0
+        count, label = connected_components(csr_array(tied.T.astype(float) @ tied))
+        groups = [passive[label == group] for group in range(count)]
+        return [columns for columns in groups if len(self.rows_of(columns))]
+
+    def rows_of(self, columns: Indices) -> Indices:
+        """Independent rows of the loops that some joints are in."""
+        tied = (np.vstack([self.equations.sign, self.equations.factors])[:, columns] != 0).any(1)
+        rows = self.closure.structure.rows
+        return rows[tied[self.equations.loop_of_row[rows]]]
+
+    def together(self, columns: Indices, most: int) -> list[Array]:
+        """Closed postures with all joints but some as at home, the nearest to the guess first."""
+        guess = self.home.copy()
+        guess[columns] = self.guess[columns]
+        search = Search(self.equations, guess, self.named, most)
+        ways = search.postures(columns, np.zeros(0, dtype=np.intp), DIGITS)
+        closed = (self._solved(q, self.rows_of(columns), columns) for q in ways)
+        return [q for q in closed if q is not None]
 
     def _block(self, index: int) -> tuple[Indices, Indices]:
         rows, columns = self.blocks[index]
@@ -153,7 +189,8 @@ class _Search:
             phi = (1 + phi) ** (1 / (size + 1))
         share = np.outer(np.arange(count), phi ** -np.arange(1.0, size + 1)) + 0.5
         share = np.remainder(share, 1.0) - 0.5
-        lower, upper = self.model.lowerPositionLimit, self.model.upperPositionLimit
+        coordinates = self.equations.coordinates
+        lower, upper = coordinates.lower, coordinates.upper
         span = np.where(self._turns, 2 * np.pi, 2 * self._unit)
         middle = self.guess.copy()
         limited = ~self._turns & np.isfinite(lower) & np.isfinite(upper)
@@ -222,13 +259,17 @@ class _Search:
             if not ways:
                 return None
             q = min(ways, key=lambda way: self.away(way, columns))
+        return self.assessed(q, self._block(index)[0])
+
+    def assessed(self, q: Array, rows: Indices) -> Assembly | None:
+        """Likewise of a whole posture, in which some rows are solved another way."""
         passive = self.closure.passive
-        if np.abs(self.equations.evaluate(q)[0]).max() > _CLOSED:
+        if np.abs(self.equations.evaluate(q)[0]).max() > self.closure.structure.surplus.allowed:
             return None
         if self.equations.turned_over(q) is not None or not self.within_limits(q, passive):
             return None
         columns = np.flatnonzero(self.difference(q, self.home) > _SAME)
-        if not len(columns) or self._looks_the_same(q):
+        if not len(columns) or self.looks_the_same(q, self.home):
             return None
         said = self.said(columns)
         away, home_away = self.away(q, said), self.away(self.home, said)
@@ -237,7 +278,6 @@ class _Search:
         ratio = _RATIO if told else _LOOSE
         if away > ratio * home_away and not outside:
             return None
-        rows, _ = self._block(index)
         loops = sorted(set(self.equations.loop_of_row[rows].tolist()))
         names = tuple(self.equations.names[i] for i in loops)
         off, home_off = self._farthest(q, said), self._farthest(self.home, said)
@@ -248,11 +288,13 @@ class _Search:
         column = int(columns[apart.argmax()])
         return column, float(apart.max() * self._unit[column])
 
-    def _looks_the_same(self, q: Array) -> bool:
-        """Whether all that has a mass is where it is at home: other angles of a ball, say."""
+    def looks_the_same(self, *postures: Array) -> bool:
+        """Whether all that has a mass is in one place in both: other angles of a ball, say."""
         data, places = self.equations.data, []
-        for posture in (q, self.home):
-            pin.forwardKinematics(self.model, data, posture)
+        for posture in postures:
+            pin.forwardKinematics(
+                self.model, data, self.equations.coordinates.configuration(posture)
+            )
             places.append([
                 place.homogeneous
                 for place, inertia in zip(data.oMi, self.model.inertias, strict=True)

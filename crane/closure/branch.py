@@ -227,7 +227,7 @@ class Branch:
         if len(self._structure.redundant):
             phi, _ = self._equations.evaluate(posture.q)
             extra = np.abs(phi[self._structure.redundant])
-            if extra.max() > 1e3 * _TOLERANCE * self.size:
+            if extra.max() > max(1e3 * _TOLERANCE * self.size, self._structure.surplus.allowed):
                 row = self._structure.redundant[extra.argmax()]
                 loop = self._equations.names[self._equations.loop_of_row[row]]
                 raise OutOfReachError(

@@ -19,6 +19,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
+from crane.closure.coordinates import Coordinates
 from crane.common.samples import Array
 
 Indices = NDArray[np.intp]
@@ -46,17 +47,18 @@ class Choice:
 
 def slides(model: pin.Model) -> NDArray[np.bool_]:
     """(nv,) whether a coordinate is a length."""
-    kinds = [joint.shortname() for joint in list(model.joints)[1:]]
-    return np.array([kind.startswith("JointModelP") for kind in kinds], dtype=bool)
+    return Coordinates(model).slides
+
+
+def size(model: pin.Model) -> float:
+    """The size of a machine: the largest distance between neighbouring joints [m]."""
+    places = [np.abs(place.translation).max() for place in list(model.jointPlacements)[1:]]
+    return float(max(places, default=0.0)) or 1.0
 
 
 def units(model: pin.Model) -> Array:
-    """(nv,) units of coordinates that compare: 1 rad, and the size of the machine.
-
-    The size is the largest distance between neighbouring joints.
-    """
-    places = [np.abs(place.translation).max() for place in list(model.jointPlacements)[1:]]
-    return np.where(slides(model), max(places, default=0.0) or 1.0, 1.0)
+    """(nv,) units of coordinates that compare: 1 rad, and the size of the machine."""
+    return np.where(slides(model), size(model), 1.0)
 
 
 def scales(model: pin.Model) -> Array:
@@ -65,7 +67,8 @@ def scales(model: pin.Model) -> Array:
     Those also stand for the ranges of joints without limits.
     """
     most = units(model)
-    span = model.upperPositionLimit - model.lowerPositionLimit
+    coordinates = Coordinates(model)
+    span = coordinates.upper - coordinates.lower
     return np.where(span > 0, np.minimum(span, most), most)
 
 
@@ -164,7 +167,8 @@ def proposals(
     """
     scale = scales(model)
     basis = motions(jacobian, scale, DEAD)
-    names = list(model.names)[1:]
+    coordinates = Coordinates(model)
+    names = coordinates.names
     columns = range(model.nv) if among is None else among
     free = [i for i in columns if i not in followers]
     effort = np.asarray(model.effortLimit)

@@ -1,7 +1,7 @@
 """Closing the loops: q = f(q_A), v = gamma v_A, a = gamma a_A + drift."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,8 @@ from crane.closure.branch import Branch
 from crane.closure.choice import Choice, condition, proposals, scales
 from crane.closure.compiled import Cursor, FastClosure
 from crane.closure.equations import LoopEquations
-from crane.closure.structure import Structure, analyse
+from crane.closure.home import Sought, settle
+from crane.closure.structure import Structure
 from crane.codegen import TooLongError, carefully
 from crane.common.errors import BranchEdgeError, InputError
 from crane.common.samples import Array, as_samples, per_sample, solve
@@ -38,19 +39,25 @@ class Closure:
         active: Names of the active joints, in the order of q_A.
         guess: (nq,) active coordinates of the home posture, and a first guess of the others.
         couplings: Linear constraints of joints.
+        said: Names of joints whose home is said to be that of the guess; where the loops do not
+            close from the guess, the others are sought. None: all are said, and none is sought.
+        loose: Names of active joints that nothing holds at the guess while the others are sought.
 
     Raises:
-        MechanismError: The loops cannot be closed from the guess, or the active joints do not
-            fit the degrees of freedom.
+        MechanismError: The loops cannot be closed, or the active joints do not fit the degrees of
+            freedom.
 
     Attributes:
         home: (nq,) the closed home posture.
         active: Columns of the active joints.
         passive: Columns of the passive joints.
         structure: Independent equations and the order in which they solve.
+        sought: How home was found where it did not follow from the guess, else None.
     """
 
     home: Array
+    structure: Structure
+    sought: Sought | None
 
     def __init__(
         self,
@@ -59,17 +66,30 @@ class Closure:
         active: Sequence[str],
         guess: Array,
         couplings: Sequence[Coupling] = (),
+        said: Collection[str] | None = None,
+        loose: Collection[str] = (),
     ):
         self.model = model
         self.equations = LoopEquations(model, loops, couplings)
         self._local = threading.local()
         self.active_names = tuple(active)
-        ids = [model.getJointId(name) for name in active]
-        self.active = np.array([model.joints[i].idx_v for i in ids], dtype=np.intp)
+        coordinates = self.equations.coordinates
+        self.active = np.array([coordinates.column(name) for name in active], dtype=np.intp)
         self.passive = np.setdiff1d(np.arange(model.nv), self.active)
-        self._names = tuple(model.names)[1:]
-        self.structure: Structure = analyse(self.equations, self.active, self.passive, guess)
-        span = model.upperPositionLimit[self.active] - model.lowerPositionLimit[self.active]
+        self._names = coordinates.names
+
+        def columns(names: Collection[str]) -> list[int]:
+            return [coordinates.column(name) for name in names]
+
+        self.structure, self.sought = settle(
+            self.equations,
+            self.active,
+            self.passive,
+            guess,
+            None if said is None else columns(said),
+            columns(loose),
+        )
+        span = (coordinates.upper - coordinates.lower)[self.active]
         self._span = np.where(np.isfinite(span) & (span > 0), span, 1.0)
         self._branch = Branch(
             self.equations, self.structure, self._names, self.active, self.passive, self._span
@@ -87,6 +107,8 @@ class Closure:
 
     @cached_property
     def _made(self) -> FastClosure | None:
+        if self.equations.coordinates.floating:
+            return None
         branch = self._branch
         try:
             return FastClosure(
@@ -152,12 +174,12 @@ class Closure:
             raise InputError("q_a is an empty stack, give at least one sample")
         near = None
         if guess is not None:
-            near = as_samples(guess, self.model.nq, "guess", self._names)
+            near = as_samples(guess, self.model.nv, "guess", self._names)
             if near.ndim != 1:
-                raise InputError(f"guess has the shape {near.shape}, give one ({self.model.nq},)")
+                raise InputError(f"guess has the shape {near.shape}, give one ({self.model.nv},)")
             if self.compiled and not self.fast.start_near(self._cursor, near):
                 self._cursor.start(self._branch.posture(near))
-        out = np.empty((*targets.shape[:-1], self.model.nq))
+        out = np.empty((*targets.shape[:-1], self.model.nv))
         if not self.compiled:
             known = self._branch.home if near is None else self._branch.posture(near)
             for i, target in enumerate(np.atleast_2d(targets)):
@@ -216,7 +238,7 @@ class Closure:
         home = self._branch.home
         way = home.q_a + np.linspace(0, 1, _STEPS + 1)[1:, None] * (target - home.q_a)
         way[-1] = target
-        out = np.empty((_STEPS, self.model.nq))
+        out = np.empty((_STEPS, self.model.nv))
         for some in (way[-1:], way[1::2], way):
             cursor.start(home)
             if self.fast.follow(cursor, some, out) == len(some):
@@ -238,7 +260,7 @@ class Closure:
             InputError: Wrong shape or not finite.
             BranchEdgeError: The passive joints are not determined there.
         """
-        q = as_samples(q, self.model.nq, "q", self._names)
+        q = as_samples(q, self.model.nv, "q", self._names)
         if not self.compiled:
             return per_sample(self._gamma, q)
         if q.size == 0:
@@ -270,7 +292,7 @@ class Closure:
             InputError: Wrong shape or not finite.
             BranchEdgeError: The passive joints are not determined there.
         """
-        q = as_samples(q, self.model.nq, "q", self._names)
+        q = as_samples(q, self.model.nv, "q", self._names)
         v = as_samples(v, self.model.nv, "v", self._names)
         return per_sample(self._drift, q, v)
 
@@ -283,7 +305,7 @@ class Closure:
         Returns:
             () or (N,) [m] for translations, [rad] for small rotations.
         """
-        q = as_samples(q, self.model.nq, "q", self._names)
+        q = as_samples(q, self.model.nv, "q", self._names)
         return per_sample(lambda one: np.abs(self.equations.evaluate(one)[0]).max(initial=0.0), q)
 
     def condition(self, q: ArrayLike) -> Array:
@@ -303,7 +325,8 @@ class Closure:
     def proposals(self) -> list[Choice]:
         """Choices of active joints for this machine at home, see `crane.closure.choice`."""
         followers = np.flatnonzero((self.equations.factors != 0).any(axis=0)).tolist()
-        return proposals(self.model, self.equations.evaluate(self.home)[1], followers)
+        rows = self.structure.rows  # the others contradict them by the digits of a file
+        return proposals(self.model, self.equations.evaluate(self.home)[1][rows], followers)
 
     def motion(self, q: Array, v_a: Array) -> tuple[Array, Array, Array]:
         """gamma, v = gamma v_A and drift of one sample, at less cost than one by one.

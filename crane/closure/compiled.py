@@ -15,7 +15,6 @@ from crane.common.samples import Array
 
 _STEEP = 1e3  # an entry of gamma above this is looked at closely by `Branch`
 _NEAR = 1e-6  # residual of a guess that is as good as closed
-_SURPLUS = 1e-9  # residual of redundant equations, likewise
 _EVALUATIONS = 8  # of Newton's method, which doubles its digits
 
 
@@ -86,7 +85,7 @@ class FastClosure:
         self.geometry = geometry_of(equations)
         self._equations, self._structure = equations, structure
         self._active, self._passive = active, passive
-        nq, n, rows = equations.model.nq, len(active), len(passive)
+        nq, n, rows = equations.model.nv, len(active), len(passive)
         self._nq, self._n = nq, n
         signs = self._signs(home)
         key = self._key(signs)
@@ -117,6 +116,7 @@ class FastClosure:
             geometry.frame_bodies,
             folded(geometry.numbers),
             tuple(loop.type for loop in equations.loops),
+            structure.surplus.allowed,
             tuple((tuple(rows), tuple(columns)) for rows, columns in structure.blocks),
             *(np.asarray(array).tobytes() for array in arrays),
         )
@@ -194,7 +194,7 @@ class FastClosure:
         steps = loops.correction
         corrected = [x + steps.get(i, 0.0) for i, x in enumerate(q, start=1)]
         rows = [entry for joint in loops.passive_joints for entry in loops.gamma[joint]]
-        worst = maximum(largest(rows) - _STEEP, loops.surplus - _SURPLUS)
+        worst = maximum(largest(rows) - _STEEP, loops.surplus - self._structure.surplus.allowed)
         for sign, determinant in zip(signs, loops.determinants, strict=True):
             worst = maximum(worst, -(float(sign) * determinant))
         for alignment in loops.alignments:

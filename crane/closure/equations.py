@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
+from crane.closure.coordinates import Coordinates
 from crane.common.errors import MechanismError
 from crane.common.samples import Array
 from crane.description import LOOP_TYPES, Coupling, LoopSpec
@@ -75,6 +76,7 @@ class LoopEquations:
         couplings: Linear constraints of joints.
 
     Attributes:
+        coordinates: Of the tree.
         names: Of what the equations belong to: loops, then couplings.
         loop_of_row: (m,) index in `names` of every equation.
         is_translation: (m,) whether it is about a length.
@@ -84,6 +86,7 @@ class LoopEquations:
         self, model: pin.Model, loops: Sequence[LoopSpec], couplings: Sequence[Coupling] = ()
     ):
         self.model = model
+        self.coordinates = Coordinates(model)
         self._local = threading.local()  # a machine may be used by several threads
         self.loops = tuple(loops)
         self.frames: list[tuple[int, pin.SE3]] = []  # (joint, placement), two per loop
@@ -114,9 +117,9 @@ class LoopEquations:
         lengths = []
         for row, coupling in zip(self.factors, self.couplings, strict=True):
             for name, factor in coupling.factors.items():
-                joint = model.joints[model.getJointId(name)]
-                row[joint.idx_v] = factor
-            lengths.append(joint.shortname().startswith("JointModelP"))
+                column = self.coordinates.column(name)
+                row[column] = factor
+            lengths.append(bool(self.coordinates.slides[column]))
         self.names = (*(loop.name for loop in loops), *(item.name for item in couplings))
         own = len(self.loops) + np.arange(len(self.couplings), dtype=np.intp)
         self.loop_of_row = np.concatenate([self._loop, own])
@@ -164,7 +167,8 @@ class LoopEquations:
         coupled = self.factors @ q - self.offsets
         if not self.loops:
             return coupled, self.factors.copy()
-        jacobian = _columns(pin.computeJointJacobians(self.model, self.data, q))
+        at = self.coordinates.configuration(q)
+        jacobian = _columns(pin.computeJointJacobians(self.model, self.data, at))
         self._local.last = a, b, p1, p2 = self._geometry()
         phi = np.einsum("ij,ij->i", a, np.where(self._moves[:, None], p2 - p1, b))
         slopes = self._row_sign * (self._wrenches(a, b, p2) @ jacobian)
@@ -176,7 +180,7 @@ class LoopEquations:
         """Name of a loop whose axes are antiparallel, which also solves its equations."""
         if not self.loops:
             return None
-        pin.forwardKinematics(self.model, self.data, q)
+        pin.forwardKinematics(self.model, self.data, self.coordinates.configuration(q))
         for index, loop in enumerate(self.loops):
             checked = aligned_axes(loop.type)
             if not checked:
@@ -202,7 +206,8 @@ class LoopEquations:
         if not self.loops:
             return np.zeros(len(self.couplings))
         a, b, _, p2 = self._local.last
-        rate = _columns(pin.computeJointJacobiansTimeVariation(self.model, self.data, q, v))
+        at = self.coordinates.configuration(q)
+        rate = _columns(pin.computeJointJacobiansTimeVariation(self.model, self.data, at, v))
         velocity = np.array([self.data.ov[joint].vector for joint, _ in self.frames])
         one = 2 * self._loop
         v2, w1, w2 = velocity[one + 1, :3], velocity[one, 3:], velocity[one + 1, 3:]

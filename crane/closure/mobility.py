@@ -6,12 +6,12 @@ space of J promises motions that are none: a small step h along them, closed wit
 leaves the surplus rows open by c h^2.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from scipy.linalg import qr
 
-from crane.closure.choice import Indices, motions, scales
+from crane.closure.choice import Indices, motions, scales, slides, units
 from crane.closure.equations import LoopEquations
 from crane.common.samples import Array, solve
 
@@ -19,6 +19,7 @@ _STEP = 0.02  # of a joint's scale
 _MOVED = 0.05  # share of a step that a finite motion keeps at least
 _OPEN = 1e-9  # residual that counts as open
 _DIRECTIONS = 3  # drawn, beside those of single joints
+_WALK = 16  # steps to the end of the range
 
 
 def locked_up(
@@ -76,30 +77,71 @@ def locked_up(
 def surplus_open(
     equations: LoopEquations, home: Array, rows: Indices, surplus: Indices, active: Indices
 ) -> tuple[int, float] | None:
-    """A surplus equation that does not hold beside home, and by how much it is open [m], [rad].
+    """The surplus equation that holds least beside home, and how far it is open [m], [rad].
 
     Active joints step one by one, and all together in drawn directions; the others follow by the
-    independent rows.
+    independent rows. What is open far enough to tell ends the search.
     """
     if not len(surplus) or not len(active):
         return None
     scale = scales(equations.model)
-    held = np.zeros((equations.model.nv, len(active)))
-    held[active, np.arange(len(active))] = 1.0
-    ways = [*np.eye(len(active))]
-    if len(active) > 1:
-        ways += [*np.random.default_rng(2).uniform(-1, 1, (_DIRECTIONS, len(active)))]
-    for way in ways:
+    worst = int(surplus[0]), 0.0
+    for held, way in _ways(equations.model.nv, active):
         # the smaller step where the branch ends within the larger one
         starts = [home + held @ (size * scale[active] * way) for size in (_STEP, _STEP / 16)]
         closed = (_closed(equations, q, rows, held) for q in starts)
         moved = next((q for q in closed if q is not None), None)
-        if moved is None:
-            continue
-        phi = np.abs(equations.evaluate(moved)[0][surplus])
-        if phi.max() > _OPEN:
-            return int(surplus[phi.argmax()]), float(phi.max())
-    return None
+        if moved is not None:
+            phi = np.abs(equations.evaluate(moved)[0][surplus])
+            worst = max(worst, (int(surplus[phi.argmax()]), float(phi.max())), key=lambda x: x[1])
+        if worst[1] > _OPEN:
+            break
+    return worst
+
+
+def surplus_along(
+    equations: LoopEquations, home: Array, rows: Indices, surplus: Indices, active: Indices
+) -> tuple[Array, bool]:
+    """How far each surplus equation opens all along the motions from home [m], [rad].
+
+    Ways lead to the limits, at least 1 rad or the machine's size far; half a turn where there are
+    none. They end where the branch does.
+
+    Returns:
+        (k,), and whether each active joint moves at all.
+    """
+    model = equations.model
+    unit, turns = units(model)[active], ~slides(model)[active]
+    room = [
+        np.abs(limit[active] - home[active])
+        for limit in (equations.coordinates.lower, equations.coordinates.upper)
+    ]
+    reach = [
+        np.where(np.isfinite(x), np.maximum(x, unit), np.where(turns, np.pi, unit)) for x in room
+    ]
+    widest = np.abs(equations.evaluate(home)[0][surplus])
+    moves = np.zeros(len(active), dtype=bool)
+    for held, way in _ways(model.nv, active):
+        for side, far in zip((-1.0, 1.0), reach, strict=True):
+            q = home
+            for _ in range(_WALK):
+                near = _closed(equations, q + held @ (side * way * far / _WALK), rows, held)
+                if near is None:
+                    break
+                q = near
+                moves |= way != 0
+                widest = np.maximum(widest, np.abs(equations.evaluate(q)[0][surplus]))
+    return widest, bool(moves.all())
+
+
+def _ways(nv: int, active: Indices) -> Iterator[tuple[Array, Array]]:
+    """Columns (nv, n) of the active joints and directions (n,): one by one, then some drawn."""
+    held = np.zeros((nv, len(active)))
+    held[active, np.arange(len(active))] = 1.0
+    ways = [*np.eye(len(active))]
+    if len(active) > 1:
+        ways += [*np.random.default_rng(2).uniform(-1, 1, (_DIRECTIONS, len(active)))]
+    return ((held, way) for way in ways)
 
 
 def _closed(equations: LoopEquations, q: Array, rows: Indices, held: Array) -> Array | None:

@@ -5,12 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr
 
 from crane.closure.blocks import Block, block_triangular
-from crane.closure.choice import proposals, words
+from crane.closure.choice import Choice, proposals, words
 from crane.closure.equations import LoopEquations
-from crane.closure.mobility import locked_up, surplus_open
+from crane.closure.exactness import Exact, Surplus
 from crane.common.errors import MechanismError
 from crane.common.samples import Array
 
@@ -18,7 +17,43 @@ Indices = NDArray[np.intp]
 
 _RANK = 1e-8  # relative size of a pivot that still counts
 _SINGULAR = 1e-5  # the same at home, which closing finds to the root of rounding if singular
-_CLOSED = 1e-9
+_NOTHING = 1e-9  # slope of an equation that no joint changes
+
+
+class HomeError(MechanismError):
+    """The loops do not close from the guess, or only to a posture that cannot be home.
+
+    Args:
+        message: See `CraneError`.
+        about: See `MechanismError`.
+        reason: In a few words why.
+    """
+
+    def __init__(self, message: str, about: str, reason: str):
+        super().__init__(message, about)
+        self.reason = reason
+
+
+class ActiveError(MechanismError):
+    """Too many or too few active joints.
+
+    Args:
+        message: See `CraneError`.
+        posture: (nq,) where the loops close; None where they leave no freedom.
+        jacobian: (m, nv) of all equations there.
+        choices: Active joints that would do.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        posture: Array | None,
+        jacobian: Array,
+        choices: Sequence[Choice] = (),
+    ):
+        super().__init__(message, "active", posture)
+        self.jacobian = jacobian
+        self.choices = tuple(choices)
 
 
 @dataclass(frozen=True)
@@ -30,12 +65,14 @@ class Structure:
         rows: (m,) independent equations, as many as there are passive joints.
         redundant: The other equations, which follow from them.
         blocks: (rows of `rows`, columns of the passive joints) in the order of solution.
+        surplus: How far the other equations may be open, see `crane.closure.exactness`.
     """
 
     home: Array
     rows: Indices
     redundant: Indices
     blocks: tuple[Block, ...]
+    surplus: Surplus = Surplus()
 
     def by_size(self) -> list[tuple[Indices, Indices]]:
         """Blocks of equal size k stacked: rows (b, k, 1) and columns (b, 1, k)."""
@@ -51,141 +88,135 @@ class Structure:
         return out
 
 
-def least_squares_step(jacobian: Array, phi: Array) -> Array:
-    """A damped Gauss-Newton step towards phi = 0, at most 0.3 [m], [rad] in any joint."""
-    damping = 1e-12 + 1e-3 * float(phi @ phi)
-    gram = jacobian.T @ jacobian
-    step = np.linalg.solve(gram + damping * np.eye(len(gram)), -jacobian.T @ phi)
-    largest = float(np.abs(step).max(initial=0.0))
-    return np.asarray(step * min(1.0, 0.3 / largest) if largest > 0 else step, dtype=np.float64)
-
-
-def _close(equations: LoopEquations, q: Array, free: Indices) -> Array:
-    """Close all loops by moving the free joints; the residual tells whether that worked."""
-    q = q.copy()
-    for _ in range(200):
-        phi, jacobian = equations.evaluate(q)
-        if np.abs(phi).max(initial=0.0) < 1e-13:
-            break
-        q[free] += least_squares_step(jacobian[:, free], phi)
-    return q
-
-
 def analyse(
-    equations: LoopEquations, active: Indices, passive: Indices, guess: Array
+    equations: LoopEquations,
+    active: Indices,
+    passive: Indices,
+    guess: Array,
+    exact: Exact,
 ) -> Structure:
     """Close the machine at home and find out what its equations determine.
 
-    Independent equations are chosen at the home posture by a QR factorisation with column
-    pivoting of J_P^T; ranks are confirmed at other closed postures nearby, and that surplus
-    equations hold there.
+    Independent equations are chosen at the home posture; ranks are confirmed at other closed
+    postures nearby, and that surplus equations hold there.
 
     Args:
         equations: All loop equations.
         active: Columns of the active joints, none to be told which might be.
         passive: Columns of the others.
         guess: (nq,) active coordinates of the home posture and a guess of the others.
+        exact: How exactly the equations hold.
 
     Raises:
         MechanismError: Not closable from the guess or only there, wrong number of active joints,
             or active joints that cannot drive the others.
     """
     model = equations.model
-    names = list(model.names)[1:]
+    names = equations.coordinates.names
     everything = np.arange(model.nv)
     followers = [int(i) for i in range(model.nv) if (equations.factors[:, i] != 0).any()]
     if not equations.names:
+        none = np.zeros((0, model.nv))
         if not len(active):
-            raise MechanismError(_unnamed(model.nv) + f"try [{', '.join(names)}]", "active", guess)
+            raise ActiveError(_unnamed(model.nv) + f"try [{', '.join(names)}]", guess, none)
         if len(passive):
-            raise MechanismError(_miscounted(names, active, passive, model.nv), "active", guess)
-        none = np.zeros(0, dtype=np.intp)
-        return Structure(guess.copy(), none, none, ())
-    somewhere = _close(equations, guess, everything)
+            raise ActiveError(_miscounted(names, active, passive, model.nv), guess, none)
+        rows = np.zeros(0, dtype=np.intp)
+        return Structure(guess.copy(), rows, rows, ())
+    somewhere = exact.close(guess, everything)
     given = f" ({_at(names, active, guess)})" if len(active) else ""
     _check_closed(
-        equations, somewhere, f"from the home guess{given}", "correct the frames or the guess"
+        equations,
+        exact,
+        somewhere,
+        f"from the home guess{given}",
+        "correct the frames or the guess",
     )
     random = np.random.default_rng(0)
     postures = [somewhere]
     for _ in range(4):
         moved = somewhere + random.uniform(-0.02, 0.02, model.nv)
-        near = _close(equations, moved, everything)
-        if np.abs(equations.evaluate(near)[0]).max() < _CLOSED:
+        near = exact.close(moved, everything)
+        if exact.is_closed(near):
             postures.append(near)
-    jacobians = [equations.evaluate(q)[1] for q in postures]
+    jacobians = [exact.jacobian(q) for q in postures]
     for index, name in enumerate(equations.names):
         rows = equations.loop_of_row == index
-        if max(np.abs(jacobian[rows]).max() for jacobian in jacobians) < _CLOSED:
+        if max(np.abs(jacobian[rows]).max() for jacobian in jacobians) < _NOTHING:
             raise MechanismError(
                 f"loop '{name}' locks nothing that the joints do not lock already: remove it",
                 f"loop {name}",
             )
     rank = max(_rank(jacobian) for jacobian in jacobians)
     freedom = model.nv - rank
-    lock = locked_up(
-        equations, somewhere, freedom, _SINGULAR, lambda q: _close(equations, q, everything)
-    )
+    lock = exact.locked_up(somewhere, freedom, _SINGULAR)
     if lock is not None:
         raise _overconstrained(equations, *lock)
 
-    def proposed(text: str, **choice: Sequence[int]) -> str:
-        found = proposals(model, jacobians[0], followers, **choice)
-        return f"{text}{words(found)}" if found else ""
+    def proposed(**choice: Sequence[int]) -> list[Choice]:
+        return proposals(model, jacobians[0], followers, **choice)
 
     if freedom != len(active) and _rank(jacobians[0], _SINGULAR) < rank:
-        raise MechanismError(
+        raise HomeError(
             f"the home posture{given} is singular, where the linkage may go on in several ways: "
             "choose another under 'home'",
             "home",
+            "the posture is singular",
         )
     if not len(active) and freedom:
-        raise MechanismError(_unnamed(freedom) + proposed("try "), "active", somewhere)
+        found = proposed()
+        raise ActiveError(
+            _unnamed(freedom) + _listed("try ", found), somewhere, jacobians[0], found
+        )
     if freedom != len(active):
         stuck = _undetermined(jacobians, passive)
-        text = _miscounted(names, active, stuck, freedom)
+        text, found = _miscounted(names, active, stuck, freedom), proposed()
         if 0 < freedom < len(active):
-            text += proposed(", such as ", among=[int(i) for i in active])
+            text += _listed(", such as ", proposed(among=[int(i) for i in active]))
         elif freedom - len(active) < len(stuck):
-            text += proposed(", such as ", kept=[int(i) for i in active])
-        raise MechanismError(text, "active", somewhere if freedom else None)
+            text += _listed(", such as ", proposed(kept=[int(i) for i in active]))
+        raise ActiveError(text, somewhere if freedom else None, jacobians[0], found)
     drivable = max(_rank(jacobian[:, passive]) for jacobian in jacobians)
     if drivable < rank:
-        stuck = _undetermined(jacobians, passive)
-        raise MechanismError(
+        stuck, found = _undetermined(jacobians, passive), proposed()
+        raise ActiveError(
             f"the active joints {_list(names, active)} cannot drive {_list(names, stuck)}: "
-            f"choose others{proposed(', such as ')}",
-            "active",
+            f"choose others{_listed(', such as ', found)}",
             somewhere,
+            jacobians[0],
+            found,
         )
-    home = _close(equations, guess, passive)
-    endless = passive[np.isinf(model.upperPositionLimit[passive])]  # pins may have wound up
+    home = exact.close(guess, passive)
+    endless = passive[np.isinf(equations.coordinates.upper[passive])]  # pins may have wound up
     home[endless] = np.remainder(home[endless] + np.pi, 2 * np.pi) - np.pi
     _check_closed(
-        equations, home, f"at home{given}", "choose other values or guess more passive joints"
+        equations,
+        exact,
+        home,
+        f"at home{given}",
+        "choose other values or guess more passive joints",
     )
     turned = equations.turned_over(home)
     if turned is not None:
-        raise MechanismError(
+        raise HomeError(
             f"loop '{turned}' closes at home with its axes opposed: turn a frame over, or guess "
             "its joints better",
             f"loop {turned}",
+            f"loop '{turned}' closes with its axes opposed",
         )
-    jacobian = equations.evaluate(home)[1][:, passive]
-    _, upper, pivots = qr(jacobian.T, mode="economic", pivoting=True)
-    diagonal = np.abs(np.diag(upper))
-    if (diagonal > _SINGULAR * diagonal[0]).sum() < rank:
-        at_home = equations.evaluate(home)[1]
+    independent = exact.independent(home, passive, rank, _SINGULAR)
+    if independent is None:
         other = ""
-        if _rank(at_home, _SINGULAR) == rank:  # a dead centre of these drives only
-            other = proposed(", or drive it by ")
-        raise MechanismError(
+        if _rank(exact.jacobian(home), _SINGULAR) == rank:  # a dead centre of these drives only
+            other = _listed(", or drive it by ", proposed())
+        raise HomeError(
             f"the home posture ({_at(names, active, home)}) is at the edge of the assembly "
             f"branch: choose another under 'home'{other}",
             "home",
+            "the posture is at the edge of its branch",
         )
-    rows, redundant = (np.sort(part).astype(np.intp) for part in np.split(pivots, [rank]))
-    lock = surplus_open(equations, home, rows, redundant, active)
+    rows, redundant = independent
+    lock, surplus = exact.surplus(home, rows, redundant, active)
     if lock is not None:
         raise _overconstrained(equations, *lock)
     incidence = np.zeros((rank, rank), dtype=bool)
@@ -195,7 +226,7 @@ def analyse(
         incidence |= part > 1e-10 * part.max(initial=1.0)
     blocks = block_triangular(incidence)
     assert blocks is not None, "independent equations have a matching"
-    return Structure(home, rows, redundant, tuple(blocks))
+    return Structure(home, rows, redundant, tuple(blocks), surplus)
 
 
 def _rank(jacobian: Array, tolerance: float = _RANK) -> int:
@@ -226,17 +257,21 @@ def _undetermined(jacobians: Sequence[Array], passive: Indices) -> Indices:
     return passive[free > 1e-6]
 
 
-def _check_closed(equations: LoopEquations, q: Array, where: str, hint: str) -> None:
+def _check_closed(equations: LoopEquations, exact: Exact, q: Array, where: str, hint: str) -> None:
     phi, _ = equations.evaluate(q)
-    worst = int(np.abs(phi).argmax())
-    if not abs(phi[worst]) <= _CLOSED:  # also NaN
+    worst = int((np.abs(phi) / exact.closed).argmax())
+    if not abs(phi[worst]) <= exact.closed[worst]:  # also NaN
         loop = equations.names[equations.loop_of_row[worst]]
-        unit = "m" if equations.is_translation[worst] else "rad"
-        raise MechanismError(
-            f"loop '{loop}' cannot be closed {where}: it stays {abs(phi[worst]):.3g} {unit} "
-            f"open, {hint}",
+        gap = f"{abs(phi[worst]):.3g} {'m' if equations.is_translation[worst] else 'rad'}"
+        raise HomeError(
+            f"loop '{loop}' cannot be closed {where}: it stays {gap} open, {hint}",
             f"loop {loop}",
+            f"loop '{loop}' stays {gap} open",
         )
+
+
+def _listed(before: str, choices: Sequence[Choice]) -> str:
+    return f"{before}{words(choices)}" if choices else ""
 
 
 def _list(names: Sequence[str], columns: Indices) -> str:

@@ -47,6 +47,8 @@ def _numbers(spec: MachineSpec) -> Iterator[tuple[str, Link | Joint, _Way]]:
         ends = ("lower", "upper") if joint.moves else ()
         for key in [key for key in ends if math.isfinite(getattr(joint.limits, key))]:
             yield f"{joint.name}.{key}", joint, ("limits", key)
+        if joint.moves:
+            yield f"{joint.name}.rotor_inertia", joint, ("rotor_inertia",)
 
 
 def _number(part: Any, way: _Way) -> float:
@@ -70,9 +72,10 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
 
     `LINK.mass`, `LINK.com.x`, `LINK.inertia.xx` (about the centre of mass), `LINK.x`, `LINK.roll`
     (where its joint places it on its parent; frames such as pins are links, too), `JOINT.lower`,
-    `friction.JOINT.coulomb`, `control.JOINT.kp`, of a circuit `supply.pressure`,
-    `oil.bulk_modulus`, `cylinder.JOINT.area_a`, `valve.JOINT.c1`, and `payload.mass`, a point
-    mass at the tip, or the load that the machine file names, scaled to that mass.
+    `JOINT.rotor_inertia`, `friction.JOINT.coulomb`, `control.JOINT.kp`, of a circuit
+    `supply.pressure`, `oil.bulk_modulus`, `cylinder.JOINT.area_a`, `valve.JOINT.c1`, and
+    `payload.mass`, a point mass at the tip, or the load that the machine file names, scaled to
+    that mass.
     """
     found = {name: _number(part, way) for name, part, way in _numbers(spec)}
     for joint in (joint.name for joint in spec.tree.moving):
@@ -113,6 +116,8 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
         head, _, rest = name.partition(".")
         if name.endswith(".mass") and value < 0:
             raise InputError(f"parameter '{name}' is {value:g} kg, it must not be negative")
+        if name.endswith(".rotor_inertia") and value < 0:
+            raise InputError(f"parameter '{name}' is {value:g}, it must not be negative")
         if name == PAYLOAD:
             tree, chains = _load(spec, tree, value)
         elif head == "friction":
@@ -346,7 +351,7 @@ def _fixed(joint: Joint, value: float) -> Joint:
     """A joint fixed where its coordinate has a value."""
     from scipy.spatial.transform import Rotation
 
-    held = dataclasses.replace(joint, kind="fixed", limits=Limits())
+    held = dataclasses.replace(joint, kind="fixed", limits=Limits(), rotor_inertia=0.0)
     turn, axis = Rotation.from_euler("xyz", joint.rpy), np.array(joint.axis)
     if joint.kind == "prismatic":
         x, y, z = (np.array(joint.xyz) + turn.apply(value * axis)).tolist()

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 Vector = tuple[float, float, float]
 Placement = tuple[Vector, Vector]  # xyz [m], rpy [rad] as URDF has them: R_z(y) R_y(p) R_x(r)
@@ -88,7 +88,10 @@ class Joint:
         rpy: Turns the parent's frame into its own [rad].
         axis: Unit vector in its own frame; without meaning if it is fixed.
         limits: Its limits.
+        rotor_inertia: Of the rotor that drives it, seen at the joint: times the square of the
+            gear's ratio [kg m2], or [kg] of a slide.
         cut: Whether it closes a ring, so that it has no ends, while findings are collected.
+        floats: The joint with six freedoms that it is one of, see `crane.description.floating`.
     """
 
     name: str
@@ -100,7 +103,9 @@ class Joint:
     rpy: Vector = (0.0, 0.0, 0.0)
     axis: Vector = (1.0, 0.0, 0.0)
     limits: Limits = field(default_factory=Limits)
+    rotor_inertia: float = 0.0
     cut: bool = False
+    floats: str = ""
 
     @property
     def moves(self) -> bool:
@@ -157,3 +162,9 @@ class Tree:
             else:
                 joints[part.name] = part
         return Tree(links, joints)
+
+
+def with_rotors(tree: Tree, rotors: Mapping[str, float]) -> Tree:
+    """The tree with rotor inertias [kg m2], [kg] by joint."""
+    joints = (replace(tree.joints[name], rotor_inertia=x) for name, x in rotors.items())
+    return tree.replacing(*joints)

@@ -58,7 +58,7 @@ class QuantityCode:
     def __init__(self, quantity: str, machine: Machine, numbers: Array, carriers: tuple[int, ...]):
         fast = self._fast = machine.closure.fast
         self._numbers = numbers
-        nq, n = machine.model.nq, len(machine.active)
+        nq, n = machine.model.nv, len(machine.active)
         key = (quantity, folded(numbers), carriers)
         if key not in fast.programs:
             fast.programs[key] = _compile(quantity, fast, numbers, n, carriers)

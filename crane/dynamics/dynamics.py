@@ -76,10 +76,11 @@ class Dynamics:
 
     @property
     def parameters(self) -> Array:
-        """(10 nb,) inertial parameters of the bodies, in the order of the tree's joints.
+        """(10 nb + nr,) inertial parameters of the bodies, in the order of the tree's joints.
 
         Ten per body about its joint frame's origin: m, m c_x, m c_y, m c_z, I_xx, I_xy, I_yy,
-        I_xz, I_yz, I_zz [kg, kg m, kg m2].
+        I_xz, I_yz, I_zz [kg, kg m, kg m2]. After them the rotor inertias that are not zero, nr of
+        them, in the same order [kg m2], [kg].
         """
         return self.tree.parameters
 
@@ -197,9 +198,10 @@ class Dynamics:
             a_a: The same shape [m/s2], [rad/s2].
 
         Returns:
-            (n, 10 nb) or (N, n, 10 nb), columns in the order of `parameters`.
+            (n, 10 nb + nr) or (N, n, 10 nb + nr), columns in the order of `parameters`.
         """
-        size = 10 * (self.machine.model.njoints - 1)
+        model = self.machine.model
+        size = 10 * (model.njoints - 1) + np.count_nonzero(model.armature)
         return self._evaluate("regressor", (self._n, size), q_a, v_a, a_a, "a_a")
 
     def drive_forces(

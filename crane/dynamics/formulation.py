@@ -18,7 +18,7 @@ def carriers(machine: Machine, formulation: str) -> tuple[int, ...]:
         formulation: One of `FORMULATIONS`.
 
     Returns:
-        (nb + 1,) indices of bodies; 0, the world, stands still.
+        (nv + 1,) indices as `Coordinates.parents` has them; 0, the world, stands still.
 
     Raises:
         InputError: Unknown formulation.
@@ -27,9 +27,9 @@ def carriers(machine: Machine, formulation: str) -> tuple[int, ...]:
         raise InputError(
             f"formulation '{formulation}' is unknown, {known(FORMULATIONS, formulation)}"
         )
-    parents = [int(parent) for parent in machine.model.parents]
+    parents = machine.coordinates.parents
     if formulation == "exact":
-        return tuple(parents)
+        return parents
     chain = {joint: chain.name for chain in machine.chains for joint in chain.joints}
     names = [None, *(chain[joint] for joint in machine.joints)]
     return tuple(p if names[p] == names[i] else 0 for i, p in enumerate(parents))

@@ -54,7 +54,7 @@ class JointForces:
             )
         for stop in machine.end_stops:
             i = machine.column(stop.joint)
-            lower, upper = machine.model.lowerPositionLimit, machine.model.upperPositionLimit
+            lower, upper = machine.coordinates.lower, machine.coordinates.upper
             table[i, 11:15] = stop.stiffness, stop.damping, lower[i], upper[i]
         table[:, 15:] = 0.0, 1.0, 0.0, 1.0
         for gas in machine.gas_springs:

@@ -31,14 +31,16 @@ def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Arr
     """Inertias, force laws and gravity in the order that `Sweep` reads them.
 
     Per body mass, COM (3), inertia about it (xx, xy, xz, yy, yz, zz) in the body's directions of
-    the geometry; per joint the 19 numbers of `JointForces.table`; gravity (3).
+    the geometry; per joint the 19 numbers of `JointForces.table`; gravity (3); per joint its rotor
+    inertia.
     """
     bodies = []
     for turn, inertia in zip(geometry.turns[1:], list(machine.model.inertias)[1:], strict=True):
         tensor = turn.T @ inertia.inertia @ turn
         bodies.append([inertia.mass, *(turn.T @ inertia.lever), *tensor[_UPPER]])
     gravity = machine.model.gravity.linear
-    return np.concatenate([np.ravel(bodies), np.ravel(forces.table), gravity])
+    rotors = machine.model.armature
+    return np.concatenate([np.ravel(bodies), np.ravel(forces.table), gravity, rotors])
 
 
 class Sweep:
@@ -76,6 +78,8 @@ class Sweep:
         self._laws = [constants.vector(BODY * bodies + JOINT * i, JOINT) for i in range(bodies)]
         gravity = constants.vector((BODY + JOINT) * bodies)
         self._gravity = times(posture.rotation[0], gravity)
+        rotors = constants.vector((BODY + JOINT) * bodies + 3, bodies)
+        self._rotors = [(i, value) for i, value in enumerate(rotors, start=1) if value != 0.0]
         self.gamma = loops.gamma
         self.rates: Vector = [0.0, *(dot(self.gamma[i], v_a) for i in range(1, self._size))]
         # the loops' drift is that of the whole machine whatever carries a body
@@ -125,7 +129,7 @@ class Sweep:
 
     @cached_property
     def mass(self) -> list[Vector]:
-        """M_A = sum J_b^T I_b J_b."""
+        """M_A = sum J_b^T I_b J_b + sum gamma_i^T I_r,i gamma_i."""
         out: list[Vector] = [[0.0] * self._n for _ in range(self._n)]
         for i in range(1, self._size):
             mass, _, tensor = self._bodies[i - 1]
@@ -135,11 +139,16 @@ class Sweep:
                 for j in range(k + 1):
                     out[k][j] = out[k][j] + dot(momentum, columns[j][0]) + dot(spin, columns[j][1])
                     out[j][k] = out[k][j]
+        for i, inertia in self._rotors:
+            row = self.gamma[i]
+            for k in range(self._n):
+                for j in range(k + 1):
+                    out[j][k] = out[k][j] = out[k][j] + inertia * row[k] * row[j]
         return out
 
     @cached_property
     def inertial_bias(self) -> Vector:
-        """Sum J_b^T (I_b a_b + v_b x* I_b v_b) at a_A = 0, weights included."""
+        """Sum J_b^T (I_b a_b + v_b x* I_b v_b) at a_A = 0, weights and rotors included."""
         velocity, acceleration = self._motion.velocity, self._motion.acceleration
         out: Vector = [0.0] * self._n
         for i in range(1, self._size):
@@ -151,6 +160,8 @@ class Sweep:
             force, moment = scale(mass, at), add(times(tensor, e), cross(w, times(tensor, w)))
             for k, (linear, angular) in enumerate(self._at_centre(i)):
                 out[k] = out[k] + dot(linear, force) + dot(angular, moment)
+        for i, inertia in self._rotors:
+            out = add(out, scale(inertia * self.drift[i], self.gamma[i]))
         return out
 
     @cached_property
@@ -242,6 +253,8 @@ class Sweep:
             v, w = velocity[i]
             at = add(v, cross(w, centre))
             total = total + 0.5 * mass * dot(at, at) + 0.5 * dot(w, times(tensor, w))
+        for i, inertia in self._rotors:
+            total = total + 0.5 * inertia * self.rates[i] * self.rates[i]
         return total
 
     @cached_property
@@ -266,7 +279,7 @@ class Sweep:
         return solve_positive(self.mass, right)
 
     def regressor(self, a_a: Sequence[Number]) -> list[Vector]:
-        """Y_A (n, 10 nb) with the inertial parameters in Pinocchio's joint frames."""
+        """Y_A (n, 10 nb + nr), inertial parameters in Pinocchio's joint frames, then rotors'."""
         velocity, acceleration = self._motion.velocity, self._motion.acceleration
         out: list[Vector] = [[] for _ in range(self._n)]
         for i in range(1, self._size):
@@ -286,6 +299,10 @@ class Sweep:
                 linear, angular = self._columns[i][k]
                 u = times(local, add(linear, cross(angular, origin)))
                 out[k] += _body_row(u, times(local, angular), w, e, at)
+        for i, _ in self._rotors:
+            rate = dot(self.gamma[i], a_a) + self.drift[i]
+            for k in range(self._n):
+                out[k].append(self.gamma[i][k] * rate)
         return out
 
 

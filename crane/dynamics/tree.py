@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.structure import Indices
 from crane.common.samples import Array, solve
 from crane.dynamics.joint_forces import JointForces
 from crane.machine import Machine
@@ -16,7 +15,7 @@ class ClosedState(NamedTuple):
     """One closed posture in motion.
 
     Attributes:
-        q: (nq,) posture.
+        q: (nv,) posture.
         gamma: (nv, n).
         v: (nv,) velocities gamma v_A.
         drift: (nv,) accelerations at a_A = 0.
@@ -36,14 +35,19 @@ class _Part:
         bodies: Their indices, a parent before its children.
 
     Attributes:
-        columns: Of their joints.
+        bodies: The same.
+        columns: Of their joints in v.
+        places: Of their joints in Pinocchio's q.
         base: The body of the tree that they stand on.
         model: Of them alone.
         data: Its data.
     """
 
     def __init__(self, whole: pin.Model, bodies: Sequence[int]):
-        self.columns = np.array(bodies) - 1
+        self.bodies = np.array(bodies)
+        joints = [whole.joints[body] for body in bodies]
+        self.columns = np.concatenate([np.arange(x.idx_v, x.idx_v + x.nv) for x in joints])
+        self.places = np.concatenate([np.arange(x.idx_q, x.idx_q + x.nq) for x in joints])
         self.base = whole.parents[bodies[0]]
         self.model, place = pin.Model(), {self.base: 0}
         for body in bodies:
@@ -70,11 +74,17 @@ class TreeDynamics:
         # a copy, so that parameters stay those of this moment
         self._model = pin.Model(machine.model)
         self._data = self._model.createData()
+        # added here, not by the parts: Pinocchio's kinetic energy forgets those of some joints
+        self._armature = np.array(self._model.armature)
+        self._rotors = np.flatnonzero(self._armature)
         self._closure, self._forces = machine.closure, forces
+        self._coordinates = machine.coordinates
+        joints = [0, *machine.coordinates.joints.tolist()]
         roots: dict[int, list[int]] = {}
         root_of = {0: 0}
         for body in range(1, self._model.njoints):
-            root_of[body] = root_of[carriers[body]] or body
+            carrier = joints[carriers[self._model.joints[body].idx_v + 1]]
+            root_of[body] = root_of[carrier] or body
             roots.setdefault(root_of[body], []).append(body)
         self._parts = [_Part(self._model, bodies) for bodies in roots.values()]
 
@@ -82,7 +92,8 @@ class TreeDynamics:
     def parameters(self) -> Array:
         """See `Dynamics.parameters`."""
         inertias = list(self._model.inertias)[1:]
-        return np.concatenate([inertia.toDynamicParameters() for inertia in inertias])
+        bodies = [inertia.toDynamicParameters() for inertia in inertias]
+        return np.concatenate([*bodies, self._armature[self._rotors]])
 
     def at(self, quantity: str, q: Array, v_a: Array, x: Array) -> Array:
         """A quantity of one sample; see `QUANTITIES` for x.
@@ -118,7 +129,8 @@ class TreeDynamics:
                 return self._energy(motion)
             case "rates":
                 a_a = self._forward(motion, x, True)
-                return np.concatenate([v, a_a, [self._dissipation(motion)]])
+                rates = self._coordinates.rates(q, v)
+                return np.concatenate([rates, a_a, [self._dissipation(motion)]])
             case "observation":
                 return np.concatenate([gamma.T @ self._forces.friction(v), self._energy(motion)])
             case "regressor":
@@ -131,11 +143,12 @@ class TreeDynamics:
 
     def _energy(self, motion: ClosedState) -> Array:
         """Kinetic and potential."""
-        kinetic = 0.0
+        configuration = self._coordinates.configuration(motion.q)
+        kinetic = 0.5 * float(self._armature @ motion.v**2)
         for part in self._parts:
-            c = part.columns
-            kinetic += pin.computeKineticEnergy(part.model, part.data, motion.q[c], motion.v[c])
-        weight = pin.computePotentialEnergy(self._model, self._data, motion.q)
+            at, v = configuration[part.places], motion.v[part.columns]
+            kinetic += pin.computeKineticEnergy(part.model, part.data, at, v)
+        weight = pin.computePotentialEnergy(self._model, self._data, configuration)
         return np.array([kinetic, weight + self._forces.potential(motion.q)])
 
     def _dissipation(self, motion: ClosedState) -> float:
@@ -152,9 +165,10 @@ class TreeDynamics:
         return np.asarray(motion.gamma.T @ tau)
 
     def _mass(self, motion: ClosedState) -> Array:
-        total = np.zeros((motion.gamma.shape[1],) * 2)
+        configuration = self._coordinates.configuration(motion.q)
+        total = motion.gamma.T @ (self._armature[:, None] * motion.gamma)
         for part in self._parts:
-            upper = np.triu(pin.crba(part.model, part.data, motion.q[part.columns]))
+            upper = np.triu(pin.crba(part.model, part.data, configuration[part.places]))
             gamma = motion.gamma[part.columns]
             total += gamma.T @ (upper + np.triu(upper, 1).T) @ gamma
         return total
@@ -162,22 +176,27 @@ class TreeDynamics:
     def _inverse(self, q: Array, v: Array, a: Array) -> Array:
         """Forces along the joints (nv,), part after part."""
         tau = np.empty_like(v)
-        for part, c in self._turned(q):
-            tau[c] = pin.rnea(part.model, part.data, q[c], v[c], a[c])
-        return tau
+        for part, at in self._turned(q):
+            c = part.columns
+            tau[c] = pin.rnea(part.model, part.data, at, v[c], a[c])
+        return tau + self._armature * a
 
     def _regressor(self, q: Array, v: Array, a: Array) -> Array:
-        """Of the tree (nv, 10 nb), part after part."""
-        out = np.zeros((len(v), 10 * len(v)))
-        for part, c in self._turned(q):
-            block = pin.computeJointTorqueRegressor(part.model, part.data, q[c], v[c], a[c])
-            out[np.ix_(c, (10 * c[:, None] + np.arange(10)).ravel())] = block
+        """Of the tree (nv, 10 nb + nr), part after part; a column for each rotor."""
+        size = 10 * (self._model.njoints - 1)
+        out = np.zeros((len(v), size + len(self._rotors)))
+        out[self._rotors, size + np.arange(len(self._rotors))] = a[self._rotors]
+        for part, at in self._turned(q):
+            c = part.columns
+            block = pin.computeJointTorqueRegressor(part.model, part.data, at, v[c], a[c])
+            out[np.ix_(c, (10 * (part.bodies[:, None] - 1) + np.arange(10)).ravel())] = block
         return out
 
-    def _turned(self, q: Array) -> Iterator[tuple[_Part, Indices]]:
-        """The parts and their columns, gravity turned into the directions of their bases."""
-        pin.forwardKinematics(self._model, self._data, q)
+    def _turned(self, q: Array) -> Iterator[tuple[_Part, Array]]:
+        """The parts and their configurations, gravity turned into their bases' directions."""
+        configuration = self._coordinates.configuration(q)
+        pin.forwardKinematics(self._model, self._data, configuration)
         for part in self._parts:
             base = self._data.oMi[part.base].rotation
             part.model.gravity.linear = base.T @ self._model.gravity.linear
-            yield part, part.columns
+            yield part, configuration[part.places]

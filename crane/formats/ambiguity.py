@@ -13,6 +13,7 @@ from crane.common.samples import Array
 from crane.description import MachineSpec
 from crane.formats.urdf.read import is_urdf
 
+_LISTED, _WRITTEN = 4, 6  # loops and coordinates in a line
 _QUICK, _THOROUGH = 6, 100  # starts of the search in one block: milliseconds, up to a second
 
 
@@ -31,7 +32,7 @@ def warn_of_assemblies(
         return
     xml = spec.path.suffix.lower() in (".xml", ".mjcf")
     drawn = xml and not is_urdf(spec.path)  # MJCF has a value of every joint
-    names = list(closure.model.names)[1:]
+    names = closure.equations.coordinates.names
     named = [i for i, name in enumerate(names) if drawn or name in spec.home]
     most = _THOROUGH if thorough else _QUICK
     found = ambiguities(closure, guess, np.array(named, dtype=np.intp), most)
@@ -44,9 +45,11 @@ def warn_of_assemblies(
 
 
 def _told(spec: MachineSpec, closure: Closure, other: Assembly) -> str:
-    loops = " and ".join(f"'{name}'" for name in other.loops)
+    loops = " and ".join(f"'{name}'" for name in other.loops[:_LISTED])
+    if more := len(other.loops) - _LISTED:
+        loops += f" and {more} more" if more > 0 else ""
     place = spec.where.get("home") or spec.where.get(f"loop {other.loops[0]}", spec.path.name)
-    names = list(closure.model.names)[1:]
+    names = closure.equations.coordinates.names
     sliding = slides(closure.model)
 
     def off(at: tuple[int, float]) -> str:
@@ -54,6 +57,9 @@ def _told(spec: MachineSpec, closure: Closure, other: Assembly) -> str:
 
     kept = "outside of limits" if other.outside else off(other.home_off)
     columns = [int(i) for i in other.columns]
+    if len(columns) > _WRITTEN:  # those that tell the assemblies apart best
+        apart = np.abs(closure.home - other.q)[columns]
+        columns = [columns[i] for i in np.argsort(-apart, kind="stable")[:_LISTED]]
     now, then = (
         _values(spec, [names[i] for i in columns], q[columns]) for q in (closure.home, other.q)
     )
@@ -71,8 +77,6 @@ def _where(spec: MachineSpec) -> str:
         return 'in <group_state name="home">'
     if suffix in (".xml", ".mjcf"):
         return "in the key 'home'"
-    if "chains" not in spec.where:  # robot.yaml, which has no place for it
-        return "in a machine file (crane convert) under 'home:'"
     return "under 'home:'"
 
 

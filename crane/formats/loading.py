@@ -8,8 +8,10 @@ from types import MappingProxyType
 from crane.common.counted import few_warnings
 from crane.common.errors import DescriptionError, InputError
 from crane.description import changed, driven, locked
+from crane.description.floating import floated
 from crane.description.sources import WITH, find
 from crane.formats.ambiguity import warn_of_assemblies
+from crane.formats.home import warn_of_home
 from crane.formats.machine_file.read import read
 from crane.machine.assemble import assemble, closed, home_guess
 from crane.machine.drives import free_joints, motors
@@ -23,6 +25,7 @@ def load(
     lock: Mapping[str, float] | None = None,
     active: Sequence[str] | None = None,
     free: Sequence[str] | None = None,
+    floating: bool = False,
 ) -> Machine:
     """Load a machine, perhaps with some of its numbers changed, or joints locked.
 
@@ -36,6 +39,8 @@ def load(
             than degrees of freedom, all of them are drives, see `Dynamics.drive_forces`.
         free: Coordinates that nothing drives, if not those of the file. What the active joints
             leave open is free anyway, with a warning.
+        floating: Whether the root floats instead of standing on the ground: a vehicle, a humanoid.
+            Its six freedoms, base_x to base_rz, are free, see `crane.description.floating`.
 
     Returns:
         The machine, its home posture closed.
@@ -46,7 +51,7 @@ def load(
         InputError: A change of a parameter that is not there, or to what cannot be.
     """
     with few_warnings():
-        return _load(name, changes, lock, active, free)
+        return _load(name, changes, lock, active, free, floating)
 
 
 def _load(
@@ -55,8 +60,11 @@ def _load(
     lock: Mapping[str, float] | None,
     active: Sequence[str] | None,
     free: Sequence[str] | None,
+    floating: bool,
 ) -> Machine:
-    spec = read(name)
+    spec, said = read(name), {"active": active, "free": free}
+    if floating:
+        spec = floated(spec)
     if active is not None or free is not None:
         spec = driven(spec, _names(active, "active"), _names(free, "free"))
     if changes:
@@ -66,9 +74,11 @@ def _load(
     model = assemble(spec)
     guess = home_guess(spec, model)
     closure = closed(spec, model, guess)
-    check_masses(spec, model, closure)
+    warn_of_home(spec, closure)
     warn_of_assemblies(spec, closure, guess)
-    lower, upper = model.lowerPositionLimit, model.upperPositionLimit
+    check_masses(spec, model, closure)
+    coordinates = closure.equations.coordinates
+    lower, upper = coordinates.lower, coordinates.upper
     return Machine(
         name=spec.name,
         source=spec.source,
@@ -89,12 +99,9 @@ def _load(
         control=MappingProxyType(dict(spec.control)),
         hydraulics=spec.hydraulics,
         chosen=MappingProxyType(
-            {
-                key: tuple(names)
-                for key, names in (("active", active), ("free", free))
-                if names is not None
-            }
+            {key: tuple(names) for key, names in said.items() if names is not None}
         ),
+        floats=floating,
         changes=MappingProxyType({name: float(value) for name, value in (changes or {}).items()}),
         free=free_joints(spec, closure.active_names),
         motors=motors(spec, closure.active_names),
@@ -134,9 +141,10 @@ def recalled(call: str) -> Machine:
             [str(joint) for joint in given.pop(kind)] if kind in given else None
             for kind in ("active", "free")
         )
+        floating = given.pop("floating", False) is True
     except (ValueError, TypeError, AttributeError, RecursionError):
         given = {"": None}
     if given:
         example = '{"changes": {"payload.mass": 200}, "lock": {"slew": 0}}'
         raise InputError(f"'{call}' names no machine, write NAME{WITH}{example}")
-    return load(name, changes, lock, active, free)
+    return load(name, changes, lock, active, free, floating)

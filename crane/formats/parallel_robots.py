@@ -7,6 +7,7 @@ from pathlib import Path
 from crane.common.errors import DescriptionError, known
 from crane.description.spec import Chain, Drive, LoopSpec, MachineSpec, places
 from crane.description.tree import Joint, Link, Tree
+from crane.formats.machine_file.posture import read_home
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.series import series
@@ -16,7 +17,7 @@ from crane.formats.xml import XmlFile
 
 URDF, YAML = "robot.urdf", "robot.yaml"
 
-_KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
+_KEYS = ("closed_loop", "type", "name_mot", "joint_name", "joint_type", "home")
 _OWN = re.compile(r"^(closed_loop|name_mot)\s*:", re.MULTILINE)
 _MACHINE = re.compile(r"^(chains|name)\s*:", re.MULTILINE)
 _LOOPS = {"3d": "spherical", "6d": "fixed"}
@@ -69,7 +70,11 @@ def read_parallel_robot(path: Path) -> MachineSpec:
                 f"the motor '{joint}' is {replaced[joint][0]}, drive a joint with one freedom",
             )
         tree.check_joint(joint, top.where("name_mot"))
+    home, home_lines = read_home(top, tree)
     where = {"active": top.where("name_mot")} | places(loops, urdf.couplings)
+    where |= {f"home {joint}": place for joint, place in home_lines.items()}
+    if "home" in top:
+        where["home"] = top.where("home")
     return MachineSpec(
         name=name,
         source=path.name,
@@ -78,6 +83,7 @@ def read_parallel_robot(path: Path) -> MachineSpec:
         tree=tree.tree,
         loops=loops,
         active=motors,
+        home=home,
         drives=tuple(Drive(joint, {joint: 1.0}) for joint in motors),
         friction=urdf.friction,
         tip=tree.only_leaf(),

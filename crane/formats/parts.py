@@ -1,6 +1,7 @@
 """What is written alike in several formats: links and joints of URDF, words on what is lost."""
 
 import copy
+import dataclasses
 import math
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -11,7 +12,7 @@ from lxml import etree
 
 from crane.common.errors import CraneWarning
 from crane.description import Coupling
-from crane.description.tree import NO_LIMIT, Joint, Limits, Link
+from crane.description.tree import NO_LIMIT, Joint, Limits, Link, Tree
 from crane.formats.visuals.meshes import mesh_file
 from crane.machine import Machine
 
@@ -47,6 +48,22 @@ def add_link(robot: etree._Element, link: Link) -> None:
     etree.SubElement(inertial, "inertia", {key: text([value]) for key, value in tensor})
 
 
+def with_whole_flyers(machine: Machine) -> Tree:
+    """The tree with a joint "floating" in place of the six of each body that floats."""
+    tree = machine.tree
+    links, joints = dict(tree.links), dict(tree.joints)
+    for column in machine.coordinates.floating:
+        series = [joints[name] for name in machine.joints[column : column + 6]]
+        for joint in series[:-1]:
+            del links[joint.child]
+        for joint in series:
+            del joints[joint.name]
+        first, last = series[0], series[-1]
+        whole = dataclasses.replace(first, name=first.floats, kind="floating", child=last.child)
+        joints[whole.name] = whole
+    return Tree(links, joints)
+
+
 def add_joint(robot: etree._Element, joint: Joint) -> etree._Element:
     """A `<joint>` of URDF with its limits.
 
@@ -61,7 +78,7 @@ def add_joint(robot: etree._Element, joint: Joint) -> etree._Element:
     add_origin(element, joint)
     etree.SubElement(element, "parent", link=joint.parent)
     etree.SubElement(element, "child", link=joint.child)
-    if not joint.moves:
+    if joint.kind in ("fixed", "floating"):
         return element
     etree.SubElement(element, "axis", xyz=text(joint.axis))
     values = {key: min(getattr(limits, key), NO_LIMIT) for key in ("effort", "velocity")}
@@ -145,6 +162,19 @@ def left_out(machine: Machine, what: str, names: Sequence[str] | Iterator[str]) 
             CraneWarning,
             stacklevel=3,
         )
+
+
+def drives_of(machine: Machine) -> dict[str, dict[str, float]]:
+    """Factors of all drives, where one acts along more than a joint."""
+    drives = {drive.name: dict(drive.factors) for drive in machine.drives}
+    plain = all(factors == {name: 1.0} for name, factors in drives.items())
+    return {} if plain else drives
+
+
+def rotors_of(machine: Machine) -> dict[str, float]:
+    """Rotor inertias that are not zero, by joint."""
+    joints = machine.tree.joints
+    return {x: joints[x].rotor_inertia for x in machine.joints if joints[x].rotor_inertia}
 
 
 def plain_friction(machine: Machine) -> list[str]:

@@ -71,9 +71,12 @@ def series(
         ends: Parent and child link.
         where: File and line.
     """
+    floats = name if tuple(parts) == (*_SLIDES, *_TURNS) else ""
     links = [ends[0], *(f"{name}_{i}" for i in range(1, len(parts))), ends[1]]
     found: list[Link | Joint] = [Link(link, where, between=name) for link in links[1:-1]]
     for i, (suffix, kind, axis) in enumerate(parts):
-        joint = Joint(f"{name}_{suffix}", kind, links[i], links[i + 1], where, axis=axis)
+        joint = Joint(
+            f"{name}_{suffix}", kind, links[i], links[i + 1], where, axis=axis, floats=floats
+        )
         found.append(joint if i else dataclasses.replace(joint, xyz=place[0], rpy=place[1]))
     return found

@@ -7,15 +7,18 @@ import numpy as np
 import pinocchio as pin
 
 from crane.closure import Closure, frame_id
+from crane.closure.coordinates import Coordinates
 from crane.closure.equations import LoopEquations
+from crane.closure.structure import ActiveError
 from crane.common.errors import DescriptionError, MechanismError, at
 from crane.common.samples import Array
 from crane.description import LoopSpec, MachineSpec, inertia_problem
 from crane.description.findings import flag, recoverable
+from crane.description.floating import flyers
 from crane.description.rigid import inertia, se3
-from crane.description.tree import Joint, Link
+from crane.description.tree import Joint, Link, Tree
 from crane.machine.axes import wrong_axis
-from crane.machine.drives import active_joints, completed, warn_of_completion
+from crane.machine.drives import active_joints, completed, free_joints, warn_of_completion
 
 _MOST = 1000  # joints that move; closing takes the cube of it
 _SAME = 1e-12  # difference of two directions that is none, as Pinocchio has it
@@ -33,10 +36,11 @@ def home_guess(spec: MachineSpec, model: pin.Model) -> Array:
         DescriptionError: An active joint is at home outside of its limits.
     """
     active = active_joints(spec, model)
-    lower, upper = model.lowerPositionLimit, model.upperPositionLimit
-    guess = np.clip(np.zeros(model.nq), lower, upper)
+    coordinates = Coordinates(model)
+    lower, upper = coordinates.lower, coordinates.upper
+    guess = np.clip(np.zeros(model.nv), lower, upper)
     for joint, value in spec.home.items():
-        column = model.joints[model.getJointId(joint)].idx_q
+        column = coordinates.column(joint)
         if joint in active and not lower[column] <= value <= upper[column]:
             problem = (
                 f"home of '{joint}' is {value:g}, outside of its limits "
@@ -63,11 +67,12 @@ def closed(
     """
     loops = spec.loops if loops is None else loops
     # while findings are collected, joints that close rings are no part of the tree
-    there = tuple(x for x in spec.couplings if all(map(model.existJointName, x.factors)))
+    known_names = set(Coordinates(model).names)
+    there = tuple(x for x in spec.couplings if known_names >= x.factors.keys())
     spec = dataclasses.replace(spec, couplings=there)
     names = active_joints(spec, model)
     try:
-        return Closure(model, loops, names, guess, there)
+        return _closure(spec, model, names, guess, loops)
     except MechanismError as refused:
         error = refused
 
@@ -79,28 +84,64 @@ def closed(
         suspect = wrong_axis(spec, model, loops, close)
         if suspect is not None:
             raise suspect
-    if error.about == "active" and error.posture is not None:
-        closure = _completed(spec, model, loops, error.posture)
+    if isinstance(error, ActiveError) and error.posture is not None:
+        closure = _completed(spec, model, guess, loops, error)
         if closure is not None:
             return closure
     raise MechanismError(at(spec.where.get(error.about, spec.path.name), error), error.about)
 
 
+def _closure(
+    spec: MachineSpec,
+    model: pin.Model,
+    names: Sequence[str],
+    guess: Array,
+    loops: Sequence[LoopSpec],
+) -> Closure:
+    """The closure, its home sought where the file does not say it."""
+    loose = set(free_joints(spec, names)) - spec.home.keys()
+    return Closure(model, loops, names, guess, spec.couplings, spec.home, loose)
+
+
 def _completed(
-    spec: MachineSpec, model: pin.Model, loops: Sequence[LoopSpec], posture: Array
+    spec: MachineSpec,
+    model: pin.Model,
+    guess: Array,
+    loops: Sequence[LoopSpec],
+    found: ActiveError,
 ) -> Closure | None:
     """The closure with active joints chosen as the file leaves it, None where that is none."""
     equations = LoopEquations(model, loops, spec.couplings)
-    choice = completed(spec, model, equations, posture)
+    choice = completed(spec, model, equations, found.jacobian)
     if choice is None:
         return None
     names, text = choice
     try:
-        closure = Closure(model, loops, names, posture, spec.couplings)
+        closure = _closure(spec, model, names, guess, loops)
     except MechanismError:
-        return None
+        try:
+            closure = Closure(model, loops, names, found.posture, spec.couplings)
+        except MechanismError:
+            return None
+    if closure.sought is not None:  # far from where they were chosen
+        jacobian = equations.evaluate(closure.home)[1][closure.structure.rows]
+        better = completed(spec, model, equations, jacobian)
+        if better is not None and better[0] != names:
+            text = better[1]
+            closure = _moved(closure, better[0])
     warn_of_completion(spec, text)
     return closure
+
+
+def _moved(closure: Closure, names: Sequence[str]) -> Closure:
+    """The same closure by other independent coordinates."""
+    equations = closure.equations
+    try:
+        other = Closure(closure.model, equations.loops, names, closure.home, equations.couplings)
+    except MechanismError:
+        return closure
+    other.sought = closure.sought
+    return other
 
 
 def assemble(spec: MachineSpec) -> pin.Model:
@@ -125,9 +166,14 @@ def assemble(spec: MachineSpec) -> pin.Model:
         root, 0, 0, pin.SE3.Identity(), pin.FrameType.BODY, inertia(tree.links[root].inertial)
     )
     frames = {root: model.addFrame(frame)}
+    afloat = {series[0]: (name, series) for name, series in flyers(spec).items()}
     waiting = _last_first(below, root)
     while waiting:
         joint = waiting.pop()
+        if joint.name in afloat:
+            last = _float(model, frames, *afloat[joint.name], tree)
+            waiting += _last_first(below, last)
+            continue
         mass = inertia(tree.links[joint.child].inertial)
         try:
             frames[joint.child] = _add(model, frames[joint.parent], joint, mass)
@@ -135,6 +181,9 @@ def assemble(spec: MachineSpec) -> pin.Model:
             reason = str(error).strip().splitlines()[0]
             raise DescriptionError(f"{joint.where}: cannot be assembled ({reason})") from None
         waiting += _last_first(below, joint.child)
+    model.armature = np.array(
+        [tree.joints[name].rotor_inertia for name in Coordinates(model).names]
+    )
     _check_bodies(spec, model)
     return model
 
@@ -167,6 +216,23 @@ def _add(model: pin.Model, parent: int, joint: Joint, mass: pin.Inertia) -> int:
     return int(model.addBodyFrame(joint.child, index, pin.SE3.Identity(), frame))
 
 
+def _float(
+    model: pin.Model, frames: dict[str, int], name: str, series: Sequence[str], tree: Tree
+) -> str:
+    """Add a free-flyer in place of a series of six joints; the link that it moves."""
+    joints = [tree.joints[part] for part in series]
+    above = model.frames[frames[joints[0].parent]]
+    place = above.placement * se3(joints[0].xyz, joints[0].rpy)
+    index = model.addJoint(above.parentJoint, pin.JointModelFreeFlyer(), place, name)
+    model.addJointFrame(index, frames[joints[0].parent])
+    last = joints[-1].child
+    mass = inertia(tree.links[last].inertial)
+    model.appendBodyToJoint(index, mass, pin.SE3.Identity())
+    for joint in joints:
+        frames[joint.child] = int(model.addBodyFrame(joint.child, index, pin.SE3.Identity(), -1))
+    return last
+
+
 def _kind(joint: Joint) -> pin.JointModel:
     """Pinocchio's joint, one for each direction of the frame's axes: they are faster."""
     turns, axis = joint.kind == "revolute", np.array(joint.axis)
@@ -184,8 +250,10 @@ def _check_bodies(spec: MachineSpec, model: pin.Model) -> None:
         for link in links.values()
         if link.refused
     }
+    floating = flyers(spec)
     for index in range(1, model.njoints):
-        joint = spec.tree.joints[model.names[index]]
+        name = model.names[index]
+        joint = spec.tree.joints[floating[name][-1] if name in floating else name]
         link = links[joint.child]
         if link.between is not None or index in doubtful:
             continue

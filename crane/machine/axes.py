@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.choice import slides
 from crane.closure.equations import LoopEquations, frame_id
 from crane.common.errors import CraneError, MechanismError
 from crane.common.samples import Array
@@ -37,8 +36,10 @@ def wrong_axis(
     equations = LoopEquations(model, loops, spec.couplings)
     data = model.createData()
     # at zero a wrong axis has turned nothing out of the plane yet
-    jacobian = pin.computeJointJacobians(model, data, np.zeros(model.nq)).reshape(6, -1)
-    sliding, names = slides(model), list(model.names)[1:]
+    coordinates = equations.coordinates
+    at = coordinates.configuration(np.zeros(model.nv))
+    jacobian = pin.computeJointJacobians(model, data, at).reshape(6, -1)
+    sliding, names = coordinates.slides, coordinates.names
     for index, loop in enumerate(loops):
         if loop.type not in (*_TURNING, "prismatic"):
             continue

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.choice import DEAD, choose, motions, proposals, scales, words
+from crane.closure.choice import DEAD, Choice, choose, motions, proposals, scales, words
+from crane.closure.coordinates import Coordinates
 from crane.closure.equations import LoopEquations
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
 from crane.description import Drive, MachineSpec
+from crane.description.floating import flyers
 
 _OF_ACTIVE = {"tasks", "control", "hydraulics"}  # sections that only active joints can have
 
@@ -27,17 +29,24 @@ def active_joints(spec: MachineSpec, model: pin.Model) -> tuple[str, ...]:
     An open chain that names none has all of them, but those that follow others by a coupling.
     """
     if spec.active is not None:
-        return tuple(dict.fromkeys((*spec.active, *spec.free)))
+        return tuple(dict.fromkeys((*spec.active, *said_free(spec))))
     followers = {next(iter(coupling.factors)) for coupling in spec.couplings}
-    return tuple(name for name in model.names[1:] if name not in followers)
+    return tuple(name for name in Coordinates(model).names if name not in followers)
+
+
+def said_free(spec: MachineSpec) -> tuple[str, ...]:
+    """Coordinates that the file calls free, and those of bodies that float."""
+    afloat = (joint for series in flyers(spec).values() for joint in series)
+    return tuple(dict.fromkeys((*spec.free, *afloat)))
 
 
 def free_joints(spec: MachineSpec, active: Sequence[str]) -> tuple[str, ...]:
     """Those of the independent coordinates that nothing drives."""
     driven = named_drives(spec)
+    free = said_free(spec)
     if not driven:
-        return tuple(name for name in active if name in spec.free)
-    return tuple(name for name in active if name in spec.free or name not in driven)
+        return tuple(name for name in active if name in free)
+    return tuple(name for name in active if name in free or name not in driven)
 
 
 def motors(spec: MachineSpec, active: Sequence[str]) -> tuple[Drive, ...]:
@@ -49,7 +58,7 @@ def motors(spec: MachineSpec, active: Sequence[str]) -> tuple[Drive, ...]:
 
 
 def completed(
-    spec: MachineSpec, model: pin.Model, equations: LoopEquations, posture: Array
+    spec: MachineSpec, model: pin.Model, equations: LoopEquations, jacobian: Array
 ) -> tuple[tuple[str, ...], str] | None:
     """Independent coordinates where the file names too few, too many or none.
 
@@ -61,30 +70,33 @@ def completed(
         spec: The machine as read.
         model: Its tree.
         equations: Its loops.
-        posture: (nq,) closed posture.
+        jacobian: (m, nv) of all loop equations at a closed posture.
 
     Returns:
         Names, and what to say of them; None where there is no such choice.
     """
-    jacobian = equations.evaluate(posture)[1]
     basis = motions(jacobian, scales(model), DEAD)
-    names = list(model.names)[1:]
+    names = equations.coordinates.names
     followers = [int(i) for i in np.flatnonzero((equations.factors != 0).any(axis=0))]
     driven = spec.active or named_drives(spec)
-    said = tuple(dict.fromkeys((*driven, *spec.free)))
+    undriven = said_free(spec)
+    said = tuple(dict.fromkeys((*driven, *undriven)))
     freedom = basis.shape[1]
     undecided = not driven and _OF_ACTIVE & spec.where.keys()
     mistaken = spec.active and len(said) == freedom  # as many as there are, and not independent
     if not freedom or undecided or (mistaken and not spec.drives):
         return None
     if not driven:
-        free = [names.index(name) for name in spec.free]
+        free = [names.index(name) for name in undriven]
         found = proposals(model, jacobian, followers, kept=free)
         if not found:
             return None
-        return found[0].joints, (
-            f"{_freedoms(freedom)} and no active joints named, taken as driven: {words(found)}"
-        )
+        meant = [
+            Choice(tuple(x for x in one.joints if x not in undriven), one.condition)
+            for one in found
+        ]
+        text = f"no active joints named, taken as driven: {words(meant)}"
+        return found[0].joints, f"{_freedoms(freedom)} and {text}"
     kept = _independent(basis, [names.index(name) for name in said])
     surplus = [name for name in said if names.index(name) not in kept]
     others = [i for i in range(len(names)) if i not in followers]
@@ -101,7 +113,10 @@ def completed(
         )
     if added:
         told.append(f"nothing drives {', '.join(added)}, free but for friction, springs and stops")
-    head = f"{len(said)} active joint{'s' * (len(said) != 1)} for {_freedoms(freedom)}"
+    count = f"{len(driven)} active joint{'s' * (len(driven) != 1)}"
+    if undriven:
+        count += f" and {len(undriven)} free"
+    head = f"{count} for {_freedoms(freedom)}"
     return (*(names[i] for i in kept), *added), f"{head}: {'; '.join(told)}"
 
 

@@ -13,6 +13,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from crane.closure import Closure, frame_id
+from crane.closure.coordinates import Coordinates
 from crane.common.errors import InputError, LimitError, known
 from crane.common.samples import Array, as_number, as_sample, as_samples
 from crane.description import (
@@ -64,7 +65,8 @@ class Machine:
         path: The machine file or URDF it was read from.
         chains: Its open sub-chains.
         tree: Its links and joints, all sub-chains hung onto each other.
-        model: Pinocchio's model of the spanning tree, depth-first, nq = nv.
+        model: Pinocchio's model of the spanning tree, depth-first; nq = nv unless it floats, see
+            `coordinates`.
         closure: Its loops.
         active: Names of the active joints, in the order of q_A.
         lower: (n,) lower limits of the active joints [m], [rad].
@@ -83,6 +85,7 @@ class Machine:
         changes: Numbers that are not those of its files, by name.
         locks: Where joints are held that its files let move, by name [m], [rad].
         chosen: Active and free joints that are not those of its file, under "active" and "free".
+        floats: Whether its root was made to float, which its file lets stand on the ground.
     """
 
     name: str
@@ -108,6 +111,7 @@ class Machine:
     changes: Mapping[str, float]
     locks: Mapping[str, float]
     chosen: Mapping[str, tuple[str, ...]]
+    floats: bool
 
     def __repr__(self) -> str:
         """Name, joints, loops and what drives it."""
@@ -125,7 +129,7 @@ class Machine:
 
     @property
     def home(self) -> Array:
-        """(nq,) the home posture, closed."""
+        """(nv,) the home posture, closed."""
         return self.closure.home
 
     @property
@@ -174,14 +178,19 @@ class Machine:
 
         Such as 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
         """
-        given = {"changes": dict(self.changes), "lock": dict(self.locks), **self.chosen}
-        given = {name: what for name, what in given.items() if what}
+        given = {"changes": dict(self.changes), "lock": dict(self.locks), "floating": self.floats}
+        given = {name: what for name, what in (given | dict(self.chosen)).items() if what}
         return f"{self.reference}{WITH}{json.dumps(given)}" if given else self.reference
 
-    @cached_property
+    @property
+    def coordinates(self) -> Coordinates:
+        """Those of the tree, and the way to Pinocchio's configurations."""
+        return self.closure.equations.coordinates
+
+    @property
     def joints(self) -> tuple[str, ...]:
-        """Names of all joints of the tree, in the order of q."""
-        return tuple(self.model.names)[1:]
+        """Names of all coordinates of the tree, in the order of q: joints, freedoms of a base."""
+        return self.coordinates.names
 
     def column(self, joint: str) -> int:
         """Index of a joint in q and v.
@@ -189,9 +198,7 @@ class Machine:
         Raises:
             InputError: There is no such joint.
         """
-        if joint not in self.joints:
-            raise InputError(f"joint '{joint}' is unknown, {known(self.joints, joint)}")
-        return self.joints.index(joint)
+        return self.coordinates.column(joint)
 
     def unit(self, joint: str) -> str:
         """Unit of a joint's coordinate, "m" or "rad"."""
@@ -256,7 +263,7 @@ class Machine:
                 raise InputError(f"joint '{spring.joint}' has two gas springs, keep one")
         for stop in end_stops or ():
             column = self.column(stop.joint)
-            limits = self.model.lowerPositionLimit[column], self.model.upperPositionLimit[column]
+            limits = self.coordinates.lower[column], self.coordinates.upper[column]
             if not np.isfinite(limits).all():
                 raise InputError(f"joint '{stop.joint}' has no limits to stop at, give it some")
         for joint in hydraulics.joints if hydraulics else ():
@@ -319,8 +326,8 @@ class Machine:
             self,
             closure=closure,
             active=names,
-            lower=fixed(self.model.lowerPositionLimit[closure.active]),
-            upper=fixed(self.model.upperPositionLimit[closure.active]),
+            lower=fixed(self.coordinates.lower[closure.active]),
+            upper=fixed(self.coordinates.upper[closure.active]),
             tasks=MappingProxyType(
                 {key: task for key, task in self.tasks.items() if same or task.space == "tip"}
             ),

@@ -25,7 +25,16 @@ def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> None:
     Raises:
         DescriptionError: A motion of the machine moves no mass.
     """
-    without = [joint for joint in spec.tree.moving if _is_massless(spec, model, joint)]
+    coordinates = closure.equations.coordinates
+
+    def body(joint: Joint) -> pin.Inertia:
+        return model.inertias[int(coordinates.joints[coordinates.column(joint.name)])]
+
+    def massless(joint: Joint) -> bool:
+        link = spec.tree.links[joint.child]
+        return link.between is None and not link.refused and not body(joint).mass > 0
+
+    without = [joint for joint in spec.tree.moving if massless(joint)]
     if not without:
         return
     if not has_mass(model):
@@ -39,7 +48,7 @@ def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> None:
         link = spec.tree.links[joint.child]
         problem = f"joint '{joint.name}' moves link '{link.name}', which has no mass"
         flag(DescriptionError(f"{link.where}: {problem}, give it an <inertial>"), harmless=True)
-    without = [joint for joint in without if not _body(model, joint).inertia.any()]
+    without = [joint for joint in without if not body(joint).inertia.any()]
     if without and not stuck:
         first = spec.tree.links[without[0].child]
         count = f" ({len(without)} such)" if len(without) > 1 else ""
@@ -56,24 +65,16 @@ def has_mass(model: pin.Model) -> bool:
     return any(body.mass > 0 or body.inertia.any() for body in list(model.inertias)[1:])
 
 
-def _is_massless(spec: MachineSpec, model: pin.Model, joint: Joint) -> bool:
-    link = spec.tree.links[joint.child]
-    return link.between is None and not link.refused and not _body(model, joint).mass > 0
-
-
-def _body(model: pin.Model, joint: Joint) -> pin.Inertia:
-    return model.inertias[model.getJointId(joint.name)]
-
-
 def _weightless(model: pin.Model, closure: Closure, without: list[Joint]) -> Iterator[Joint]:
     """The massless joints that move most in each motion of the machine that moves no mass."""
-    gamma = closure.gamma(closure.home)
-    upper = np.triu(pin.crba(model, model.createData(), closure.home))
+    gamma = closure.motion(closure.home, np.zeros(closure.degrees_of_freedom))[0]  # uncompiled
+    coordinates = closure.equations.coordinates
+    upper = np.triu(pin.crba(model, model.createData(), coordinates.configuration(closure.home)))
     mass: Array = gamma.T @ (upper + np.triu(upper, 1).T) @ gamma
     largest = np.sqrt(np.diag(mass))
     scale = 1 / np.where(largest > 0, largest, 1.0)
     values, vectors = np.linalg.eigh(mass * scale * scale[:, None])
-    columns = [model.joints[model.getJointId(joint.name)].idx_v for joint in without]
+    columns = [coordinates.column(joint.name) for joint in without]
     for vector in vectors.T[values < _DEFINITE]:
         moved = np.abs(gamma[columns] @ (scale * vector))
         yield without[int(moved.argmax())]

@@ -70,7 +70,7 @@ class Kinematics:
         Returns:
             (3,) or (N, 3) [m].
         """
-        return self._positions(as_samples(q, self._model.nq, "q", self.machine.joints))
+        return self._positions(as_samples(q, self._model.nv, "q", self.machine.joints))
 
     def _positions(self, q: Array) -> Array:
         if q.ndim == 2 and self._points is not None:
@@ -79,7 +79,7 @@ class Kinematics:
 
     def position_at(self, q: Array) -> Array:
         """Position (3,) [m] of one posture (nq,)."""
-        pin.forwardKinematics(self._model, self._data, q)
+        pin.forwardKinematics(self._model, self._data, self.machine.coordinates.configuration(q))
         placement = pin.updateFramePlacement(self._model, self._data, self._frame)
         return np.array(placement.translation)
 
@@ -112,7 +112,8 @@ class Kinematics:
         def one(q: Array, v_a: Array) -> Array:
             v = self.machine.closure.gamma(q) @ v_a
             drift = self.machine.closure.drift(q, v)
-            pin.forwardKinematics(self._model, self._data, q, v, drift)
+            at = self.machine.coordinates.configuration(q)
+            pin.forwardKinematics(self._model, self._data, at, v, drift)
             acceleration = pin.getFrameClassicalAcceleration(
                 self._model, self._data, self._frame, pin.LOCAL_WORLD_ALIGNED
             )
@@ -226,8 +227,9 @@ class Kinematics:
 
     def tree_jacobian(self, q: Array) -> Array:
         """Jacobian dx/dq (3, nv) of the spanning tree at one posture (nq,)."""
+        at = self.machine.coordinates.configuration(q)
         tree: Array = pin.computeFrameJacobian(
-            self._model, self._data, q, self._frame, pin.LOCAL_WORLD_ALIGNED
+            self._model, self._data, at, self._frame, pin.LOCAL_WORLD_ALIGNED
         )
         return tree.reshape(6, -1)[:3]  # of a single joint it comes as a vector
 
@@ -339,7 +341,7 @@ class _FastPoint:
         self._n = len(machine.active)
         key = (type(self), self._body, folded(self._place))
         if key not in fast.programs:
-            fast.programs[key] = self._compile(machine.model.nq)
+            fast.programs[key] = self._compile(machine.model.nv)
         self._program = fast.programs[key]
 
     def rows(self, q: Array, v_a: Array | None = None) -> Array:

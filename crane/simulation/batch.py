@@ -13,7 +13,7 @@ from crane.common.samples import Array, Brief
 from crane.control import Controller
 from crane.dynamics import Dynamics
 from crane.machine import Machine
-from crane.simulation.recorded import imbalance
+from crane.simulation.recorded import imbalance, limits_passed
 from crane.simulation.run import (
     Progress,
     as_controller,
@@ -104,7 +104,8 @@ def simulate_batch(
         time, rows = integrate(Dynamics(machine), control, starts[i], steps, step)
         energy = np.hstack([rows.kinetic, rows.potential, rows.work, rows.lost])
         q_a = rows.q[:, machine.closure.active]
-        return time, q_a, rows.v_a, rows.tau, energy, imbalance(rows, step)
+        doubts = filter(None, (limits_passed(machine, time, rows.q), imbalance(rows, step)))
+        return time, q_a, rows.v_a, rows.tau, energy, "; ".join(doubts)
 
     results: dict[int, _Result] = {}
     failures: dict[int, str] = {}

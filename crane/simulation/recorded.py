@@ -7,16 +7,17 @@ import numpy as np
 
 from crane.codegen import Parts
 from crane.common.errors import CraneWarning
-from crane.common.samples import Array
+from crane.common.samples import FARTHEST, Array
 from crane.control import Controller, Free, Signals, ValveDrive, reference_of
 from crane.hydraulics.circuit import BALANCES
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
-from crane.motion.trajectories import Trajectory
+from crane.motion.trajectories import LIMIT_SLACK, Trajectory
 from crane.recordings.recording import Recording
 
 Column = tuple[str, Array, str]  # name, values, unit
 
+_SHOWN = 3  # joints beyond their limits that are named
 _IMBALANCE = 5e-3  # share of the energy that went through
 
 
@@ -33,7 +34,8 @@ def recorded(
         task: Name to put into it.
     """
     q_a = rows.q[:, machine.closure.active]
-    _warn_of_limits(machine, time, q_a)
+    if text := limits_passed(machine, time, rows.q):
+        warnings.warn(text, CraneWarning, stacklevel=3)
     channels: dict[str, Array] = {}
     units: dict[str, str] = {}
     for name, values, unit in _channels(machine, control, time, rows):
@@ -106,17 +108,39 @@ def _name_of(control: Controller) -> str:
     return "" if isinstance(control, Free) else type(control).__name__
 
 
-def _warn_of_limits(machine: Machine, time: Array, q_a: Array) -> None:
+def limits_passed(machine: Machine, time: Array, q: Array) -> str:
+    """What to say of joints that went beyond limits where nothing stops them, else nothing.
+
+    Args:
+        machine: The machine.
+        time: (N,) [s].
+        q: (N, nv) the motion.
+    """
+    lower, upper = machine.coordinates.lower, machine.coordinates.upper
+    beyond = np.maximum(lower - q, q - upper)
+    farthest = beyond.max(axis=0)
     stopped = {stop.joint for stop in machine.end_stops}
-    for i, joint in enumerate(machine.active):
-        outside = (q_a[:, i] < machine.lower[i]) | (q_a[:, i] > machine.upper[i])
-        if outside.any() and joint not in stopped:
-            warnings.warn(
-                f"'{joint}' leaves its limits {machine.lower[i]:g} to {machine.upper[i]:g} at "
-                f"t = {time[outside.argmax()]:.4g} s, it has no end stop",
-                CraneWarning,
-                stacklevel=4,
-            )
+    passed = [
+        i for i in np.flatnonzero(farthest > LIMIT_SLACK) if machine.joints[i] not in stopped
+    ]
+    if not passed:
+        return ""
+    passed.sort(key=lambda i: -farthest[i] / min(upper[i] - lower[i], FARTHEST))
+    words = []
+    for i in passed[:_SHOWN]:
+        joint, first = machine.joints[i], int(np.argmax(beyond[:, i] > LIMIT_SLACK))
+        limit = lower[i] if q[first, i] < lower[i] else upper[i]
+        unit = machine.unit(joint)
+        words.append(
+            f"'{joint}' passes its limit {limit:.4g} {unit} at t = {time[first]:.4g} s, by up to "
+            f"{farthest[i]:.3g} {unit}"
+        )
+    more = f" and {len(passed) - _SHOWN} more joints" if len(passed) > _SHOWN else ""
+    one = len(passed) == 1
+    return (
+        f"{', '.join(words)}{more}: nothing stops {'it' if one else 'them'} there, give "
+        f"{'it an end stop' if one else 'them end stops'}"
+    )
 
 
 def imbalance(rows: Parts, step: float) -> str:

@@ -183,6 +183,8 @@ def _integration(
         )
     if method in (None, "rk4"):
         return Steps(dynamics, control, own)
+    if method in ADAPTIVE and dynamics.machine.coordinates.floating:
+        raise InputError(f"method '{method}' does not go round with a body that floats, take rk4")
     if method in ADAPTIVE:
         return AdaptiveSteps(dynamics, control, own, method)
     raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")

@@ -244,6 +244,8 @@ def _unit(machine: Machine, head: str, rest: list[str]) -> str:
         return f"{force} s/{length}" if last.startswith("viscous") else force
     if last in ("lower", "upper"):
         return machine.unit(".".join([head, *rest[:-1]]))
+    if last == "rotor_inertia":
+        return "kg" if machine.unit(".".join([head, *rest[:-1]])) == "m" else "kg m2"
     if "inertia" in rest:
         return "kg m2"
     return {"mass": "kg", "x": "m", "y": "m", "z": "m"}.get(last, "rad")

@@ -7,12 +7,13 @@ import pinocchio as pin
 
 from crane.closure import Closure
 from crane.closure.equations import LoopEquations
-from crane.closure.structure import least_squares_step
+from crane.closure.exactness import least_squares_step
 from crane.common.errors import CraneWarning, MechanismError
 from crane.common.samples import Array
 from crane.description import MachineSpec
 from crane.description.findings import Findings, flag
 from crane.formats.ambiguity import warn_of_assemblies
+from crane.formats.home import warn_of_home
 from crane.machine.assemble import assemble, closed, home_guess
 from crane.machine.masses import check_masses
 
@@ -50,6 +51,7 @@ def check_mechanism(spec: MachineSpec, found: Findings) -> Closure | None:
         loops.remove(idle[0])
     check_masses(spec, model, closure)
     _warn_of_limits(spec, closure)
+    warn_of_home(spec, closure)
     warn_of_assemblies(spec, closure, guess, thorough=True)
     return closure
 
@@ -69,7 +71,7 @@ def _note_with_gaps(
 def _gaps(spec: MachineSpec, model: pin.Model, guess: Array) -> dict[str, str]:
     """How far apart and askew the frames of open loops are, as near as they come to closing."""
     equations = LoopEquations(model, spec.loops, spec.couplings)
-    active = [model.joints[model.getJointId(name)].idx_v for name in spec.active or ()]
+    active = [equations.coordinates.column(name) for name in spec.active or ()]
     every = np.arange(model.nv)
     phi = np.zeros(0)
     for free in (every, np.setdiff1d(every, active)):
@@ -99,10 +101,10 @@ def _length(metres: float) -> str:
 
 def _warn_of_limits(spec: MachineSpec, closure: Closure) -> None:
     """Warn of passive joints that are outside of their limits at home."""
-    model = closure.model
+    coordinates = closure.equations.coordinates
     for column in closure.passive:
-        name = model.names[int(column) + 1]
-        lower, upper = model.lowerPositionLimit[column], model.upperPositionLimit[column]
+        name = coordinates.names[int(column)]
+        lower, upper = coordinates.lower[column], coordinates.upper[column]
         q = closure.home[column]
         if not lower - 1e-9 <= q <= upper + 1e-9:
             place = spec.tree.joints[name].where

@@ -1,23 +1,30 @@
 """The check of a machine: reading, assembling and closing it, and whether its numbers fit."""
 
 import re
+import shlex
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from crane.closure import Closure
+from crane.common.counted import kind
 from crane.common.errors import CraneWarning
+from crane.common.output import file_name
 from crane.description import MachineSpec, driven
 from crane.description.findings import Findings, collecting, recoverable
+from crane.description.floating import floated
 from crane.description.sources import find
 from crane.formats.check.mechanism import check_mechanism
 from crane.formats.check.plausible import implausible
 from crane.formats.machine_file.read import read
+from crane.machine.masses import has_mass
 
 # "four_bar.yaml:12: what", or a file that has no line to point at
 _PLACE = re.compile(r"(?P<file>.+?)(?::(?P<line>\d+)|(?<=\.yaml|\.urdf)|(?<=\.xml|\.yml)): ")
 _MOST = 500  # findings in a report
+_SHOWN = 14  # kinds of findings on a screen
+_LINES = 6  # that have a finding of one kind
 
 
 @dataclass(frozen=True)
@@ -49,11 +56,27 @@ class Report:
         findings: By file and line.
         summary: One line on the machine, None where it cannot be loaded.
         full: Whether there was more than is listed.
+        next: The command to type next.
     """
 
     findings: tuple[Finding, ...]
     summary: str | None
     full: bool
+    next: str
+
+    @property
+    def lines(self) -> list[str]:
+        """One screen: each kind of finding once, with the lines of those like it; errors first."""
+        groups: dict[tuple[str, bool, str], list[Finding]] = {}
+        for finding in sorted(self.findings, key=lambda one: not one.error):
+            groups.setdefault((finding.file, finding.error, kind(finding.what)), []).append(
+                finding
+            )
+        told = [_together(some) for some in groups.values()]
+        if len(told) > _SHOWN:
+            rest = sum(len(some) for some in list(groups.values())[_SHOWN:])
+            told[_SHOWN:] = [f"{rest} more, of {len(groups) - _SHOWN} other kinds"]
+        return told
 
     @property
     def errors(self) -> int:
@@ -81,7 +104,10 @@ class Report:
 
 
 def check(
-    name: str | Path, active: Sequence[str] | None = None, free: Sequence[str] | None = None
+    name: str | Path,
+    active: Sequence[str] | None = None,
+    free: Sequence[str] | None = None,
+    floating: bool = False,
 ) -> Report:
     """Read a machine as far as possible, and say all that is wrong or unusual about it.
 
@@ -91,6 +117,7 @@ def check(
         name: As for `load`.
         active: As for `load`.
         free: As for `load`.
+        floating: As for `load`.
 
     Raises:
         DescriptionError: There is no such file.
@@ -103,6 +130,7 @@ def check(
         warnings.simplefilter("always", CraneWarning)
         with recoverable():
             spec = read(path)
+            spec = floated(spec) if floating else spec
         if spec is not None and (active is not None or free is not None):
             with recoverable():
                 spec = driven(spec, active, free)
@@ -119,7 +147,36 @@ def check(
     if spec is not None and closure is not None and not found.errors:
         summary = _summary(spec, closure)
     ordered = sorted(set(findings), key=lambda x: (x.file, x.line, not x.error, x.what))
-    return Report(tuple(ordered[:_MOST]), summary, found.full or len(ordered) > _MOST)
+    full = found.full or len(ordered) > _MOST
+    return Report(tuple(ordered[:_MOST]), summary, full, _next(name, spec, closure, summary))
+
+
+def _together(alike: list[Finding]) -> str:
+    """Findings of one kind as one line."""
+    others = [str(one.line) for one in alike[1:] if one.line]
+    if len(alike) == 1:
+        return str(alike[0])
+    dots = ["..."] if len(others) > _LINES else []
+    lines = f", lines {', '.join(others[:_LINES] + dots)}" if others else ""
+    return f"{alike[0]} ({len(alike)} such{lines})"
+
+
+def _next(
+    name: str | Path, spec: MachineSpec | None, closure: Closure | None, summary: str | None
+) -> str:
+    """What to type next."""
+    called = shlex.quote(str(name))
+    if spec is None or closure is None or summary is None:
+        return f"crane check {called} again, once the errors are mended"
+    if closure.sought is not None:
+        return f"crane check {called} --write-home"
+    if not has_mass(closure.model):
+        return f"crane live {called}"
+    for task in spec.tasks.values():
+        return (
+            f"crane simulate {called} --task {shlex.quote(task.name)} --out {file_name(task.name)}"
+        )
+    return f"crane simulate {called} --duration 2 --out {file_name(spec.name)}"
 
 
 def _closed(spec: MachineSpec, found: Findings) -> Closure | None:

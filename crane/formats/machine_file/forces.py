@@ -73,6 +73,18 @@ def _force_element(joint: str, item: Section) -> ForceElement:
     return element
 
 
+def read_rotors(top: Section, tree: TreeBuilder) -> dict[str, float]:
+    """Rotor inertia by joint."""
+    found: dict[str, float] = {}
+    section = top.section("rotor_inertia", "'rotor_inertia'")
+    for joint in section or ():
+        assert section is not None
+        with recoverable():
+            tree.check_joint(joint, section.where(joint))
+            found[joint] = section.number(joint, minimum=0.0)
+    return found
+
+
 def read_gas_springs(top: Section, tree: TreeBuilder) -> tuple[GasSpring, ...]:
     """Enclosed gas along joints."""
     springs = []

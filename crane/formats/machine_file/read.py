@@ -11,6 +11,7 @@ from crane.description.spec import (
     LOOP_TYPES,
     Chain,
     Coupling,
+    Drive,
     Friction,
     Load,
     LoopSpec,
@@ -20,14 +21,17 @@ from crane.description.spec import (
     places,
     unit_vector,
 )
+from crane.description.tree import with_rotors
 from crane.formats.machine_file.circuit import check_active, read_hydraulics
 from crane.formats.machine_file.forces import (
     read_end_stops,
     read_forces,
     read_friction,
     read_gas_springs,
+    read_rotors,
 )
 from crane.formats.machine_file.open_loops import warn_of_open_loops
+from crane.formats.machine_file.posture import read_home
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tasks import read_tasks
 from crane.formats.machine_file.tree_builder import TreeBuilder
@@ -37,8 +41,8 @@ from crane.formats.urdf.read import Urdf, is_urdf, read_urdf
 Part = TypeVar("Part")
 
 _KEYS = (
-    "name", "source", "chains", "loops", "active", "free", "home", "friction", "forces",
-    "gas_springs", "end_stops", "couplings",
+    "name", "source", "chains", "loops", "active", "free", "drives", "home", "friction", "forces",
+    "gas_springs", "end_stops", "rotor_inertia", "couplings",
     "tip", "payload", "tasks", "control", "hydraulics",
 )  # fmt: skip
 
@@ -113,8 +117,9 @@ def _read_machine(path: Path) -> MachineSpec:
         active = Anything()
     free = _free(top, tree, active)
     where = {key: top.where(key) for key in top} | places(loops, couplings)
-    home, home_lines = _home(top, tree)
+    home, home_lines = read_home(top, tree)
     where |= {f"home {joint}": place for joint, place in home_lines.items()}
+    rotors = _part(read_rotors, {}, top, tree)
     friction |= _part(read_friction, {}, top, tree)
     forces = _part(read_forces, (), top, tree)
     gas_springs = _part(read_gas_springs, (), top, tree)
@@ -133,8 +138,9 @@ def _read_machine(path: Path) -> MachineSpec:
         tasks = _part(read_tasks, tasks, top, active, tip, valves)
         control = _part(_control, control, top, active)
     return MachineSpec(
-        name, source, path, chains, tree.tree, loops, active, home, friction, forces,
-        gas_springs, end_stops, tip, tasks, control, hydraulics, couplings, where, payload, free,
+        name, source, path, chains, with_rotors(tree.tree, rotors), loops, active, home, friction,
+        forces, gas_springs, end_stops, tip, tasks, control, hydraulics, couplings, where, payload,
+        free, _part(_drives, (), top, tree),
     )  # fmt: skip
 
 
@@ -156,21 +162,6 @@ def _part(read: Callable[..., Part], nothing: Any, *arguments: object) -> Part:
     with recoverable(harmless=True):
         return read(*arguments)
     return nothing
-
-
-def _home(top: Section, tree: TreeBuilder) -> tuple[dict[str, float], dict[str, str]]:
-    """Coordinates of the home posture, and where each was written."""
-    home, where = {}, {}
-    section = None
-    with recoverable():
-        section = top.section("home", "'home'")
-    for joint in section or ():
-        assert section is not None
-        with recoverable():
-            tree.check_joint(joint, section.where(joint))
-            home[joint] = section.number(joint)
-            where[joint] = section.where(joint)
-    return home, where
 
 
 def _tip(top: Section, tree: TreeBuilder) -> str | None:
@@ -304,6 +295,22 @@ def _factor(joints: Section, joint: str) -> float:
     if factor == 0:
         flag(joints.fail(joint, f"the factor of '{joint}' is 0, leave it out"))
     return factor
+
+
+def _drives(top: Section, tree: TreeBuilder) -> tuple[Drive, ...]:
+    """What motors act along, where that is not the active joints one by one."""
+    found = []
+    section = top.section("drives", "'drives'")
+    for name in section or ():
+        assert section is not None
+        with recoverable():
+            joints = section.section(name, f"drive '{name}'")
+            if joints is None or not list(joints):
+                raise section.fail(name, f"drive '{name}' moves no joint, name some")
+            for joint in joints:
+                tree.check_joint(joint, joints.where(joint))
+            found.append(Drive(name, {joint: _factor(joints, joint) for joint in joints}))
+    return tuple(found)
 
 
 def _payload(top: Section, tree: TreeBuilder, tip: str | None) -> Load | None:

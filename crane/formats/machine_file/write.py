@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import shutil
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -14,7 +13,16 @@ from crane.common.errors import CraneError, CraneWarning, InputError, OutputErro
 from crane.common.output import file_name, staging
 from crane.description import Task
 from crane.formats.machine_file.read import read
-from crane.formats.parts import add_joint, add_link, draw, finished, origin_of
+from crane.formats.parts import (
+    add_joint,
+    add_link,
+    draw,
+    drives_of,
+    finished,
+    origin_of,
+    rotors_of,
+    with_whole_flyers,
+)
 from crane.hydraulics import Cylinder, Hydraulics, Valve
 from crane.hydraulics.components import HOLDING, number_names
 from crane.machine import Machine
@@ -34,27 +42,75 @@ def write_machine(machine: Machine, folder: str | Path) -> Path:
         InputError: A coupling holds a single joint.
         OutputError: The folder cannot be written, or holds what the machine was read from.
     """
-    chains = _Chains(machine)
-    name = file_name(machine.name)
-    file = f"{name}.yaml"
-    data = _content(machine, chains)
-    load = _payload(machine)
-    if load is not None:
-        data["payload"] = {"urdf": load.name}
+    file = f"{file_name(machine.name)}.yaml"
+    draft = Draft(machine)
     originals = {machine.path, *(chain.urdf for chain in machine.chains)}
-    for written in (file, *chains.files.values()):
+    for written in draft.files(file):
         if (place := (Path(folder) / written).resolve()) in originals:
             raise OutputError(
                 f"{place}: is what '{machine.name}' was read from, choose another folder"
             )
     with staging(folder) as part:
-        for chain in chains.names:
-            content = finished(chains.robot(chain), origin_of(machine))
-            (part / chains.files[chain]).write_bytes(content)
-        if load is not None:
-            shutil.copyfile(load, part / load.name)
-        (part / file).write_text(_yaml(data), encoding="utf-8")
+        draft.write(part, file)
     return Path(folder) / file
+
+
+class Draft:
+    """A machine as machine file and URDFs that are not written yet.
+
+    Args:
+        machine: The machine, as it is: with its changes, locks and payload.
+        folder: Of the URDFs, from the machine file's on.
+
+    Attributes:
+        data: What the machine file says.
+        robots: The URDF of each sub-chain.
+
+    Raises:
+        InputError: A coupling holds a single joint.
+    """
+
+    def __init__(self, machine: Machine, folder: str = ""):
+        self._chains = _Chains(machine)
+        self._folder, self._comment = folder, origin_of(machine)
+        self.data = _content(machine)
+        self.robots: dict[str, etree._Element] = {}
+        for name in self._chains.names:
+            parent = {"parent": self._chains.parents[name]} if name in self._chains.parents else {}
+            self.add_chain(name, self._chains.robot(name), parent)
+        load = _payload(machine)
+        self._load = None if load is None else (load.name, load.read_bytes())
+        if self._load is not None:
+            self.data["payload"] = {"urdf": self._inside(self._load[0])}
+
+    def add_chain(self, name: str, robot: etree._Element, more: Mapping[str, str]) -> None:
+        """Append a sub-chain; `more` is what its entry says beside its name and file."""
+        self.robots[name] = robot
+        file = self._inside(f"{len(self.robots)}_{file_name(name)}.urdf")
+        self.data["chains"].append({"name": name, "urdf": file, **more})
+
+    def robot_of(self, link: str) -> etree._Element:
+        """The URDF that a link is in."""
+        return self.robots[self._chains.chain_of[link]]
+
+    def files(self, file: str) -> list[str]:
+        """Paths of all files from the folder on, that of the machine file first."""
+        urdfs = [chain["urdf"] for chain in self.data["chains"]]
+        return [file, *urdfs, *([self.data["payload"]["urdf"]] if self._load else [])]
+
+    def write(self, folder: Path, file: str) -> None:
+        """Write all into a folder, the machine file by this name."""
+        (folder / self._folder).mkdir(exist_ok=True)
+        for chain in self.data["chains"]:
+            content = finished(self.robots[chain["name"]], self._comment)
+            (folder / chain["urdf"]).write_bytes(content)
+        if self._load is not None:
+            (folder / self.data["payload"]["urdf"]).write_bytes(self._load[1])
+        kept = {key: value for key, value in self.data.items() if value not in (None, [], {})}
+        (folder / file).write_text(_yaml(kept), encoding="utf-8")
+
+    def _inside(self, file: str) -> str:
+        return f"{self._folder}/{file}" if self._folder else file
 
 
 class _Chains:
@@ -65,44 +121,40 @@ class _Chains:
     """
 
     def __init__(self, machine: Machine):
-        self.machine, self.tree = machine, machine.tree
+        self.machine, self.tree = machine, with_whole_flyers(machine)
         self.chains = [chain for chain in machine.chains if chain.name != "payload"]
         self.names = [chain.name for chain in self.chains]
-        self.files = {name: f"{i}_{file_name(name)}.urdf" for i, name in enumerate(self.names, 1)}
         self.parents = {chain.name: str(chain.parent) for chain in self.chains[1:]}
         self._attached = {chain.attachment: chain.name for chain in self.chains[1:]}
         root = self.tree.root
-        self._chain_of = {root: self.names[0]}
+        self.chain_of = {root: self.names[0]}
         below, waiting = self.tree.below(), [root]
         while waiting:
             link = waiting.pop()
             for joint in below.get(link, ()):
-                within = self._attached.get(joint.name, self._chain_of[link])
-                self._chain_of[joint.child] = within
+                within = self._attached.get(joint.name, self.chain_of[link])
+                self.chain_of[joint.child] = within
                 waiting.append(joint.child)
 
     def robot(self, chain: str) -> etree._Element:
         """The URDF of a sub-chain."""
         robot = etree.Element("robot", name=chain)
         for link in self.tree.links.values():
-            if self._chain_of[link.name] == chain:
+            if self.chain_of[link.name] == chain:
                 add_link(robot, link)
         for joint in self.tree.joints.values():
-            if self._chain_of[joint.child] == chain and joint.name not in self._attached:
+            if self.chain_of[joint.child] == chain and joint.name not in self._attached:
                 add_joint(robot, joint)
         draw(robot, self.machine, [chain])
         return robot
 
 
-def _content(machine: Machine, chains: _Chains) -> dict[str, Any]:
-    """The machine file, without the payload."""
+def _content(machine: Machine) -> dict[str, Any]:
+    """The machine file, without chains and payload."""
     data: dict[str, Any] = {"name": machine.name}
     if machine.source:
         data["source"] = machine.source
     data["chains"] = []
-    for name in chains.names:
-        parent = {"parent": chains.parents[name]} if name in chains.parents else {}
-        data["chains"].append({"name": name, "urdf": chains.files[name], **parent})
     equations = machine.closure.equations
     data["loops"] = [
         {
@@ -120,7 +172,8 @@ def _content(machine: Machine, chains: _Chains) -> dict[str, Any]:
             )
         item = {"name": coupling.name, "joints": dict(coupling.factors)}
         data["couplings"].append(item | ({"offset": coupling.offset} if coupling.offset else {}))
-    data["active"] = list(machine.active)
+    data["active"] = _driven(machine)
+    data["free"] = list(machine.free)
     data["home"] = dict(zip(machine.joints, machine.home.tolist(), strict=True))
     data["friction"] = {
         joint: _numbers(law) or {"viscous": 0.0} for joint, law in machine.friction.items()
@@ -128,12 +181,21 @@ def _content(machine: Machine, chains: _Chains) -> dict[str, Any]:
     data["forces"] = [_numbers(item) for item in machine.forces]
     data["gas_springs"] = {item.joint: _numbers(item, "joint") for item in machine.gas_springs}
     data["end_stops"] = {item.joint: _numbers(item, "joint") for item in machine.end_stops}
+    data["rotor_inertia"] = rotors_of(machine)
+    data["drives"] = drives_of(machine)
     data["tip"] = machine.tip
     data["tasks"] = {name: _task(task) for name, task in machine.tasks.items()}
     data["control"] = {joint: _numbers(gains) for joint, gains in machine.control.items()}
     if machine.hydraulics is not None:
         data["hydraulics"] = _hydraulics(machine.hydraulics)
-    return {key: value for key, value in data.items() if value not in (None, [], {})}
+    return data
+
+
+def _driven(machine: Machine) -> list[str]:
+    """Joints under `active`: drives in surplus are among them."""
+    if machine.motors and all(list(x.factors.values()) == [1.0] for x in machine.motors):
+        return [joint for motor in machine.motors for joint in motor.factors]
+    return [joint for joint in machine.active if joint not in machine.free]
 
 
 def _numbers(item: Any, *without: str) -> dict[str, Any]:

@@ -10,9 +10,11 @@ import pinocchio as pin
 
 from crane.common.errors import DescriptionError
 from crane.description.spec import Coupling, LoopSpec
+from crane.formats.mjcf.acting import fixed_tendon
 from crane.formats.mjcf.file import MujocoFile
 
 _SAME = 1e-9  # relative difference of two distances that counts as none
+_TORQUE_SCALE = 10  # its place among the numbers of a weld
 _Z = (0.0, 0.0, 1.0)
 
 
@@ -60,9 +62,11 @@ def read_equality(
 ) -> tuple[tuple[LoopSpec, ...], tuple[Coupling, ...]]:
     """Loops and couplings of the equality constraints that are switched on.
 
-    `connect` is a spherical loop, `weld` a fixed one. Two `connect` of the same two bodies, at
-    points with the same distance on both, are a hinge about the line through them: they become
-    one revolute loop, whose five equations say the same as their six.
+    `connect` is a spherical loop, `weld` a fixed one, or a spherical one if its `torquescale` is
+    zero. Two `connect` of the same two bodies, at points with the same distance on both, are a
+    hinge about the line through them: they become one revolute loop, whose five equations say the
+    same as their six. What a program moves (mocap) is no part of a machine, so constraints to it
+    are left out, and those within one body.
 
     Args:
         mjcf: The file.
@@ -82,7 +86,9 @@ def read_equality(
         where = mjcf.where_equality(index)
         name = mjcf.name("EQUALITY", index).strip() or f"{kind.lower()}{index + 1}"
         if not model.eq_active0[index]:
-            mjcf.warn(f"the constraint '{name}' is switched off and left out")
+            mjcf.lose("constraints that are switched off", name)
+            continue
+        if kind in ("CONNECT", "WELD") and _idle(mjcf, index, name):
             continue
         while name in names:
             name += "_"
@@ -91,12 +97,14 @@ def read_equality(
             waiting.append((name, where, *_ends(mjcf, frames, index, kind)))
         elif kind == "WELD":
             one, two = _ends(mjcf, frames, index, kind)
-            loops.append(_loop(name, "fixed", one, two, frames, where))
+            turns_too = model.eq_data[index, _TORQUE_SCALE] != 0
+            style = "fixed" if turns_too else "spherical"
+            loops.append(_loop(name, style, one, two, frames, where))
         elif kind == "JOINT":
             sums = [[(i, 1.0)] if i >= 0 else [] for i in _objects(model, index)]
             couplings.append(_coupling(mjcf, name, where, sums, index, parts))
         elif kind == "TENDON":
-            sums = [_fixed_tendon(mjcf, i, name, where) for i in _objects(model, index)]
+            sums = [_tendon(mjcf, i, name, where) for i in _objects(model, index)]
             couplings.append(_coupling(mjcf, name, where, sums, index, parts))
         else:
             raise DescriptionError(
@@ -108,6 +116,25 @@ def read_equality(
 
 def _objects(model: Any, index: int) -> tuple[int, int]:
     return int(model.eq_obj1id[index]), int(model.eq_obj2id[index])
+
+
+def _bodies(model: Any, kind: str, objects: tuple[int, int]) -> list[int]:
+    """The bodies that a connect or weld joins."""
+    return [int(model.site_bodyid[x]) if kind == "SITE" else x for x in objects]
+
+
+def _idle(mjcf: MujocoFile, index: int, name: str) -> bool:
+    """Whether a connect or weld binds nothing of the machine, which is noted."""
+    model = mjcf.model
+    kind = mjcf.kind("Obj", model.eq_objtype[index])
+    bodies = _bodies(model, kind, _objects(model, index))
+    if any(model.body_mocapid[body] >= 0 for body in bodies):
+        mjcf.lose("constraints to what a program moves (mocap)", name)
+        return True
+    if len({int(model.body_weldid[body]) for body in bodies}) == 1:
+        mjcf.lose("constraints within one body", name)
+        return True
+    return False
 
 
 def _ends(mjcf: MujocoFile, frames: Frames, index: int, kind: str) -> tuple[_Anchor, _Anchor]:
@@ -206,19 +233,16 @@ def _along(line: np.ndarray) -> np.ndarray:
     return np.column_stack([first, np.cross(third, first), third])
 
 
-def _fixed_tendon(mjcf: MujocoFile, tendon: int, name: str, where: str) -> list[tuple[int, float]]:
-    """Joints of a fixed tendon and their factors."""
-    model, found = mjcf.model, []
+def _tendon(mjcf: MujocoFile, tendon: int, name: str, where: str) -> list[tuple[int, float]]:
+    """Joints of a fixed tendon and their factors; none for the tendon that is not there."""
     if tendon < 0:
         return []
-    start = model.tendon_adr[tendon]
-    for wrap in range(start, start + model.tendon_num[tendon]):
-        if mjcf.kind("Wrap", model.wrap_type[wrap]) != "JOINT":
-            raise DescriptionError(
-                f"{where}: the constraint '{name}' is about a tendon in space, use a fixed one"
-            )
-        found.append((int(model.wrap_objid[wrap]), float(model.wrap_prm[wrap])))
-    return found
+    factors = fixed_tendon(mjcf, tendon)
+    if factors is None:
+        raise DescriptionError(
+            f"{where}: the constraint '{name}' is about a tendon in space, use a fixed one"
+        )
+    return list(factors.items())
 
 
 def _coupling(

@@ -2,15 +2,19 @@
 
 import re
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from lxml import etree
 
 from crane.common.errors import CraneWarning, DescriptionError
 from crane.formats.mjcf.bounds import copies
+from crane.formats.mjcf.missing import MassMissingError, missing_file, without_files
 from crane.formats.xml import XmlFile
 
+_SHOWN = 6  # names in a line
 _INSTALL = "reading MJCF needs MuJoCo, install it: pip install 'crane-dynamics[mjcf]'"
 
 
@@ -34,6 +38,8 @@ class MujocoFile:
     def __init__(self, file: Path):
         self.file = file
         self._files: list[XmlFile] = []
+        self._lost: dict[str, list[str]] = {}
+        self._otherwise: dict[str, list[str]] = {}
         self._sizes: dict[Path, int] = {}
         self._open(file, [])
         try:
@@ -45,13 +51,33 @@ class MujocoFile:
         before = mujoco.get_mju_user_warning()
         mujoco.set_mju_user_warning(told.append)  # else into a file in the working folder
         try:
-            self.model: Any = mujoco.MjModel.from_xml_path(str(file))
+            self.model: Any = self._compiled()
+        except MassMissingError as error:
+            raise DescriptionError(
+                f"{self.where(error.body, 'body')}: body '{error.body}' has its mass from "
+                f"'{error.mesh}', which is not there: put the file there, or give the body an "
+                "<inertial>"
+            ) from None
         except Exception as error:  # ValueError, FatalError, and others of its parts
             raise self._refused(str(error) or type(error).__name__) from None
         finally:
             mujoco.set_mju_user_warning(before)
-        for text in told:
-            self.warn(f"MuJoCo says {' '.join(text.split())}")
+        if told := [" ".join(text.split()) for text in dict.fromkeys(told)]:
+            self.warn(f"MuJoCo says {'; '.join(told)}")
+
+    def _compiled(self) -> Any:
+        """MuJoCo's model, without shapes and pictures whose files are not there."""
+        path = str(self.file)
+        try:
+            return self._mujoco.MjModel.from_xml_path(path)
+        except ValueError as error:
+            if not (name := missing_file(str(error))):
+                raise
+        model, files, lighter = without_files(self._mujoco, path, name)
+        self.lose("meshes and pictures that are not there", *(Path(x).name for x in files))
+        if lighter:
+            self.differ("bodies without the mass of their meshes, which are not there", *lighter)
+        return model
 
     def _open(self, file: Path, above: list[Path], wanted: str = "mujoco") -> int:
         """Read a file and what it includes, strictly; the number of elements it stands for."""
@@ -117,6 +143,24 @@ class MujocoFile:
         """Name of a body, invented where it has none."""
         return self.name("BODY", index).strip() or f"body{index}"
 
+    def joint(self, index: int) -> str:
+        """Name of a joint, invented where it has none."""
+        return self.name("JOINT", index).strip() or f"joint{index + 1}"
+
+    def tendon(self, index: int) -> str:
+        """Name of a tendon, invented where it has none."""
+        return self.name("TENDON", index).strip() or f"tendon{index + 1}"
+
+    def actuator(self, index: int) -> str:
+        """Name of an actuator, invented where it has none."""
+        return self.name("ACTUATOR", index).strip() or f"actuator{index + 1}"
+
+    def transmission(self, actuator: int) -> tuple[str, int]:
+        """What an actuator acts by, such as JOINT or TENDON, and the number of that."""
+        kind = self.kind("Trn", self.model.actuator_trntype[actuator])
+        target = int(self.model.actuator_trnid[actuator, 0])
+        return "JOINT" if kind == "JOINTINPARENT" else kind, target
+
     @property
     def switched_off(self) -> set[str]:
         """What the file switches off of MuJoCo's computing, such as CONTACT."""
@@ -148,6 +192,42 @@ class MujocoFile:
         xml, element = found[index]
         return xml.where(element)
 
+    def lose(self, what: str, *names: str) -> None:
+        """Note what is left out, to be told in one line with all else."""
+        self._lost.setdefault(what, []).extend(names)
+
+    def differ(self, what: str, *names: str) -> None:
+        """Note what is taken otherwise than MuJoCo does."""
+        self._otherwise.setdefault(what, []).extend(names)
+
+    def tell(self) -> None:
+        """Warn of all that has been noted, in a line of each kind."""
+        for head, noted in (
+            ("left out of what MuJoCo has", self._lost),
+            ("otherwise than in MuJoCo", self._otherwise),
+        ):
+            words = [f"{what} ({listed(x)})" if x else what for what, x in noted.items()]
+            if words:
+                self.warn(f"{head}: {'; '.join(words)}")
+
     def warn(self, text: str) -> None:
-        """Tell of something that is left out."""
+        """Warn at once."""
         warnings.warn(f"{self.file.name}: {text}", CraneWarning, stacklevel=3)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Names, the first of many."""
+    names = list(dict.fromkeys(names))
+    more = [f"{len(names) - _SHOWN} more"] if len(names) > _SHOWN else []
+    return ", ".join(names[:_SHOWN] + more)
+
+
+def rows(model: Any, field: str) -> list[int]:
+    """Rows of a field in which a number is not zero; newer versions have more than older ones."""
+    values = getattr(model, field, None)
+    if values is None or not np.size(values):
+        return []
+    found: list[int] = np.flatnonzero(
+        np.any(np.reshape(values, (len(values), -1)), axis=1)
+    ).tolist()
+    return found

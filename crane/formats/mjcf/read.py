@@ -7,13 +7,16 @@ import numpy as np
 import pinocchio as pin
 
 from crane.common.errors import DescriptionError
+from crane.description.floating import with_rotation_vectors
 from crane.description.rigid import inertial, placement, vector
-from crane.description.spec import Chain, Drive, ForceElement, Friction, MachineSpec, places
-from crane.description.tree import Inertial, Joint, Limits, Link, Tree, limit
+from crane.description.spec import Chain, MachineSpec, places
+from crane.description.tree import Inertial, Joint, Limits, Link, Tree, limit, with_rotors
 from crane.formats.machine_file.tree_builder import TreeBuilder
+from crane.formats.mjcf.acting import isotropic, read_acting
+from crane.formats.mjcf.actuators import read_drives
 from crane.formats.mjcf.equality import Frames, read_equality
 from crane.formats.mjcf.file import MujocoFile
-from crane.formats.mjcf.left_out import warn_of_the_rest
+from crane.formats.mjcf.left_out import note_the_rest
 from crane.formats.series import parts_of, series
 from crane.formats.urdf.read import Urdf
 
@@ -43,14 +46,11 @@ class _Reader:
         self.joints: dict[str, Joint] = {}
         self.bodies: list[str] = []  # their links
         self.parts: dict[int, list[str]] = {}  # joint of MuJoCo -> joints
-        self.friction: dict[str, Friction] = {}
-        self.forces: list[ForceElement] = []
 
     def spec(self) -> MachineSpec:
         """The machine."""
         mjcf = self.mjcf
-        joints = [self._name("JOINT", i) for i in range(self.model.njnt)]
-        self.names = joints
+        self.names = [mjcf.joint(i) for i in range(self.model.njnt)]
         for body in range(self.model.nbody):
             self._body(body)
         if not self.model.njnt:
@@ -60,15 +60,16 @@ class _Reader:
         for link, (body, place) in frames.made.items():
             self._add_link(link, frames.where[link])
             self._fix(link, self.bodies[body], place)
-        warn_of_the_rest(mjcf, joints)
+        acting, drives = read_acting(mjcf, self.parts), read_drives(mjcf, self.parts)
+        note_the_rest(mjcf)
         urdf = Urdf(
             mjcf.file,
             mjcf.file.stem,
-            Tree(self.links, self.joints),
+            with_rotors(Tree(self.links, self.joints), acting.rotors),
             self.bodies[0],
             loops,
             None,
-            self.friction,
+            acting.friction,
             couplings,
         )
         chain = Chain(mjcf.file.stem, mjcf.file, None, mjcf.file.name, urdf.moving)
@@ -76,37 +77,36 @@ class _Reader:
         tree.add(chain, urdf)
         for loop in loops:
             tree.check_loop(loop)
-        active = self._active()
-        if active is None and (loops or couplings):
-            active = ()
-        home = self._home()
+        active = self._listed("active")
+        for drive in drives if not active else ():
+            # one joint of each: what else it moves hangs on that, or is another coordinate
+            active += [x for x in drive.factors if x not in active][:1]
+        free = self._listed("free")
+        home, tip = self._home(), self._tip(tree)
+        mjcf.tell()
         homes = {f"home {joint}": self.joints[joint].where for joint in home}
-        return MachineSpec(
+        spec = MachineSpec(
             name=self._custom("name") or mjcf.file.stem,
             source=self._custom("source") or mjcf.file.name,
             path=mjcf.file,
             chains=(chain,),
             tree=tree.tree,
             loops=loops,
-            active=active,
+            active=tuple(active) if active or loops or couplings else None,
             home=home,
-            friction=self.friction,
-            forces=tuple(self.forces),
-            tip=self._tip(tree),
+            friction=acting.friction,
+            forces=tuple(acting.springs),
+            tip=tip,
             couplings=couplings,
             where=places(loops, couplings) | homes,
-            drives=tuple(Drive(joint, {joint: 1.0}) for joint in active or ()),
+            free=tuple(free),
+            drives=drives,
         )
-
-    def _name(self, kind: str, index: int) -> str:
-        """Name of a body or joint, invented where it has none."""
-        if kind == "BODY":
-            return self.mjcf.body(index)
-        return self.mjcf.name(kind, index).strip() or f"joint{index + 1}"
+        return with_rotation_vectors(spec)
 
     def _link(self, wanted: str) -> str:
         """A name for a link that no body and no other link has."""
-        taken = {self._name("BODY", i) for i in range(self.model.nbody)}
+        taken = {self.mjcf.body(i) for i in range(self.model.nbody)}
         taken |= self.links.keys()
         while wanted in taken:
             wanted += "_"
@@ -127,7 +127,7 @@ class _Reader:
 
     def _body(self, body: int) -> None:
         """A body with its joints."""
-        model, name = self.model, self._name("BODY", body)
+        model, name = self.model, self.mjcf.body(body)
         where = self.mjcf.where(name, "body")
         self.bodies.append(name)
         if body == 0:
@@ -135,13 +135,17 @@ class _Reader:
             return
         turn = _rotation(model.body_iquat[body])
         tensor = turn @ np.diag(model.body_inertia[body]) @ turn.T
+        first = model.body_jntadr[body]
+        joints = range(first, first + model.body_jntnum[body])
+        for joint in joints:
+            if self.mjcf.kind("Joint", model.jnt_type[joint]) in ("BALL", "FREE"):
+                tensor = tensor + isotropic(self.mjcf, joint) * np.eye(3)
         inertia = pin.Inertia(float(model.body_mass[body]), model.body_ipos[body].copy(), tensor)
         parent = self.bodies[model.body_parentid[body]]
         place = pin.SE3(_rotation(model.body_quat[body]), model.body_pos[body].copy())
-        first = model.body_jntadr[body]
         parts: list[Joint] = []
         at = np.zeros(3)  # anchor of the part before, in the body's frame
-        for joint in range(first, first + model.body_jntnum[body]):
+        for joint in joints:
             if model.jnt_type[joint] == 0:
                 place = pin.SE3.Identity()
             anchor = model.jnt_pos[joint].copy()
@@ -164,21 +168,12 @@ class _Reader:
             self._fix(name, parent, place if not parts else pin.SE3(np.eye(3), -at))
 
     def _joint(self, joint: int, place: pin.SE3) -> list[Joint]:
-        """The freedoms of a joint, without their links, and what acts on them."""
+        """The freedoms of a joint, without their links."""
         model, name = self.model, self.names[joint]
         where = self.mjcf.where(name, "joint", "freejoint")
         kind = self.mjcf.kind("Joint", model.jnt_type[joint])
-        dof = model.jnt_dofadr[joint]
         if kind in ("BALL", "FREE"):
             parts = parts_of("spherical" if kind == "BALL" else "floating", (0.0, 0.0, 1.0))
-            own = range(dof, dof + len(parts))
-            if model.dof_damping[own].any() or model.dof_frictionloss[own].any() or (
-                model.jnt_stiffness[joint]
-            ):  # fmt: skip
-                self.mjcf.warn(
-                    f"damping, friction and stiffness of the {kind.lower()} joint '{name}' are "
-                    "left out, a machine has them along single freedoms"
-                )
             made = series(name, parts, placement(place), ("", ""), where)
             return [part for part in made if isinstance(part, Joint)]
         axis = model.jnt_axis[joint].copy()
@@ -192,12 +187,6 @@ class _Reader:
         if model.jnt_limited[joint]:
             lower, upper = (limit(float(x)) for x in model.jnt_range[joint])
             limits = Limits(lower, upper, where=where)
-        damping, loss = float(model.dof_damping[dof]), float(model.dof_frictionloss[dof])
-        if damping or loss:
-            self.friction[name] = Friction(viscous=damping, coulomb=loss)
-        if stiffness := float(model.jnt_stiffness[joint]):
-            rest = float(model.qpos_spring[model.jnt_qposadr[joint]])
-            self.forces.append(ForceElement(name, stiffness=stiffness, rest=rest))
         style = "revolute" if turns else "prismatic"
         return [Joint(name, style, "", "", where, *placement(place), vector(axis), limits)]
 
@@ -217,34 +206,12 @@ class _Reader:
             )
         return frames
 
-    def _active(self) -> tuple[str, ...] | None:
-        """Joints that actuators drive, in their order."""
-        model, found = self.model, []
-        for index in range(model.nu):
-            kind = self.mjcf.kind("Trn", model.actuator_trntype[index])
-            name = self.mjcf.name("ACTUATOR", index)
-            if kind not in ("JOINT", "JOINTINPARENT"):
-                self.mjcf.warn(
-                    f"the actuator '{name}' acts by a {kind.lower()} and is left out, those of "
-                    "joints make them active"
-                )
-                continue
-            parts = self.parts[int(model.actuator_trnid[index, 0])]
-            if len(parts) > 1:
-                where = self.mjcf.where(name, "motor", "position", "velocity", "general")
-                raise DescriptionError(
-                    f"{where}: the actuator '{name}' drives a joint with {len(parts)} freedoms, "
-                    "drive hinges or slides"
-                )
-            if parts[0] not in found:
-                found += parts
-        return tuple(found) or None
-
     def _home(self) -> dict[str, float]:
-        """Coordinates of the key "home", or else of the posture that the file draws."""
+        """Coordinates of the key "home", else of the first key, else as the file draws them."""
         model = self.model
-        keys = {self.mjcf.name("KEY", i): i for i in range(model.nkey)}
-        qpos = model.key_qpos[keys["home"]] if "home" in keys else model.qpos0
+        keys = [self.mjcf.name("KEY", i) for i in range(model.nkey)]
+        at_home = keys.index("home") if "home" in keys else 0
+        qpos = model.key_qpos[at_home] if keys else model.qpos0
         home: dict[str, float] = {}
         for joint, names in self.parts.items():
             at = model.jnt_qposadr[joint]
@@ -254,8 +221,16 @@ class _Reader:
                 values = [*qpos[at : at + 3], *_cardan(_rotation(qpos[at + 3 : at + 7]))]
             elif kind == "BALL":
                 values = _cardan(_rotation(qpos[at : at + 4]))
-            home |= {x: float(value) for x, value in zip(names, values, strict=True) if value}
+            home |= {x: self._within(x, float(y)) for x, y in zip(names, values, strict=True) if y}
         return home
+
+    def _within(self, joint: str, value: float) -> float:
+        """A coordinate of home within the limits of its joint."""
+        limits = self.joints[joint].limits
+        inside = min(max(value, limits.lower), limits.upper)
+        if inside != value:
+            self.mjcf.differ("home is taken within the limits", f"{joint} {value:g} as {inside:g}")
+        return inside
 
     def _custom(self, name: str) -> str:
         """A `<text>` under `<custom>`, empty where there is none."""
@@ -267,12 +242,20 @@ class _Reader:
                 return raw.split(b"\0")[0].decode("utf-8", "replace").strip()
         return ""
 
+    def _listed(self, name: str) -> list[str]:
+        """Joints that a `<text>` lists, none if one of them is not there."""
+        joints = [word for word in self._custom(name).split(", ") if word]
+        if all(joint in self.joints for joint in joints):
+            return joints
+        self.mjcf.lose(f"the text '{name}', which names no joints", *joints)
+        return []
+
     def _tip(self, tree: TreeBuilder) -> str | None:
         tip = self._custom("tip")
         if tip in tree.links and tree.moves(tip):
             return tip
         if tip:
-            self.mjcf.warn(f"the text 'tip' names no moving body or site '{tip}', it is left out")
+            self.mjcf.lose(f"the text 'tip', which names no moving body or site '{tip}'")
         return None if tip else tree.only_leaf()
 
 

@@ -1,6 +1,7 @@
 """A MJCF file for MuJoCo."""
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from lxml import etree
 
 from crane.common.errors import CraneWarning, InputError
 from crane.common.output import replacing
-from crane.description import Coupling, LoopSpec
+from crane.description import Coupling, Drive, LoopSpec
 from crane.formats.parts import (
     ends,
     finished,
@@ -31,10 +32,11 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
     """Write a machine as a MJCF file with equality constraints between sites.
 
     Spherical loops become `connect`, fixed ones `weld`, revolute ones two `connect` at points of
-    the axis; couplings `joint`, of more than two joints `tendon`. Active joints have a motor each,
-    frames are sites, the home posture is the key "home". Coulomb and viscous friction and springs
-    are there; the damping of force elements becomes viscous friction. A warning names what else
-    is left out. There are no shapes, so nothing collides.
+    the axis; couplings `joint`, of more than two joints `tendon`. Drives have a motor each, by a
+    fixed tendon where they act along more than one joint; where drives are not the active joints,
+    a text names these. Frames are sites, the home posture is the key "home". Coulomb and viscous
+    friction, springs and rotor inertias are there; the damping of force elements becomes viscous
+    friction. A warning names what else is left out. There are no shapes, so nothing collides.
 
     Args:
         machine: The machine, as it is: with its changes, locks and payload.
@@ -88,16 +90,14 @@ class _Writer:
             if frame.parentJoint in self.bodies:
                 self._site(self.bodies[frame.parentJoint], frame.name, frame.placement)
         equations = self.machine.closure.equations
-        if equations.loops or equations.couplings:
-            tendons, equality = etree.Element("tendon"), etree.Element("equality")
-            for loop in equations.loops:
-                self._loop(equality, loop)
-            for coupling in equations.couplings:
-                self._coupling(equality, tendons, coupling)
-            self.root.extend([tendons, equality] if len(tendons) else [equality])
-        actuator = add(self.root, "actuator")
-        for name in self.machine.active:
-            add(actuator, "motor", name=name, joint=name)
+        tendons, equality, actuator = map(etree.Element, ("tendon", "equality", "actuator"))
+        for loop in equations.loops:
+            self._loop(equality, loop)
+        for coupling in equations.couplings:
+            self._coupling(equality, tendons, coupling)
+        for drive in self.machine.drives:
+            self._drive(actuator, tendons, drive)
+        self.root.extend(part for part in (tendons, equality, actuator) if len(part))
         key = add(add(self.root, "keyframe"), "key", name="home", qpos=text(self.home))
         assert key is not None
         return finished(self.root, origin_of(self.machine))
@@ -107,6 +107,9 @@ class _Writer:
         texts = {"name": machine.name, "source": machine.source, "tip": machine.tip or ""}
         if not machine.tip and len(self._leaves()) == 1:
             texts["tip"] = "none"
+        if [drive.name for drive in machine.drives] != list(machine.active):
+            # else the drives say which joints are active
+            texts |= {"active": ", ".join(machine.active), "free": ", ".join(machine.free)}
         custom = etree.SubElement(self.root, "custom")
         for name, data in texts.items():
             if data:
@@ -169,6 +172,8 @@ class _Writer:
         }
         if (limits := ends(described.limits)) is not None:
             values |= {"limited": "true", "range": text(limits)}
+        if described.rotor_inertia:
+            values["armature"] = text([described.rotor_inertia])
         law = machine.friction.get(name)
         acting = [item for item in machine.forces if item.joint == name]
         stiffness = sum(item.stiffness for item in acting)
@@ -234,13 +239,25 @@ class _Writer:
             polynomial = text([offset, slopes[0] if slopes else 0.0, 0, 0, 0])
             etree.SubElement(equality, "joint", {**stiff, **named, "polycoef": polynomial})
             return
-        tendon = etree.SubElement(tendons, "fixed", name=coupling.name)
-        for joint, factor in coupling.factors.items():
-            etree.SubElement(tendon, "joint", joint=joint, coef=text([factor]))
+        tendon = _tendon(tendons, coupling.name, coupling.factors)
         polynomial = text([coupling.offset, 0, 0, 0, 0])
-        etree.SubElement(
-            equality, "tendon", {**stiff, "tendon1": coupling.name, "polycoef": polynomial}
-        )
+        etree.SubElement(equality, "tendon", {**stiff, "tendon1": tendon, "polycoef": polynomial})
+
+    def _drive(self, actuator: etree._Element, tendons: etree._Element, drive: Drive) -> None:
+        along = {"joint": drive.name}
+        if dict(drive.factors) != {drive.name: 1.0}:
+            along = {"tendon": _tendon(tendons, drive.name, drive.factors)}
+        etree.SubElement(actuator, "motor", {"name": drive.name, **along})
+
+
+def _tendon(tendons: etree._Element, name: str, factors: Mapping[str, float]) -> str:
+    """Add a fixed tendon, under a name that no other has."""
+    while any(tendon.get("name") == name for tendon in tendons):
+        name += "_"
+    tendon = etree.SubElement(tendons, "fixed", name=name)
+    for joint, factor in factors.items():
+        etree.SubElement(tendon, "joint", joint=joint, coef=text([factor]))
+    return name
 
 
 def _placed(place: pin.SE3) -> dict[str, str]:

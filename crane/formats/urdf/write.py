@@ -13,13 +13,16 @@ from crane.formats.parts import (
     add_link,
     add_origin,
     draw,
+    drives_of,
     finished,
     left_out,
     linear,
     only_in_machine_files,
     origin_of,
     plain_friction,
+    rotors_of,
     text,
+    with_whole_flyers,
 )
 from crane.machine import Machine
 
@@ -39,7 +42,7 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
         InputError: A coupling binds several joints in a way that no `<coupling>` says.
         OutputError: It cannot be written.
     """
-    tree = machine.tree
+    tree = with_whole_flyers(machine)
     robot = etree.Element("robot", name=machine.name)
     made = {  # which reading a loop makes again
         f"{loop.name}_{end}": frame
@@ -55,7 +58,11 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
             add_joint(robot, joint)
     passive = [joint for joint in machine.joints if joint not in machine.active]
     for name in (*machine.active, *passive):
-        _add_moving(machine, robot, name)
+        if name in tree.joints:
+            _add_moving(machine, robot, name)
+    for joint in tree.joints.values():
+        if joint.kind == "floating":
+            add_joint(robot, joint).set("independent", "true")
     for loop in machine.closure.equations.loops:
         _add_loop(tree, robot, loop)
     for coupling in machine.closure.equations.couplings:
@@ -69,6 +76,8 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
     draw(robot, machine)
     lost = plain_friction(machine) + only_in_machine_files(machine)
     lost += ["springs and forces"] if machine.forces else []
+    lost += ["rotor inertias"] if rotors_of(machine) else []
+    lost += ["drives along several joints"] if drives_of(machine) else []
     with replacing(path) as part:
         part.write_bytes(finished(robot, origin_of(machine)))
     left_out(machine, "URDF+", lost)

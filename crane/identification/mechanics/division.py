@@ -33,7 +33,7 @@ def divided(machine: Machine, parameters: Array, whole: Machine) -> dict[str, Ar
     Raises:
         InputError: A body cannot exist.
     """
-    described = Dynamics(whole).parameters.reshape(-1, 10)
+    described = Dynamics(whole).parameters[: 10 * (whole.model.njoints - 1)].reshape(-1, 10)
     places: dict[int, list[tuple[str, Array, Array]]] = {}
     out = {}
     for name, body in zip(body_names(whole), described, strict=True):

@@ -63,8 +63,8 @@ class Inertial:
 
     def __init__(self, machine: Machine):
         self._dynamics = Dynamics(machine)
-        self.nominal = self._dynamics.parameters
         bodies = body_names(machine)
+        self.nominal = self._dynamics.parameters[: 10 * len(bodies)]
         self.names = tuple(f"{body}.{key}" for body in bodies for key in PER_BODY)
         self.signs = (False,) * len(self.names)  # that a body is possible is more than signs
 
@@ -74,9 +74,9 @@ class Inertial:
 
 
 def inertial_columns(dynamics: Dynamics, at: Samples) -> Array:
-    """`Dynamics.regressor` (N, n, 10 nb) along a motion, whose loops are closed already."""
+    """The bodies' part of `Dynamics.regressor`, (N, n, 10 nb), along a closed motion."""
     found = dynamics.at("regressor", at.q, at.v_a, at.a_a)
-    return found.reshape(*at.v_a.shape, -1)
+    return found.reshape(*at.v_a.shape, -1)[:, :, : 10 * (dynamics.machine.model.njoints - 1)]
 
 
 def body_names(machine: Machine) -> tuple[str, ...]:
@@ -324,7 +324,8 @@ class Model:
 
         tau_A = W(q_A, v_A, a_A) beta + known,
 
-    known = -gamma^T f with the passive forces f of the machine that no term scales.
+    known = gamma^T (I_r a - f) with the passive forces f and the rotor inertias I_r of the machine
+    that no term scales.
 
     Args:
         machine: The machine.
@@ -364,6 +365,9 @@ class Model:
         }
         rest = tuple(spring for spring in machine.gas_springs if spring.joint not in scaled)
         self._forces = JointForces(machine.replace(gas_springs=rest))
+        estimated = [joint for joint in machine.joints if f"{joint}.rotor" in self.names]
+        self._rotors = np.array(machine.model.armature)
+        self._rotors[[machine.column(joint) for joint in estimated]] = 0.0
         self._given = known
 
     def samples(
@@ -387,5 +391,9 @@ class Model:
         """Forces (N, n) that no parameter changes: tau = W beta + known."""
         if self._given is not None:
             return self._given(at)
-        force = self._forces.passive(at.q, np.einsum("kij,kj->ki", at.gamma, at.v_a))
-        return -np.einsum("kij,ki->kj", at.gamma, force)
+        v = np.einsum("kij,kj->ki", at.gamma, at.v_a)
+        force = -self._forces.passive(at.q, v)
+        if self._rotors.any():
+            drift = self.machine.closure.drift(at.q, v)
+            force += self._rotors * (np.einsum("kij,kj->ki", at.gamma, at.a_a) + drift)
+        return np.einsum("kij,ki->kj", at.gamma, force)

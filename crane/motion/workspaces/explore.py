@@ -189,7 +189,7 @@ def _patches(
         patch = fill(machine, base, pair, (first, second))
         if patch is None:
             nothing: NDArray[np.bool_] = np.zeros((size, size), dtype=bool)
-            q = np.full((size, size, machine.model.nq), np.nan)
+            q = np.full((size, size, machine.model.nv), np.nan)
             patch = Patch(pair, base, (first, second), nothing, q)
         patches.append(patch)
     return patches, [k for k, plan in enumerate(planned) if plan.counts]

@@ -96,7 +96,7 @@ def fill(
     """
     closure, shape = machine.closure, (len(axes[0]), len(axes[1]))
     patch = Patch(
-        pair, base, axes, np.zeros(shape, dtype=bool), np.full((*shape, machine.model.nq), np.nan)
+        pair, base, axes, np.zeros(shape, dtype=bool), np.full((*shape, machine.model.nv), np.nan)
     )
     home = machine.home[closure.active]
     first = tuple(int(np.abs(axis - home[i]).argmin()) for i, axis in zip(pair, axes, strict=True))

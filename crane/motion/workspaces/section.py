@@ -73,7 +73,8 @@ def slewing(machine: Machine, frame: str) -> tuple[int, Array] | None:
     gamma = machine.closure.gamma(machine.home)
     carrying = list(model.supports[model.frames[machine.frame(frame)].parentJoint])
     data = model.createData()
-    jacobian = pin.computeJointJacobians(model, data, machine.home).reshape(6, -1)
+    at = machine.coordinates.configuration(machine.home)
+    jacobian = pin.computeJointJacobians(model, data, at).reshape(6, -1)
     for i, name in enumerate(machine.active):
         joint = model.getJointId(name)
         column = machine.column(name)

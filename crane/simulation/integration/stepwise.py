@@ -65,11 +65,12 @@ class PythonStepper:
             rate, _ = self._rate(time + share * step, state + share * step * rate)
             total = total + weight * rate
         after = state + step / 6 * total
-        q = self.layout.view(after).q
+        machine, q = self._dynamics.machine, self.layout.view(after).q
         try:
-            q[:] = self._dynamics.machine.closure.solve(q[self._active], guess=q)
+            closed = machine.closure.solve(q[self._active], guess=q)
         except ClosureError as error:
             raise HaltedError(time + step, q[self._active], f": {error}") from None
+        q[:] = machine.coordinates.wrapped(closed)
         return after
 
     def _rate(self, time: float, state: Array) -> tuple[Array, Array]:

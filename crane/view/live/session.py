@@ -165,7 +165,8 @@ class Session:
         """(len(links), 4, 4) poses of links in the world."""
         model = self.machine.model
         data = model.createData()
-        pin.framesForwardKinematics(model, data, self.posture.q)
+        at = self.machine.coordinates.configuration(self.posture.q)
+        pin.framesForwardKinematics(model, data, at)
         frames = [self.machine.frame(link) for link in links]
         return np.array([data.oMf[i].homogeneous for i in frames]).reshape(-1, 4, 4)
 
@@ -194,7 +195,7 @@ class Session:
             shares = np.unique(np.minimum(done + step * np.arange(1, _AT_ONCE + 1), 1.0))
             goals = here + shares[:, None] * (target - here)
             goals[shares == 1.0] = target
-            out = np.empty((len(goals), self.machine.model.nq))
+            out = np.empty((len(goals), len(self.machine.joints)))
             count = closure.fast.follow(cursor, goals, out)
             way += list(out[:count])
             done = float(shares[count - 1]) if count else done

@@ -182,7 +182,7 @@ def columns(machine: Machine, recording: "Recording") -> Iterator[Column]:
         column = machine.column(joint)
         low, high = (
             float(limits[column])
-            for limits in (machine.model.lowerPositionLimit, machine.model.upperPositionLimit)
+            for limits in (machine.coordinates.lower, machine.coordinates.upper)
         )
         titles = (
             [ANGLES, "Angular velocities", TORQUES]

@@ -4,7 +4,8 @@ A page holds no poses. Its script computes them as Pinocchio does, from the root
 
     oM_i = oM_parent(i)  placement_i  exp(S_i q_i),
 
-S_i being the joint's unit axis, which it turns about or slides along.
+S_i being the joint's unit axis, which it turns about or slides along. A body that floats has six
+coordinates, place and rotation vector.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -28,21 +29,26 @@ def tree(machine: Machine) -> dict[str, Any]:
     """Joints, bodies' masses and link frames for the script; matrices column by column.
 
     Returns:
-        joints in the order of q, each after its parent; -1 is the world.
+        joints, each after its parent, with the first of their coordinates; -1 is the world.
     """
     model = machine.model
     joints = []
     for i in range(1, model.njoints):
-        axis = np.ravel(model.joints[i].createData().S)
-        turns = machine.unit(model.names[i]) == "rad"
+        column = model.joints[i].idx_v
+        kind, axis = "floating", np.zeros(3)
+        if column not in machine.coordinates.floating:
+            subspace = np.ravel(model.joints[i].createData().S)
+            slides = bool(machine.coordinates.slides[column])
+            kind = "prismatic" if slides else "revolute"
+            axis = subspace[:3] if slides else subspace[3:]
         joints.append(
             {
                 "name": model.names[i],
                 "parent": model.parents[i] - 1,
-                "column": machine.column(model.names[i]),
+                "column": column,
                 "placement": matrix(model.jointPlacements[i]),
-                "type": "revolute" if turns else "prismatic",
-                "axis": axis[3:].tolist() if turns else axis[:3].tolist(),
+                "type": kind,
+                "axis": axis.tolist(),
                 "mass": model.inertias[i].mass,
                 "lever": model.inertias[i].lever.tolist(),
             }
@@ -144,7 +150,7 @@ def postures(machine: Machine, recording: "Recording", rows: np.ndarray) -> Arra
     """
     check_joints(machine, recording)
     columns = {joint: recording.q[rows, i] for i, joint in enumerate(recording.joints)}
-    q = np.empty((len(rows), machine.model.nq))
+    q = np.empty((len(rows), len(machine.joints)))
     if all(joint in columns or _recorded(machine, recording, joint) for joint in machine.joints):
         for joint in machine.joints:
             column = columns[joint] if joint in columns else recording.channels[joint][rows]

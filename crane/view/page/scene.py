@@ -103,7 +103,8 @@ def link_poses(machine: Machine, q: Array, links: Iterable[str]) -> dict[str, Ar
     frames = {link: machine.frame(link) for link in links}
     poses = {link: np.empty((len(q), 4, 4)) for link in frames}
     for i, posture in enumerate(q):
-        pin.framesForwardKinematics(machine.model, data, posture)
+        at = machine.coordinates.configuration(posture)
+        pin.framesForwardKinematics(machine.model, data, at)
         for link, frame in frames.items():
             poses[link][i] = data.oMf[frame].homogeneous
     for link, pose in poses.items():
@@ -131,7 +132,7 @@ def _heading(machine: Machine, q: Array, size: float) -> float:
     if machine.tip is None:
         return 0.0
     data = machine.model.createData()
-    pin.framesForwardKinematics(machine.model, data, q)
+    pin.framesForwardKinematics(machine.model, data, machine.coordinates.configuration(q))
     frame = machine.frame(machine.tip)
     joints = machine.model.supports[machine.model.frames[frame].parentJoint]
     if len(joints) < 2:  # the tip stands still

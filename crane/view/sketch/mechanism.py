@@ -135,9 +135,9 @@ class _Projection:
         parent, at = self.parents[joint], self.origins[joint]
         along = self.axes[joint] / max(float(np.linalg.norm(self.axes[joint])), 1e-9)
         outer = self.outer[joint] or [at]
-        column = self.model.joints[joint].idx_q
-        low = float(self.model.lowerPositionLimit[column])
-        high = float(self.model.upperPositionLimit[column])
+        column = self.model.joints[joint].idx_v
+        low = float(self.machine.coordinates.lower[column])
+        high = float(self.machine.coordinates.upper[column])
         value = float(self.q[column])
         chains = (self.chains[parent], self.chains[joint])
         boom, name = joint in self.carrying, self.model.names[joint]

@@ -25,6 +25,11 @@ function displacement({ type, axis: [x, y, z] }, value) {
     if (type === "prismatic") {
         return Float64Array.of(1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, x * value, y * value, z * value, 1);
     }
+    return rotation([x, y, z], value);
+}
+
+// About a unit axis by an angle (Rodrigues).
+function rotation([x, y, z], value) {
     const [s, c] = [Math.sin(value), Math.cos(value)];
     const h = 2 * Math.sin(value / 2) ** 2; // 1 - cos without cancellation
     return Float64Array.of(
@@ -33,6 +38,14 @@ function displacement({ type, axis: [x, y, z] }, value) {
         h * x * z + s * y, h * y * z - s * x, c + h * z * z, 0,
         0, 0, 0, 1,
     );
+}
+
+// A body that floats, by place and rotation vector.
+function flown([x, y, z, a, b, c]) {
+    const angle = Math.hypot(a, b, c);
+    const pose = angle ? rotation([a / angle, b / angle, c / angle], angle) : Float64Array.from(STILL);
+    pose.set([x, y, z], 12);
+    return pose;
 }
 
 class Tree {
@@ -48,7 +61,9 @@ class Tree {
         for (const joint of this.joints) {
             const parent = joint.parent < 0 ? STILL : found[joint.parent];
             const zero = product(parent, joint.placement);
-            found.push(product(zero, displacement(joint, q[joint.column])));
+            found.push(product(zero, joint.type === "floating"
+                ? flown(q.slice(joint.column, joint.column + 6))
+                : displacement(joint, q[joint.column])));
         }
         return found;
     }

@@ -1,0 +1,202 @@
+"""Closing the loops from anywhere: for machines whose files say little of their home posture.
+
+The residual of a loop is what it locks of log(M_1^-1 M_2), M_i the placements of its frames:
+rotations [rad], and translations in shares of the machine's size; where it locks no rotation, the
+distance of the origins. Unlike the loop equations it is zero only where axes point the same way,
+and grows all the way to half a turn. Damped least squares go downhill from any start (Levenberg
+1944; a damping that falls with the square of the residual keeps the convergence quadratic,
+Yamashita and Fukushima 2001), with a line search along the path that limits bend. Starts lie
+around the guess, farther and farther off.
+"""
+
+import itertools
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pinocchio as pin
+
+from crane.closure.choice import Indices, size, slides, units
+from crane.closure.equations import LoopEquations
+from crane.common.samples import Array
+from crane.description import LOOP_TYPES
+
+_ZERO = 1e-11
+_ITERATIONS = 80
+_STEP = 1.0  # [rad], or share of the machine's size: of an iteration at most
+_HALVINGS = 12
+_DAMPING = 1e-3
+_SLOW, _PATIENCE = 0.99, 6  # ratio of residuals that is no progress, and how often it is borne
+_STARTS, _MORE = 24, 5  # until one closes, and from then on
+_WORK = 2000  # starts times joints at most
+_RADII = (0.3, 1.0, 2.0, np.pi)  # of the starts [rad], or shares of the machine's size
+_SAME = 1e-3  # difference of postures that is none, likewise
+
+
+class Residual:
+    """How far loops and couplings are from closed.
+
+    Args:
+        equations: The loops.
+    """
+
+    def __init__(self, equations: LoopEquations):
+        self._equations = equations
+        self._shares = np.where(np.arange(6) < 3, size(equations.model), 1.0)
+        self._locked = [np.flatnonzero(LOOP_TYPES[loop.type]) for loop in equations.loops]
+        own = equations.loop_of_row >= len(equations.loops)
+        self._coupled = np.where(equations.is_translation[own], self._shares[0], 1.0)
+
+    def evaluate(self, q: Array) -> tuple[Array, Array]:
+        """Residuals (m,) and their slopes (m, nv)."""
+        equations = self._equations
+        model, data = equations.model, equations.data
+        at = equations.coordinates.configuration(q)
+        world = pin.computeJointJacobians(model, data, at).reshape(6, -1)
+        gaps = [(equations.factors @ q - equations.offsets) / self._coupled]
+        slopes = [equations.factors / self._coupled[:, None]]
+        for index, locked in enumerate(self._locked):
+            one, two = (
+                data.oMi[joint] * place for joint, place in equations.frames[2 * index :][:2]
+            )
+            apart = one.actInv(two)
+            moves = two.toActionMatrixInverse() @ (equations.sign[index] * world)  # as 2 sees them
+            if locked.max() < 3:
+                gap, slope = apart.translation, apart.rotation @ moves[:3]
+            else:
+                gap, slope = pin.log6(apart).vector, pin.Jlog6(apart) @ moves
+            gaps.append(gap[locked] / self._shares[locked])
+            slopes.append(slope[locked] / self._shares[locked, None])
+        return np.concatenate(gaps), np.vstack(slopes)
+
+
+class Search:
+    """Closed postures of a machine, from anywhere.
+
+    Args:
+        equations: The loops.
+        guess: (nq,) what is said of the posture.
+        said: Columns for which it is the file that says so.
+        more: Starts from the first closed posture on.
+    """
+
+    def __init__(self, equations: LoopEquations, guess: Array, said: Indices, more: int = _MORE):
+        model = equations.model
+        self._residual, self._guess = Residual(equations), guess
+        self._unit, self._turns = units(model), ~slides(model)
+        self._lower, self._upper = equations.coordinates.lower, equations.coordinates.upper
+        self._said, self._more = said, more
+        coupled = (equations.factors != 0).any(axis=0)
+        self._endless = self._turns & ~coupled & np.isinf(self._upper) & np.isinf(self._lower)
+
+    def postures(self, free: Indices, beyond: Indices, enough: float) -> list[Array]:
+        """Closed postures, the nearest to the guess first.
+
+        Nearest at what is said, then at all joints, where the farthest is [rad], [machine's size].
+
+        Args:
+            free: Columns of the joints that may move.
+            beyond: Columns of those that may leave their limits.
+            enough: Residual that counts as closed.
+        """
+        found: list[Array] = []
+        most = max(2, _WORK // len(self._guess))
+        last = min(_STARTS, most)
+        for count, start in enumerate(self._starts(free)):
+            if count >= last:
+                break
+            q, gap = self.descend(start, free, beyond)
+            if gap > enough:
+                continue
+            if not found:
+                last = min(most, count + 1 + self._more)
+            if all(self.apart(q, other).max() > _SAME for other in found):
+                found.append(q)
+        return sorted(found, key=self._away)
+
+    def _away(self, q: Array) -> tuple[float, float]:
+        apart = self.apart(q, self._guess)
+        return round(float(apart[self._said].max(initial=0.0)), 3), float(apart.max(initial=0.0))
+
+    def farthest(self, q: Array) -> tuple[int, float]:
+        """The joint that is farthest from the guess, and by how much [m], [rad]."""
+        apart = self.apart(q, self._guess)
+        return int(apart.argmax()), float((apart * self._unit)[apart.argmax()])
+
+    def apart(self, one: Array, two: Array) -> Array:
+        """(nq,) how far apart the joints of two postures are [rad], [machine's size]."""
+        turned = np.abs(np.remainder(one - two + np.pi, 2 * np.pi) - np.pi)
+        return np.asarray(np.where(self._endless, turned, np.abs(one - two) / self._unit))
+
+    def _starts(self, free: Indices) -> Iterator[Array]:
+        """The guess, and low-discrepancy points of boxes around it that grow.
+
+        Multiples of the powers of 1 / phi, phi^(k + 1) = phi + 1 for k unknowns (Roberts 2018).
+        """
+        yield self._guess.copy()
+        phi = 2.0
+        for _ in range(40):
+            phi = (1 + phi) ** (1 / (len(free) + 1))
+        steps = phi ** -np.arange(1.0, len(free) + 1)
+        for count in itertools.count(1):
+            share = 2 * np.remainder(0.5 + count * steps, 1.0) - 1
+            start = self._guess.copy()
+            start[free] += _RADII[count % len(_RADII)] * self._unit[free] * share
+            yield start
+
+    def descend(self, q: Array, free: Indices, beyond: Indices) -> tuple[Array, float]:
+        """Least squares from one start.
+
+        Args:
+            q: (nq,) the start.
+            free: Columns of the joints that may move.
+            beyond: Columns of those that may leave their limits.
+
+        Returns:
+            The posture, angles of endless joints within half a turn of the guess, and its largest
+            residual.
+        """
+        lower, upper = self._lower.copy(), self._upper.copy()
+        lower[beyond], upper[beyond] = -np.inf, np.inf
+        q = q.copy()
+        q[free] = np.clip(q, lower, upper)[free]
+        gap, slope = self._residual.evaluate(q)
+        slow = 0
+        for _ in range(_ITERATIONS):
+            cost = float(gap @ gap)
+            if np.abs(gap).max(initial=0.0) < _ZERO or slow >= _PATIENCE:
+                break
+            down = -slope.T @ gap
+            stuck = ((q <= lower) & (down < 0)) | ((q >= upper) & (down > 0))
+            able = free[~stuck[free]]
+            if not len(able):
+                break
+            step = np.zeros(len(q))
+            step[able] = self._step(slope[:, able] * self._unit[able], gap) * self._unit[able]
+            moved = self._line_search(q, step, cost, lambda way: np.clip(way, lower, upper))
+            if moved is None:
+                break
+            q, gap, slope = moved
+            slow += int(gap @ gap > _SLOW * cost)
+        ends = self._endless.copy()
+        ends[np.setdiff1d(np.arange(len(q)), free)] = False
+        off = q - self._guess
+        q[ends] = self._guess[ends] + np.remainder(off[ends] + np.pi, 2 * np.pi) - np.pi
+        return q, float(np.abs(gap).max(initial=0.0))
+
+    @staticmethod
+    def _step(slope: Array, gap: Array) -> Array:
+        gram = slope.T @ slope
+        damping = _DAMPING * min(1.0, float(gap @ gap)) + 1e-14
+        step = np.linalg.solve(gram + damping * np.eye(len(gram)), -slope.T @ gap)
+        return np.asarray(step * min(1.0, _STEP / max(np.abs(step).max(initial=0.0), 1e-300)))
+
+    def _line_search(
+        self, q: Array, step: Array, cost: float, bend: Callable[[Array], Array]
+    ) -> tuple[Array, Array, Array] | None:
+        """The longest of halved steps that gets downhill, None where none does."""
+        for halvings in range(_HALVINGS):
+            way = bend(q + step / 2**halvings)
+            gap, slope = self._residual.evaluate(way)
+            if gap @ gap < cost * (1 - 1e-4 / 2**halvings):
+                return way, gap, slope
+        return None

@@ -1,0 +1,167 @@
+"""Coordinates of a tree: as many as velocities, whatever Pinocchio's model has."""
+
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from crane.common.errors import InputError, known
+from crane.common.samples import Array
+
+FREE_FLYER = "JointModelFreeFlyer"
+
+
+class Coordinates:
+    """Names, limits and kinds of a tree's coordinates (nv,), and the way to Pinocchio's (nq,).
+
+    Both are the same but for bodies that float: those have place and rotation vector here, place
+    and quaternion in Pinocchio's model; see `crane.description.floating`.
+
+    Args:
+        model: The tree. The coordinates of a free-flyer B are called B_x, B_y, B_z, B_rx, B_ry,
+            B_rz.
+
+    Attributes:
+        names: (nv,) in the order of Pinocchio's velocities.
+        joints: (nv,) index of the joint that each belongs to.
+        floating: First column of each free-flyer.
+        parents: (nv + 1,) what carries what, as if each coordinate i moved a body i + 1 of its
+            own: the six of a free-flyer in a row; 0 is the world.
+    """
+
+    def __init__(self, model: pin.Model):
+        self.model = model
+        self.names: tuple[str, ...] = ()
+        self.floating: tuple[int, ...] = ()
+        joints: list[int] = []
+        places: list[int] = []  # in Pinocchio's q, of a free-flyer those of its place
+        for i in range(1, model.njoints):
+            joint, name = model.joints[i], model.names[i]
+            if joint.shortname() == FREE_FLYER:
+                self.floating += (joint.idx_v,)
+                self.names += tuple(f"{name}_{part}" for part in ("x", "y", "z", "rx", "ry", "rz"))
+            else:
+                self.names += (name,)
+            joints += [i] * joint.nv
+            places += range(joint.idx_q, joint.idx_q + joint.nv)
+        self.joints = np.array(joints, dtype=np.intp)
+        last = {0: 0} | {joint: i + 1 for i, joint in enumerate(joints)}
+        self.parents: tuple[int, ...] = (0,) + tuple(
+            i if i and joints[i - 1] == joint else last[model.parents[joint]]
+            for i, joint in enumerate(joints)
+        )
+        self._places = np.array(places, dtype=np.intp)
+        self._index = {name: i for i, name in enumerate(self.names)}
+
+    def column(self, name: str) -> int:
+        """Index of a coordinate.
+
+        Raises:
+            InputError: There is none of that name.
+        """
+        if name not in self._index:
+            raise InputError(f"joint '{name}' is unknown, {known(self.names, name)}")
+        return self._index[name]
+
+    @cached_property
+    def lower(self) -> Array:
+        """(nv,) lower limits [m], [rad]."""
+        return self._limits(self.model.lowerPositionLimit, -np.inf)
+
+    @cached_property
+    def upper(self) -> Array:
+        """(nv,) upper limits [m], [rad]."""
+        return self._limits(self.model.upperPositionLimit, np.inf)
+
+    @cached_property
+    def slides(self) -> NDArray[np.bool_]:
+        """(nv,) whether a coordinate is a length."""
+        found = np.zeros(len(self.names), dtype=bool)
+        for i in range(1, self.model.njoints):
+            joint = self.model.joints[i]
+            if joint.shortname() == FREE_FLYER:
+                found[joint.idx_v : joint.idx_v + 3] = True
+            else:
+                found[joint.idx_v] = joint.shortname().startswith("JointModelP")
+        return found
+
+    def configuration(self, q: Array) -> Array:
+        """Pinocchio's configuration (nq,) or (N, nq) of coordinates (nv,) or (N, nv)."""
+        if not self.floating:
+            return q
+        out = np.zeros((*q.shape[:-1], self.model.nq))
+        out[..., self._places] = q
+        for column in self.floating:
+            at = self._places[column]
+            out[..., at + 3 : at + 7] = _quaternion(q[..., column + 3 : column + 6])
+        return out
+
+    def coordinates(self, configuration: Array) -> Array:
+        """The way back: coordinates (nv,) or (N, nv) of Pinocchio's configuration."""
+        if not self.floating:
+            return configuration
+        out: Array = configuration[..., self._places]
+        for column in self.floating:
+            at = self._places[column]
+            quaternion = configuration[..., at + 3 : at + 7]
+            out[..., column + 3 : column + 6] = _rotation_vector(quaternion)
+        return out
+
+    def rates(self, q: Array, v: Array) -> Array:
+        """Time derivatives (nv,) of coordinates (nv,) at velocities (nv,).
+
+        Of a free-flyer p' = R V_lin, r' = (1 + r x / 2 + c (r x)^2) V_ang.
+        """
+        if not self.floating:
+            return v
+        out = v.copy()
+        for column in self.floating:
+            r, angular = q[column + 3 : column + 6], v[column + 3 : column + 6]
+            out[column : column + 3] = pin.exp3(r) @ v[column : column + 3]
+            half = 0.5 * float(np.linalg.norm(r))
+            # the series in t^2 where the closed form cancels
+            c = (
+                (1 - half / np.tan(half)) / (4 * half * half)
+                if half > 1e-3
+                else 1 / 12 + half**2 / 180
+            )
+            turned = np.cross(r, angular)
+            out[column + 3 : column + 6] = angular + 0.5 * turned + c * np.cross(r, turned)
+        return out
+
+    def wrapped(self, q: Array) -> Array:
+        """The same posture (nv,) with rotation vectors of at most pi."""
+        if not self.floating:
+            return q
+        out = q.copy()
+        for column in self.floating:
+            r = out[column + 3 : column + 6]
+            length = float(np.linalg.norm(r))
+            if length > np.pi:
+                r *= 1 - 2 * np.pi * np.round(length / (2 * np.pi)) / length
+        return out
+
+    def _limits(self, given: Array, none: float) -> Array:
+        out = np.asarray(given, dtype=np.float64)[self._places].copy()
+        for column in self.floating:
+            out[column : column + 6] = none
+        return out
+
+
+def _quaternion(r: Array) -> Array:
+    """x, y, z, w of rotation vectors (..., 3)."""
+    half = 0.5 * np.linalg.norm(r, axis=-1, keepdims=True)
+    return np.concatenate([0.5 * np.sinc(half / np.pi) * r, np.cos(half)], axis=-1)
+
+
+def _rotation_vector(quaternion: Array) -> Array:
+    """Rotation vectors (..., 3) of at most pi, of x, y, z, w, which need not have length 1."""
+    sign = np.where(quaternion[..., 3:] < 0, -1.0, 1.0)
+    x, w = sign * quaternion[..., :3], sign * quaternion[..., 3:]
+    length = np.linalg.norm(x, axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(length, w)
+    small = length < 1e-150 * w
+    return np.asarray(
+        x * np.where(small, 2 / np.where(w > 0, w, 1.0), angle / np.where(small, 1, length))
+    )

@@ -1,0 +1,202 @@
+"""How exactly loop equations hold: to rounding, or to the digits that a file was written with.
+
+A planar linkage in space has more equations than it needs. Written with few digits, its axes are
+not quite parallel and its pins not quite in one plane, so the surplus equations contradict the
+others by that much: taken at their word they leave the linkage no freedom. With
+
+    J D = U S V^T        rows and columns in shares of the machine's size and in rad
+
+singular values below 1e-3 of the largest are digits, and are cut off: what remains has the rank of
+the linkage that was meant. As many independent equations as that rank are chosen and closed to
+rounding. They span the largest volume, so that each other row of U is a combination of theirs with
+factors of at most 1 (see `crane.closure.choice.choose`): surplus equations stay open by no more
+than the sum of what the digits contradict, nowhere magnified.
+
+That they are digits shows when the machine moves: over a turn, or its limits, they stay below 1e-4
+of the machine's size. What locks up opens further than that.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import qr
+
+from crane.closure.choice import Indices, choose, size, units
+from crane.closure.equations import LoopEquations
+from crane.closure.mobility import locked_up, surplus_along, surplus_open
+from crane.common.samples import Array
+
+CLOSED = 1e-9  # [m], [rad]
+DIGITS = 1e-4  # of the machine's size, or rad: what counts as digits
+_MEANT = 1e-3  # share of the largest singular value from which on one is meant
+_ROUNDING = 1e-12  # of surplus equations that hold to rounding, at the size of 1 m
+_OPEN = 1e-9  # of those that lock a machine up
+
+
+@dataclass(frozen=True)
+class Surplus:
+    """How far surplus equations may be open.
+
+    Attributes:
+        allowed: What they may be open by [m], [rad].
+        row: The one that is open by most on the way that was looked at, -1 for exact ones.
+        gap: By how much it is [m], [rad].
+    """
+
+    allowed: float = CLOSED
+    row: int = -1
+    gap: float = 0.0
+
+
+Lock = tuple[int, float] | None  # the row that stays open by most, and by how much [m], [rad]
+
+
+class Exact:
+    """Equations that hold to rounding.
+
+    Args:
+        equations: All of them.
+
+    Attributes:
+        closed: (m,) what residuals of closed loops are at most [m], [rad].
+    """
+
+    closed: Array
+
+    def __init__(self, equations: LoopEquations):
+        self._equations = equations
+        self._size = size(equations.model)
+        self._share = np.where(equations.is_translation, self._size, 1.0)
+        self.closed = np.full(len(self._share), CLOSED)
+
+    def is_closed(self, q: Array) -> bool:
+        """Whether all loops are closed."""
+        return bool((np.abs(self._equations.evaluate(q)[0]) < self.closed).all())
+
+    def close(self, q: Array, free: Indices) -> Array:
+        """Close all loops by moving the free joints; the residual tells whether that worked."""
+        q = q.copy()
+        for _ in range(200):
+            phi, jacobian = self._equations.evaluate(q)
+            if np.abs(phi).max(initial=0.0) < 1e-13:
+                break
+            q[free] += least_squares_step(jacobian[:, free], phi)
+        return q
+
+    def jacobian(self, q: Array) -> Array:
+        """(m, nv) slopes of the equations as they were meant."""
+        return self._equations.evaluate(q)[1]
+
+    def locked_up(self, q: Array, freedom: int, tolerance: float) -> Lock:
+        """See `crane.closure.mobility.locked_up`."""
+        everything = np.arange(self._equations.model.nv)
+        return locked_up(
+            self._equations, q, freedom, tolerance, lambda near: self.close(near, everything)
+        )
+
+    def independent(
+        self, home: Array, passive: Indices, rank: int, tolerance: float
+    ) -> tuple[Indices, Indices] | None:
+        """As many independent rows as the rank, and the others; None where J_P has a lower one."""
+        jacobian = self._equations.evaluate(home)[1][:, passive]
+        _, upper, pivots = qr(jacobian.T, mode="economic", pivoting=True)
+        diagonal = np.abs(np.diag(upper))
+        if (diagonal > tolerance * diagonal[0]).sum() < rank:
+            return None
+        rows, redundant = (np.sort(part).astype(np.intp) for part in np.split(pivots, [rank]))
+        return rows, redundant
+
+    def surplus(
+        self, home: Array, rows: Indices, redundant: Indices, active: Indices
+    ) -> tuple[Lock, Surplus]:
+        """What locks the machine up beside home, or else how far surplus equations may open.
+
+        Digits that are almost enough hold at home, and no longer half a turn away.
+        """
+        lock = surplus_open(self._equations, home, rows, redundant, active)
+        if lock is None or lock[1] <= _ROUNDING * max(1.0, self._size):
+            return None, Surplus()
+        if lock[1] > _OPEN:
+            return lock, Surplus()
+        return None, self._digits(home, rows, redundant, active)[1]
+
+    def _digits(
+        self, home: Array, rows: Indices, redundant: Indices, active: Indices
+    ) -> tuple[Lock, Surplus]:
+        if not len(redundant):
+            return None, Surplus()
+        widest, moves = surplus_along(self._equations, home, rows, redundant, active)
+        most = DIGITS * self._share[redundant]
+        worst = int((widest / most).argmax())
+        row, gap = int(redundant[worst]), float(widest[worst])
+        if gap > most[worst] or not moves:
+            return (row, gap), Surplus()
+        decade = 10.0 ** np.ceil(np.log10(max(2 * widest.max(), CLOSED)))  # code is shared by it
+        return None, Surplus(max(CLOSED, min(float(decade), float(most.max()))), row, gap)
+
+
+class Rounded(Exact):
+    """Equations that hold to the digits of a file.
+
+    Args:
+        equations: All of them.
+    """
+
+    def __init__(self, equations: LoopEquations):
+        super().__init__(equations)
+        self.closed = DIGITS * self._share
+        self._unit = units(equations.model)
+
+    def close(self, q: Array, free: Indices) -> Array:
+        """Least squares; what the digits contradict is left open, and moves nothing."""
+        q = q.copy()
+        for _ in range(200):
+            phi, jacobian = self._equations.evaluate(q)
+            if (np.abs(phi) < 10 * self.closed).all():
+                break
+            q[free] += least_squares_step(jacobian[:, free], phi)
+        for _ in range(20):
+            phi, jacobian = self._equations.evaluate(q)
+            slope = (jacobian / self._share[:, None] * self._unit)[:, free]
+            step = np.linalg.lstsq(slope, -phi / self._share, rcond=_MEANT)[0]
+            q[free] += step * self._unit[free]
+            if not 1e-14 < np.abs(step).max(initial=0.0) < 1.0:
+                break
+        return q
+
+    def jacobian(self, q: Array) -> Array:
+        """(m, nv) slopes without the singular values that are digits."""
+        slope = super().jacobian(q) / self._share[:, None] * self._unit
+        left, values, right = np.linalg.svd(slope, full_matrices=False)
+        values[values < _MEANT * values[0]] = 0.0
+        return np.asarray((left * values @ right) * self._share[:, None] / self._unit)
+
+    def locked_up(self, q: Array, freedom: int, tolerance: float) -> Lock:
+        """Left to `surplus`, which looks farther."""
+        return None
+
+    def independent(
+        self, home: Array, passive: Indices, rank: int, tolerance: float
+    ) -> tuple[Indices, Indices] | None:
+        """Rows of the largest volume, and the others; None where J_P has a lower rank."""
+        slope = (super().jacobian(home) / self._share[:, None] * self._unit)[:, passive]
+        left, values, _ = np.linalg.svd(slope, full_matrices=False)
+        if rank != len(passive) or values[-1] < _MEANT * values[0]:
+            return None
+        rows = choose(left, range(len(slope)))
+        return None if rows is None else (rows, np.setdiff1d(np.arange(len(slope)), rows))
+
+    def surplus(
+        self, home: Array, rows: Indices, redundant: Indices, active: Indices
+    ) -> tuple[Lock, Surplus]:
+        """What locks the machine up, or else how far surplus equations may open."""
+        return self._digits(home, rows, redundant, active)
+
+
+def least_squares_step(jacobian: Array, phi: Array) -> Array:
+    """A damped Gauss-Newton step towards phi = 0, at most 0.3 [m], [rad] in any joint."""
+    damping = 1e-12 + 1e-3 * float(phi @ phi)
+    gram = jacobian.T @ jacobian
+    step = np.linalg.solve(gram + damping * np.eye(len(gram)), -jacobian.T @ phi)
+    largest = float(np.abs(step).max(initial=0.0))
+    return np.asarray(step * min(1.0, 0.3 / largest) if largest > 0 else step, dtype=np.float64)

@@ -1,0 +1,134 @@
+"""The home posture of a machine: from what its file says of it, or from anywhere.
+
+Where the loops do not close from the guess, they are closed from anywhere
+(see `crane.closure.anywhere`):
+
+1. with the driven joints held, all others within their limits;
+2. with active joints free, too, whose home the file does not say, within their limits;
+3. the same two with passive joints beyond their limits.
+
+The first of these that closes counts, and of the postures that it finds the one that is nearest to
+the guess, see `Search.postures`.
+"""
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.closure.anywhere import Search
+from crane.closure.equations import LoopEquations
+from crane.closure.exactness import CLOSED, DIGITS, Exact, Rounded
+from crane.closure.structure import ActiveError, HomeError, Indices, Structure, analyse
+from crane.common.errors import MechanismError
+from crane.common.samples import Array
+
+_TRIED = 4  # of the postures that are found
+
+
+@dataclass(frozen=True)
+class Sought:
+    """How a home posture was found that did not follow from the guess.
+
+    Attributes:
+        reason: Why it did not.
+        count: How many postures were found.
+        moved: Columns of joints that are elsewhere than guessed.
+        farthest: The joint that is farthest from the guess, and by how much [m], [rad].
+    """
+
+    reason: str
+    count: int
+    moved: Indices
+    farthest: tuple[int, float]
+
+
+def settle(
+    equations: LoopEquations,
+    active: Indices,
+    passive: Indices,
+    guess: Array,
+    said: Collection[int] | None,
+    loose: Collection[int] = (),
+) -> tuple[Structure, Sought | None]:
+    """Structure and home of a machine, and how home was found if not from the guess.
+
+    Args:
+        equations: All loop equations.
+        active: Columns of the active joints.
+        passive: Columns of the others.
+        guess: (nq,) what is known of the home posture.
+        said: Columns for which it is the file that says so; None: home follows from the guess or
+            not at all.
+        loose: Columns of active joints that move like passive ones while home is sought.
+
+    Raises:
+        MechanismError: There is no home posture, or see `analyse`.
+    """
+    try:
+        return _analysed(equations, active, passive, guess), None
+    except HomeError as error:
+        if said is None:
+            raise
+        refused = error
+    search = Search(equations, guess, np.array(sorted(said), dtype=np.intp))
+    for found in _found(search, equations, active, passive, said, loose):
+        for q in found[:_TRIED]:
+            try:
+                structure = _analysed(equations, active, passive, q)
+            except ActiveError:
+                raise
+            except MechanismError:
+                continue
+            home = structure.home
+            moved = np.flatnonzero(search.apart(home, guess) > CLOSED)
+            return structure, Sought(refused.reason, len(found), moved, search.farthest(home))
+    raise refused
+
+
+def _analysed(
+    equations: LoopEquations, active: Indices, passive: Indices, guess: Array
+) -> Structure:
+    """See `analyse`; to the digits of the file where equations contradict each other."""
+    try:
+        return analyse(equations, active, passive, guess, Exact(equations))
+    except MechanismError as error:
+        refused = error
+    rounded = Rounded(equations)
+    try:
+        return analyse(equations, active, passive, guess, rounded)
+    except ActiveError as error:
+        if str(error) == str(refused) or not error.choices:
+            raise refused from None
+        meant = error
+    except MechanismError:
+        raise refused from None
+    # other active joints are told where the machine moves with them
+    names = equations.coordinates.names
+    others = np.array([names.index(joint) for joint in meant.choices[0].joints], dtype=np.intp)
+    rest = np.setdiff1d(np.arange(equations.model.nv), others)
+    try:
+        analyse(equations, others, rest, guess, rounded)
+    except MechanismError:
+        raise refused from None
+    raise meant
+
+
+def _found(
+    search: Search,
+    equations: LoopEquations,
+    active: Indices,
+    passive: Indices,
+    said: Collection[int],
+    loose: Collection[int],
+) -> Iterator[list[Array]]:
+    """Closed postures, one list for each of the steps above."""
+    held = np.union1d(passive, np.array(list(loose), dtype=np.intp))
+    every = np.union1d(held, np.setdiff1d(active, list(said)))
+    ways = [held, every] if len(every) > len(held) else [held]
+    limited = np.isfinite(equations.coordinates.lower[passive]).any()
+    limited |= np.isfinite(equations.coordinates.upper[passive]).any()
+    nothing = np.zeros(0, dtype=np.intp)
+    for beyond in (nothing, passive) if limited else (nothing,):
+        for way in ways:
+            yield search.postures(way, beyond, DIGITS)

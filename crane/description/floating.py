@@ -1,0 +1,113 @@
+"""Bodies that float: which series of six freedoms at the root are one joint without singularity.
+
+A joint with six freedoms is read as a series of three slides and three turns (see
+`crane.formats.series`), whose Cardan angles have a singularity at a pitch of 90 degrees. Where
+such a series carries a body from the ground, and no loop, coupling, spring or drive acts on it,
+its place need not be solved for: the series is one free-flyer then, with coordinates and
+velocities of its own.
+
+Its coordinates are the place p [m] and the rotation vector r [rad] of the body, R = exp(r x), of a
+length of at most pi; its velocities the body's twist in the body's axes, V = (linear, angular):
+
+    p' = R V_lin,   r' = (1 + r x / 2 + c (r x)^2) V_ang,   c = (1 - (t/2) cot(t/2)) / t^2, t = |r|
+
+(Bullo and Murray 1995), which is regular up to t = 2 pi. Forces are a wrench in the same axes.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+
+from crane.description.spec import MachineSpec
+from crane.description.tree import Joint, Link, Tree
+
+PARTS = ("x", "y", "z", "rx", "ry", "rz")
+
+
+def flyers(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
+    """By name of each joint with six freedoms that floats the joints of its series, in order."""
+    groups: dict[str, list[Joint]] = {}
+    for joint in spec.tree.joints.values():
+        if joint.floats:
+            groups.setdefault(joint.floats, []).append(joint)
+    found = {}
+    for name, series in groups.items():
+        if len(series) == len(PARTS) and _is_free(spec, series):
+            found[name] = tuple(joint.name for joint in series)
+    return found
+
+
+def _is_free(spec: MachineSpec, series: list[Joint]) -> bool:
+    """Whether a series carries a body from the ground that nothing else holds."""
+    above = {joint.child: joint for joint in spec.tree.joints.values()}
+    at = series[0].parent
+    while at in above:
+        if above[at].moves:
+            return False  # it rides on another body
+        at = above[at].parent
+    names = {joint.name for joint in series}
+    forced = {part.joint for part in spec.forces} | {part.joint for part in spec.gas_springs}
+    forced |= {part.joint for part in spec.end_stops}
+    driven = {*(spec.active or ()), *(joint for drive in spec.drives for joint in drive.factors)}
+    bound = {joint for coupling in spec.couplings for joint in coupling.factors}
+    if names & (forced | driven | bound):
+        return False
+    return not any(
+        _rides(above, loop.predecessor, series[-1].child)
+        != _rides(above, loop.successor, series[-1].child)
+        for loop in spec.loops
+    )
+
+
+def _rides(above: Mapping[str, Joint], link: str, body: str) -> bool:
+    """Whether a body carries a link."""
+    seen = set()
+    while link != body and link in above and link not in seen:
+        seen.add(link)
+        link = above[link].parent
+    return link == body
+
+
+def with_rotation_vectors(spec: MachineSpec) -> MachineSpec:
+    """A machine whose home has Cardan angles, R_x R_y R_z, of bodies that turn out to float."""
+    from scipy.spatial.transform import Rotation
+
+    home = dict(spec.home)
+    for series in flyers(spec).values():
+        turns = series[3:]
+        angles = [home.pop(name, 0.0) for name in turns]
+        vector = Rotation.from_euler("XYZ", angles).as_rotvec().tolist()
+        home |= {name: x for name, x in zip(turns, vector, strict=True) if x}
+    return dataclasses.replace(spec, home=home)
+
+
+def floated(spec: MachineSpec) -> MachineSpec:
+    """A machine whose root floats instead of standing on the ground, by base_x to base_rz.
+
+    A machine that floats already stays as it is.
+    """
+    if flyers(spec):
+        return spec
+    tree, root = spec.tree, spec.tree.root
+    taken = {*tree.links, *tree.joints}
+    name = "base"
+    while taken & {f"{name}_{part}" for part in (*PARTS, *range(1, len(PARTS)), "ground")}:
+        name += "_"
+    ground = f"{name}_ground"
+    where = tree.links[root].where
+    links = [Link(ground, where)]
+    links += [Link(f"{name}_{i}", where, between=name) for i in range(1, len(PARTS))]
+    ends = [ground, *(link.name for link in links[1:]), root]
+    joints = []
+    for i, part in enumerate(PARTS):
+        kind = "revolute" if part.startswith("r") else "prismatic"
+        axis = [0.0, 0.0, 0.0]
+        axis["xyz".index(part[-1])] = 1.0
+        joints.append(
+            Joint(
+                f"{name}_{part}", kind, ends[i], ends[i + 1], where,
+                axis=(axis[0], axis[1], axis[2]), floats=name,
+            )
+        )  # fmt: skip
+    # the ground first: it is the root now
+    whole = Tree({links[0].name: links[0]}, {}).replacing(*tree, *links[1:], *joints)
+    return dataclasses.replace(spec, tree=whole)
