@@ -25,7 +25,7 @@ from crane.codegen.llvm.engine import Code
 from crane.codegen.representation import Formula, Routine
 from crane.codegen.scalar import Number, needed
 
-MOST = 60_000  # operations of a formula; longer ones take minutes to compile
+MOST = 400_000  # operations of a formula; longer ones take minutes to compile
 
 
 class TooLongError(Exception):
