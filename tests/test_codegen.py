@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from crane.codegen import Expression, Program, Tape, largest, maximum
+from crane.codegen.factors import Positive
 from crane.codegen.scalar import (
     add,
     apply,
@@ -20,7 +21,6 @@ from crane.codegen.scalar import (
     product,
     scale,
     solve,
-    solve_positive,
     subtract,
     times,
     with_sign_of,
@@ -546,11 +546,11 @@ def test_singular_matrices_are_not_finite():
 
 
 @pytest.mark.parametrize("k", range(1, 9))
-def test_solve_positive_equals_numpy(k):
+def test_positive_matrices_are_solved_as_by_numpy(k):
     random = np.random.default_rng(k)
 
     def formulas(x):
-        return solve_positive([x[k * i : k * i + k] for i in range(k)], x[k * k :])
+        return Positive([x[k * i : k * i + k] for i in range(k)]).solve(x[k * k :])
 
     function = Function(formulas(Tape().loads(0, 0, k * k + k)))
     for trial in range(30):
@@ -561,7 +561,7 @@ def test_solve_positive_equals_numpy(k):
         wanted = np.linalg.solve(matrix, right)
         found = function([*matrix.ravel(), *right])
         assert np.abs((found - wanted) * scales).max() <= 1e-12 * np.abs(wanted * scales).max()
-    exact = solve_positive(matrix.tolist(), right.tolist())
+    exact = Positive(matrix.tolist()).solve(right.tolist())
     np.testing.assert_allclose(exact, found, rtol=1e-10)
 
 

@@ -141,6 +141,7 @@ class Bodies:
         rotation: Of every body, (3, 3).
         origin: Of every body, (3,).
         columns: Of every joint, its spatial column at the trunk's origin: linear, angular.
+        arms: Of every body, its origin seen from its parent's; not of those on the world.
     """
 
     def __init__(self, geometry: Geometry, constants: Constants, q: Sequence[Number]):
@@ -148,9 +149,13 @@ class Bodies:
         still: list[Vector] = [[float(r == c) for c in range(3)] for r in range(3)]
         self.rotation: list[list[Vector]] = [still]
         self.origin: list[Vector] = [[0.0] * 3]
+        self.arms: list[Vector] = [[0.0] * 3]
         self.columns: list[tuple[Vector, Vector]] = [([0.0] * 3, [0.0] * 3)]
         for i in range(1, len(geometry.parents)):
-            rotation, origin = self._moved(i, q[i - 1])
+            rotation, arm = self._moved(i, q[i - 1])
+            parent = geometry.parents[i]
+            origin = add(self.origin[parent], arm)
+            self.arms.append(arm if parent else [0.0] * 3)
             if i == geometry.trunk:
                 back = [list(column) for column in zip(*rotation, strict=True)]
                 self.rotation[0], self.origin[0] = back, scale(-1.0, times(back, origin))
@@ -163,15 +168,15 @@ class Bodies:
             self.origin.append(origin)
 
     def _moved(self, i: int, q: Number) -> tuple[list[Vector], Vector]:
-        """Rotation and origin of body i, its parent's being known."""
+        """Rotation of body i and its origin from its parent's, whose rotation is known."""
         parent = self.geometry.parents[i]
         turn, place = self._constants.place(i - 1)
         rotation = product(self.rotation[parent], turn)
-        origin = add(self.origin[parent], times(self.rotation[parent], place))
+        arm = times(self.rotation[parent], place)
         if self.geometry.revolute[i]:
             c, s = apply("cos", q), apply("sin", q)
-            return [[c * x + s * y, c * y - s * x, z] for x, y, z in rotation], origin
-        return rotation, add(origin, scale(q, [row[2] for row in rotation]))
+            return [[c * x + s * y, c * y - s * x, z] for x, y, z in rotation], arm
+        return rotation, add(arm, scale(q, [row[2] for row in rotation]))
 
     def frame(self, index: int) -> tuple[list[Vector], Vector]:
         """Axes (columns of a rotation) and origin of a loop frame."""
@@ -369,10 +374,10 @@ class MovingBodies:
     def drift(self) -> Vector:
         """(nb + 1,) accelerations of the joints at a_A = 0."""
         held: dict[int, Vector] = {joint: [0.0] for joint in self._loops.active_joints}
-        x, _ = self._loops.solve(held, [-self._bend(row) for row in self._loops.rows], 1)
+        x, _ = self._loops.solve(held, [-self.bend(row) for row in self._loops.rows], 1)
         return [0.0] + [x[i][0] for i in range(1, len(self._posture.columns))]
 
-    def _bend(self, row: Row) -> Number:
+    def bend(self, row: Row) -> Number:
         """Second derivative of phi at zero joint acceleration; see `LoopEquations.curvature`."""
         one, two = row.bodies
         (v1, w1), (v2, w2) = self.velocity[one], self.velocity[two]

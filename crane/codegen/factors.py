@@ -3,9 +3,45 @@
 import itertools
 from collections.abc import Sequence
 
-from crane.codegen.scalar import Expression, Number, Tape
+from crane.codegen.scalar import Expression, Number, Tape, dot
 
 Matrix = list[list[Number]]
+
+
+class Positive:
+    """A symmetric positive definite matrix as L D L^T, L with ones on its diagonal.
+
+    Args:
+        matrix: (k, k), of which the lower half is read.
+
+    Attributes:
+        inverse: (k,) one over the diagonal of D.
+    """
+
+    def __init__(self, matrix: Sequence[Sequence[Number]]):
+        size = len(matrix)
+        self._lower: Matrix = [[0.0] * size for _ in range(size)]
+        self.inverse: list[Number] = []
+        for j in range(size):
+            scaled: list[Number] = []
+            for k in range(j):
+                scaled.append(matrix[j][k] - dot(scaled, self._lower[k][:k]))
+            self._lower[j][:j] = [x * d for x, d in zip(scaled, self.inverse, strict=True)]
+            self.inverse.append(1.0 / (matrix[j][j] - dot(scaled, self._lower[j][:j])))
+
+    def halved(self, right: Sequence[Number]) -> list[Number]:
+        """L^-1 b."""
+        x: list[Number] = []
+        for row, value in zip(self._lower, right, strict=True):
+            x.append(value - dot(row[: len(x)], x))
+        return x
+
+    def solve(self, right: Sequence[Number]) -> list[Number]:
+        """A^-1 b."""
+        x = [value * d for value, d in zip(self.halved(right), self.inverse, strict=True)]
+        for j in range(len(x) - 1, -1, -1):
+            x[j] = x[j] - dot([row[j] for row in self._lower[j + 1 :]], x[j + 1 :])
+        return x
 
 
 def eliminated(matrix: Sequence[Sequence[Number]]) -> Matrix:

@@ -203,6 +203,11 @@ def times(matrix: Sequence[Sequence[Number]], vector: Sequence[Number]) -> list[
     return [dot(row, vector) for row in matrix]
 
 
+def transposed(matrix: Sequence[Sequence[Number]]) -> list[list[Number]]:
+    """Rows as columns."""
+    return [list(column) for column in zip(*matrix, strict=True)]
+
+
 def product(a: Sequence[Sequence[Number]], b: Sequence[Sequence[Number]]) -> list[list[Number]]:
     """Matrix times matrix."""
     columns = list(zip(*b, strict=True))
@@ -268,22 +273,3 @@ def solve(
                 total = total - rows[k][i] * out[i][j]
             out[k][j] = total * inverse
     return out, determinant
-
-
-def solve_positive(matrix: Sequence[Sequence[Number]], right: Sequence[Number]) -> list[Number]:
-    """Solve A x = b with A symmetric and positive definite, by L D L^T."""
-    size = len(right)
-    lower: list[list[Number]] = [[0.0] * size for _ in range(size)]
-    diagonal: list[Number] = []
-    x = list(right)
-    for j in range(size):
-        scaled = [lower[j][k] * diagonal[k] for k in range(j)]
-        diagonal.append(matrix[j][j] - dot(scaled, lower[j][:j]))
-        inverse = 1.0 / diagonal[j]
-        for i in range(j + 1, size):
-            lower[i][j] = (matrix[i][j] - dot(scaled, lower[i][:j])) * inverse
-        x[j] = x[j] - dot(lower[j][:j], x[:j])
-    for j in range(size - 1, -1, -1):
-        tail = [lower[i][j] for i in range(j + 1, size)]
-        x[j] = x[j] / diagonal[j] - dot(tail, x[j + 1 :])
-    return x

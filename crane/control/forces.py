@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.codegen import Number
-from crane.codegen.scalar import add, scale, solve_positive, subtract
+from crane.codegen.factors import Positive
+from crane.codegen.scalar import add, scale, subtract
 from crane.common.errors import ClosureError, CraneWarning, InputError
 from crane.common.samples import Array, as_number, as_sample
 from crane.control.base import At, Law
@@ -163,6 +164,6 @@ def _without(tau: list[Number], free: list[int], at: At) -> list[Number]:
         pushed = at.inverse([float(k == i) for k in range(n)], friction=False)
         columns.append(subtract(pushed, still))
     mass = [[column[i] for column in columns] for i in free]
-    falling = solve_positive(mass, [-tau[i] for i in free])
+    falling = Positive(mass).solve([-tau[i] for i in free])
     moved = add(tau, *(scale(a, column) for a, column in zip(falling, columns, strict=True)))
     return [0.0 if i in free else x for i, x in enumerate(moved)]

@@ -9,6 +9,7 @@ from crane.closure.compiled import FastClosure
 from crane.closure.traced import Constants, folded
 from crane.codegen import Number, Program, Tape, largest
 from crane.common.samples import Array
+from crane.dynamics.recursion import Plan
 from crane.dynamics.traced import Sweep
 from crane.machine import Machine
 
@@ -46,6 +47,7 @@ class QuantityCode:
         machine: The machine.
         numbers: See `numbers_of`.
         carriers: See `crane.dynamics.formulation`.
+        plan: See `crane.dynamics.recursion`.
 
     Attributes:
         size: Length of the result of one sample.
@@ -55,13 +57,20 @@ class QuantityCode:
         TooLongError: It would take too long to compile.
     """
 
-    def __init__(self, quantity: str, machine: Machine, numbers: Array, carriers: tuple[int, ...]):
+    def __init__(
+        self,
+        quantity: str,
+        machine: Machine,
+        numbers: Array,
+        carriers: tuple[int, ...],
+        plan: Plan,
+    ):
         fast = self._fast = machine.closure.fast
         self._numbers = numbers
         nq, n = machine.model.nv, len(machine.active)
-        key = (quantity, folded(numbers), carriers)
+        key = (quantity, folded(numbers), carriers, plan)
         if key not in fast.programs:
-            fast.programs[key] = _compile(quantity, fast, numbers, n, carriers)
+            fast.programs[key] = _compile(quantity, fast, numbers, n, carriers, plan)
         self._program = program = fast.programs[key]
         self.size = program.outputs("formula").size
         self.cursor = fast.cursor()
@@ -119,12 +128,17 @@ class QuantityCode:
 
 
 def _compile(
-    quantity: str, fast: FastClosure, numbers: Array, n: int, carriers: tuple[int, ...]
+    quantity: str,
+    fast: FastClosure,
+    numbers: Array,
+    n: int,
+    carriers: tuple[int, ...],
+    plan: Plan,
 ) -> Program:
     tape = Tape()
     q, posture, loops = fast.trace(tape, 0, 2)
     constants = Constants(tape, 1, numbers)
-    sweep = Sweep(posture, loops, constants, q, tape.loads(3, 0, n), carriers)
+    sweep = Sweep(posture, loops, constants, q, tape.loads(3, 0, n), carriers, plan)
     outputs = QUANTITIES[quantity](sweep, tape.loads(3, n, n))
     program = Program()
     program.add("formula", 4, outputs)

@@ -11,6 +11,7 @@ from crane.common.samples import Array, as_number, as_samples, per_sample
 from crane.dynamics.compiled import QuantityCode
 from crane.dynamics.formulation import carriers
 from crane.dynamics.joint_forces import JointForces
+from crane.dynamics.recursion import planned
 from crane.dynamics.traced import numbers_of
 from crane.dynamics.tree import TreeDynamics
 from crane.machine import Machine
@@ -61,6 +62,7 @@ class Dynamics:
             )
         self.machine, self.formulation = machine, formulation
         self.carriers = carriers(machine, formulation)
+        self.plan = planned(machine) if formulation == "exact" else ()
         self.forces = JointForces(machine)
         self.backend = backend if machine.closure.compiled else "pinocchio"
         self.tree = TreeDynamics(machine, self.forces, self.carriers)
@@ -302,7 +304,7 @@ class Dynamics:
         if quantity not in self._formulas:
             try:
                 self._formulas[quantity] = (
-                    QuantityCode(quantity, self.machine, self.numbers, self.carriers)
+                    QuantityCode(quantity, self.machine, self.numbers, self.carriers, self.plan)
                     if self.backend == "compiled"
                     else None
                 )

@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 
 from crane.closure.traced import Bodies, Constants, Geometry, Loops, MovingBodies, Vector
+from crane.codegen.factors import Positive
 from crane.codegen.scalar import (
     Number,
     add,
@@ -15,12 +16,13 @@ from crane.codegen.scalar import (
     maximum,
     product,
     scale,
-    solve_positive,
     subtract,
     times,
 )  # fmt: skip
 from crane.common.samples import Array
+from crane.dynamics.inertia import Pair
 from crane.dynamics.joint_forces import JointForces
+from crane.dynamics.recursion import Moving, Plan, accelerations
 from crane.machine import Machine
 
 BODY, JOINT = 10, 19  # numbers per body and per joint
@@ -53,6 +55,8 @@ class Sweep:
         q: (nb,).
         v_a: (n,).
         carriers: See `crane.dynamics.formulation`.
+        plan: How forward dynamics goes through the machine's clusters; see
+            `crane.dynamics.recursion`.
 
     Attributes:
         gamma: Rows of gamma by joint.
@@ -68,18 +72,18 @@ class Sweep:
         q: Sequence[Number],
         v_a: Sequence[Number],
         carriers: Sequence[int],
+        plan: Plan = (),
     ):
-        self._carriers = carriers
+        self._carriers, self._plan = carriers, plan
         self._posture, self._loops, self._q = posture, loops, q
         self._size = len(posture.geometry.parents)
         self._n = len(v_a)
         bodies = self._size - 1
-        self._inertial = [constants.vector(BODY * i, BODY) for i in range(bodies)]
+        self._inertias = [constants.vector(BODY * i, BODY) for i in range(bodies)]
         self._laws = [constants.vector(BODY * bodies + JOINT * i, JOINT) for i in range(bodies)]
         gravity = constants.vector((BODY + JOINT) * bodies)
         self._gravity = times(posture.rotation[0], gravity)
-        rotors = constants.vector((BODY + JOINT) * bodies + 3, bodies)
-        self._rotors = [(i, value) for i, value in enumerate(rotors, start=1) if value != 0.0]
+        self._rotors: Vector = [0.0, *constants.vector((BODY + JOINT) * bodies + 3, bodies)]
         self.gamma = loops.gamma
         self.rates: Vector = [0.0, *(dot(self.gamma[i], v_a) for i in range(1, self._size))]
         # the loops' drift is that of the whole machine whatever carries a body
@@ -87,7 +91,7 @@ class Sweep:
             MovingBodies(posture, loops, self.rates, self._gravity, parents)
             for parents in (posture.geometry.parents, carriers)
         )
-        self.drift, self._motion = whole.drift, alone
+        self.drift, self._whole, self._motion = whole.drift, whole, alone
 
     @cached_property
     def _columns(self) -> list[list[tuple[Vector, Vector]]]:
@@ -106,21 +110,29 @@ class Sweep:
         return columns
 
     @cached_property
-    def _bodies(self) -> list[tuple[Number, Vector, list[Vector]]]:
-        """Per body mass, COM, inertia about it, in the trunk's frame."""
+    def _masses(self) -> list[tuple[Number, Vector, list[Vector]]]:
+        """Per body mass, lever from origin to COM, inertia about it, in the trunk's axes."""
         out: list[tuple[Number, Vector, list[Vector]]] = []
         for i in range(1, self._size):
-            mass, *rest = self._inertial[i - 1]
+            mass, *rest = self._inertias[i - 1]
             rotation = self._posture.rotation[i]
-            centre = add(self._posture.origin[i], times(rotation, rest[:3]))
             xx, xy, xz, yy, yz, zz = rest[3:]
             half = product(rotation, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             tensor: list[Vector] = [[0.0] * 3 for _ in range(3)]
             for r in range(3):
                 for c in range(r + 1):
                     tensor[r][c] = tensor[c][r] = dot(half[r], rotation[c])
-            out.append((mass, centre, tensor))
+            out.append((mass, times(rotation, rest[:3]), tensor))
         return out
+
+    @cached_property
+    def _bodies(self) -> list[tuple[Number, Vector, list[Vector]]]:
+        """Per body mass, COM, inertia about it, in the trunk's frame."""
+        origins = self._posture.origin[1:]
+        return [
+            (mass, add(origin, lever), tensor)
+            for origin, (mass, lever, tensor) in zip(origins, self._masses, strict=True)
+        ]
 
     def _at_centre(self, i: int) -> list[tuple[Vector, Vector]]:
         """Columns of body i: linear at its COM, angular."""
@@ -139,40 +151,68 @@ class Sweep:
                 for j in range(k + 1):
                     out[k][j] = out[k][j] + dot(momentum, columns[j][0]) + dot(spin, columns[j][1])
                     out[j][k] = out[k][j]
-        for i, inertia in self._rotors:
-            row = self.gamma[i]
+        for i, row in self.gamma.items():
             for k in range(self._n):
                 for j in range(k + 1):
-                    out[j][k] = out[k][j] = out[k][j] + inertia * row[k] * row[j]
+                    out[j][k] = out[k][j] = out[k][j] + self._rotors[i] * row[k] * row[j]
         return out
+
+    def _projected(self, along: Sequence[Number]) -> Vector:
+        """gamma^T of forces along the joints (nb + 1,)."""
+        out: Vector = [0.0] * self._n
+        for i, row in self.gamma.items():
+            out = add(out, scale(along[i], row))
+        return out
+
+    def _along_tree(self, wrenches: Sequence[Pair]) -> Vector:
+        """Forces along the joints (nb + 1,) that hold wrenches at the bodies' COMs."""
+        forces = [force for force, _ in wrenches]
+        moments = [
+            add(moment, cross(lever, force))
+            for (_, lever, _), (force, moment) in zip(self._masses, wrenches, strict=True)
+        ]
+        out: Vector = [0.0] * self._size
+        for i in range(self._size - 1, 0, -1):
+            force, moment = forces[i - 1], moments[i - 1]
+            axis = [row[2] for row in self._posture.rotation[i]]
+            out[i] = dot(axis, moment if self._posture.geometry.revolute[i] else force)
+            carrier = self._carriers[i]
+            if carrier:
+                arm = self._posture.arms[i]
+                forces[carrier - 1] = add(forces[carrier - 1], force)
+                moments[carrier - 1] = add(moments[carrier - 1], moment, cross(arm, force))
+        return out
+
+    def _along_inertial(self, rates: Sequence[Number]) -> Vector:
+        """Forces along the joints (nb + 1,) that accelerate them so, weights included."""
+        gained: list[Pair] = [([0.0] * 3, [0.0] * 3)]
+        wrenches: list[Pair] = []
+        for i in range(1, self._size):
+            mass, centre, tensor = self._bodies[i - 1]
+            linear, angular = (scale(rates[i], part) for part in self._posture.columns[i])
+            before = gained[self._carriers[i]]
+            gained.append((add(before[0], linear), add(before[1], angular)))
+            v, w = self._motion.velocity[i]
+            a, e = (
+                add(*parts) for parts in zip(self._motion.acceleration[i], gained[i], strict=True)
+            )
+            at = add(a, cross(e, centre), cross(w, add(v, cross(w, centre))))
+            wrenches.append((scale(mass, at), add(times(tensor, e), cross(w, times(tensor, w)))))
+        rotors = [inertia * rate for inertia, rate in zip(self._rotors, rates, strict=True)]
+        return add(self._along_tree(wrenches), rotors)
 
     @cached_property
     def inertial_bias(self) -> Vector:
         """Sum J_b^T (I_b a_b + v_b x* I_b v_b) at a_A = 0, weights and rotors included."""
-        velocity, acceleration = self._motion.velocity, self._motion.acceleration
-        out: Vector = [0.0] * self._n
-        for i in range(1, self._size):
-            mass, centre, tensor = self._bodies[i - 1]
-            v, w = velocity[i]
-            a = add(acceleration[i][0], self._columns[i][self._n][0])
-            e = add(acceleration[i][1], self._columns[i][self._n][1])
-            at = add(a, cross(e, centre), cross(w, add(v, cross(w, centre))))
-            force, moment = scale(mass, at), add(times(tensor, e), cross(w, times(tensor, w)))
-            for k, (linear, angular) in enumerate(self._at_centre(i)):
-                out[k] = out[k] + dot(linear, force) + dot(angular, moment)
-        for i, inertia in self._rotors:
-            out = add(out, scale(inertia * self.drift[i], self.gamma[i]))
-        return out
+        return self._projected(self._along_inertial(self.drift))
 
     @cached_property
     def weight(self) -> Vector:
         """gamma^T g(q)."""
-        out: Vector = [0.0] * self._n
-        for i in range(1, self._size):
-            force = scale(-self._bodies[i - 1][0], self._gravity)
-            for k, (linear, _) in enumerate(self._at_centre(i)):
-                out[k] = out[k] + dot(linear, force)
-        return out
+        wrenches: list[Pair] = [
+            (scale(-mass, self._gravity), [0.0] * 3) for mass, _, _ in self._masses
+        ]
+        return self._projected(self._along_tree(wrenches))
 
     def _law(self, i: int) -> tuple[Number, Number, Number, Number]:
         """Of joint i: passive force, friction, power taken out, energy stored.
@@ -216,32 +256,26 @@ class Sweep:
         return force, friction, lost, stored
 
     @cached_property
-    def _along_joints(self) -> tuple[Vector, Vector, Number, Number]:
-        passive: Vector = [0.0] * self._n
-        friction: Vector = [0.0] * self._n
-        lost: Number = 0.0
-        stored: Number = 0.0
-        for i in range(1, self._size):
-            force, braking, power, energy = self._law(i)
-            passive = add(passive, scale(force, self.gamma[i]))
-            friction = add(friction, scale(braking, self.gamma[i]))
-            lost, stored = lost + power, stored + energy
-        return passive, friction, lost, stored
+    def _at_joints(self) -> tuple[Vector, Vector, Vector, Vector]:
+        """`_law` of all joints (nb + 1,), one quantity after the other."""
+        laws = [(0.0,) * 4, *(self._law(i) for i in range(1, self._size))]
+        force, friction, lost, stored = (list(column) for column in zip(*laws, strict=True))
+        return force, friction, lost, stored
 
     @property
     def passive(self) -> Vector:
         """gamma^T f."""
-        return self._along_joints[0]
+        return self._projected(self._at_joints[0])
 
     @property
     def friction(self) -> Vector:
         """gamma^T tau_F."""
-        return self._along_joints[1]
+        return self._projected(self._at_joints[1])
 
     @property
     def dissipation(self) -> Number:
         """Power that friction, dampers and end stops take out [W]."""
-        return self._along_joints[2]
+        return dot(self._at_joints[2], [1.0] * self._size)
 
     @cached_property
     def kinetic(self) -> Number:
@@ -253,14 +287,14 @@ class Sweep:
             v, w = velocity[i]
             at = add(v, cross(w, centre))
             total = total + 0.5 * mass * dot(at, at) + 0.5 * dot(w, times(tensor, w))
-        for i, inertia in self._rotors:
-            total = total + 0.5 * inertia * self.rates[i] * self.rates[i]
+        for inertia, rate in zip(self._rotors, self.rates, strict=True):
+            total = total + 0.5 * inertia * rate * rate
         return total
 
     @cached_property
     def potential(self) -> Number:
         """Weights, springs, constant forces, end stops [J]."""
-        total = self._along_joints[3]
+        total = dot(self._at_joints[3], [1.0] * self._size)
         for mass, centre, _ in self._bodies:
             height = subtract(centre, self._posture.origin[0])
             total = total - mass * dot(self._gravity, height)
@@ -268,15 +302,32 @@ class Sweep:
 
     def inverse(self, a_a: Sequence[Number], friction: bool) -> Vector:
         """M_A a_A + bias - passive [+ friction]."""
-        tau = subtract(add(times(self.mass, a_a), self.inertial_bias), self.passive)
-        return add(tau, self.friction) if friction else tau
+        rates = [0.0, *(dot(row, a_a) + self.drift[i] for i, row in sorted(self.gamma.items()))]
+        return self._projected(subtract(self._along_inertial(rates), self._forces(friction)))
+
+    def _forces(self, friction: bool) -> Vector:
+        """Forces along the joints (nb + 1,) that nobody commands."""
+        passive, braking, _, _ = self._at_joints
+        return subtract(passive, braking) if friction else passive
 
     def forward(self, tau: Sequence[Number], friction: bool) -> Vector:
         """M_A^-1 (tau - bias + passive [- friction])."""
-        right = subtract(add(tau, self.passive), self.inertial_bias)
-        if friction:
-            right = subtract(right, self.friction)
-        return solve_positive(self.mass, right)
+        if self._plan:
+            return self._recursive(tau, friction)
+        right = add(tau, self._projected(self._forces(friction)))
+        return Positive(self.mass).solve(subtract(right, self.inertial_bias))
+
+    def _recursive(self, tau: Sequence[Number], friction: bool) -> Vector:
+        """The same without M_A."""
+        forces = list(self._forces(friction))
+        for joint, force in zip(self._loops.active_joints, tau, strict=True):
+            forces[joint] = forces[joint] + force
+        moving = Moving(
+            self._posture, self._loops, self._whole, self.rates, self.drift, self._gravity,
+            self._masses, self._rotors, forces,
+        )  # fmt: skip
+        rates = accelerations(moving, self._plan)
+        return [rates[joint] for joint in self._loops.active_joints]
 
     def regressor(self, a_a: Sequence[Number]) -> list[Vector]:
         """Y_A (n, 10 nb + nr), inertial parameters in Pinocchio's joint frames, then rotors'."""
@@ -299,10 +350,11 @@ class Sweep:
                 linear, angular = self._columns[i][k]
                 u = times(local, add(linear, cross(angular, origin)))
                 out[k] += _body_row(u, times(local, angular), w, e, at)
-        for i, _ in self._rotors:
-            rate = dot(self.gamma[i], a_a) + self.drift[i]
-            for k in range(self._n):
-                out[k].append(self.gamma[i][k] * rate)
+        for i, row in sorted(self.gamma.items()):
+            if self._rotors[i] != 0.0:
+                rate = dot(row, a_a) + self.drift[i]
+                for k in range(self._n):
+                    out[k].append(row[k] * rate)
         return out
 
 

@@ -8,7 +8,7 @@ from crane.codegen.llvm.objects import object_code
 from crane.codegen.llvm.text import ENTRY, text_of
 from crane.codegen.representation import Formula, Routine
 
-_SPEED = 2  # of LLVM's levels of optimisation
+_SPEED = 1  # of LLVM's levels of optimisation; higher ones take longer and gain nothing here
 _TUNING = {"slp_vectorization": False}  # takes long and gains nothing here
 
 
