@@ -3,6 +3,10 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from crane.closure.equations import LoopEquations
+
 
 @dataclass(frozen=True)
 class Cluster:
@@ -18,6 +22,12 @@ class Cluster:
 
     base: int
     joints: tuple[int, ...]
+
+
+def clusters_of(equations: LoopEquations) -> list[Cluster]:
+    """The clusters of a machine, each behind the one that carries it."""
+    ties = (np.flatnonzero(row) + 1 for row in (*equations.sign, *equations.factors))
+    return clusters(equations.coordinates.parents, (tie.tolist() for tie in ties if len(tie)))
 
 
 def clusters(parents: Sequence[int], ties: Iterable[Iterable[int]]) -> list[Cluster]:

@@ -6,11 +6,11 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from crane.closure.branch import Posture
+from crane.closure.clusters import clusters_of
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import Indices, Structure
 from crane.closure.traced import Bodies, Constants, Loops, folded, geometry_of
 from crane.codegen import Layout, Number, Program, Tape, largest, maximum
-from crane.codegen.scalar import dot
 from crane.common.samples import Array
 
 _STEEP = 1e3  # an entry of gamma above this is looked at closely by `Branch`
@@ -23,15 +23,17 @@ class Cursor:
     """Where following a stack has got to; every thread and every formula has its own.
 
     Attributes:
-        at: (nq + m n,) posture and passive rows of gamma that the next sample starts from.
+        at: (nq + entries,) posture and entries of gamma that the next sample starts from.
+        entries: Rows (passive joints) and columns of these entries; the others are zero.
     """
 
     at: Array
+    entries: tuple[Indices, Indices]
 
     def start(self, posture: Posture) -> None:
         """Let the next sample start from a posture."""
         self.at[: len(posture.q)] = posture.q
-        self.at[len(posture.q) :] = posture.gamma.ravel()
+        self.at[len(posture.q) :] = posture.gamma[self.entries]
 
 
 class _Shared:
@@ -85,8 +87,8 @@ class FastClosure:
         self.geometry = geometry_of(equations)
         self._equations, self._structure = equations, structure
         self._active, self._passive = active, passive
-        nq, n, rows = equations.model.nv, len(active), len(passive)
-        self._nq, self._n = nq, n
+        self._nq, self._n = equations.model.nv, len(active)
+        self._entries = self._moving()
         signs = self._signs(home)
         key = self._key(signs)
         shared = _SHARED.get(key)
@@ -97,9 +99,25 @@ class FastClosure:
         self._loops = program
         self.address = program.address("follow")
         self.close_address = program.address("close")
-        self._rows = rows
         self._home = home
         self.bounds = np.array([1e-15 * size, 1e-13 * size, 1e-9 * min(1.0, size)])
+
+    def _moving(self) -> tuple[Indices, Indices]:
+        """Passive joints and active ones that move them: others of their cluster."""
+        rows, columns = [], []
+        for cluster in clusters_of(self._equations):
+            joints = np.array(cluster.joints) - 1
+            passive = np.flatnonzero(np.isin(self._passive, joints))
+            active = np.flatnonzero(np.isin(self._active, joints))
+            rows.append(np.repeat(passive, len(active)))
+            columns.append(np.tile(active, len(passive)))
+        return np.concatenate(rows), np.concatenate(columns)
+
+    @property
+    def _pairs(self) -> list[tuple[int, int]]:
+        """The same, one by one."""
+        rows, columns = self._entries
+        return list(zip(rows.tolist(), columns.tolist(), strict=True))
 
     def _key(self, signs: Array) -> tuple:
         """All that the formulas depend on."""
@@ -137,7 +155,7 @@ class FastClosure:
 
     def cursor(self) -> "Cursor":
         """A place to follow stacks from, at home."""
-        cursor = Cursor(np.empty(self._nq + self._rows * self._n))
+        cursor = Cursor(np.empty(self._nq + len(self._entries[0])), self._entries)
         cursor.start(self._home)
         return cursor
 
@@ -193,7 +211,7 @@ class FastClosure:
         q, _, loops = self.trace(Tape(), 0, 1)
         steps = loops.correction
         corrected = [x + steps.get(i, 0.0) for i, x in enumerate(q, start=1)]
-        rows = [entry for joint in loops.passive_joints for entry in loops.gamma[joint]]
+        rows = [loops.gamma[loops.passive_joints[row]][k] for row, k in self._pairs]
         worst = maximum(largest(rows) - _STEEP, loops.surplus - self._structure.surplus.allowed)
         for sign, determinant in zip(signs, loops.determinants, strict=True):
             worst = maximum(worst, -(float(sign) * determinant))
@@ -246,7 +264,7 @@ class FastClosure:
         sample.
         """
         nq, n = self._nq, self._n
-        at = Layout(q=nq, gamma=len(self._passive) * n)
+        at = Layout(q=nq, gamma=len(self._pairs))
         arrays = {"numbers": None, "targets": None, "at": at, "out": None, "bounds": None}
         with program.routine("follow", counts=("count",), arrays=arrays) as r:
             guess, verdict = r.array("guess", nq), r.array("verdict", program.outputs("distance"))
@@ -272,11 +290,14 @@ class FastClosure:
     def _add_gamma(self, program: Program) -> None:
         """whole(result of newton) -> gamma of all joints, and `gammas` over postures."""
         tape, n, result = Tape(), self._n, program.outputs("newton")
+        at = {pair: result.start("gamma") + i for i, pair in enumerate(self._pairs)}
         rows: list[list[Number]] = [[0.0] * n for _ in range(self._nq)]
         for k, column in enumerate(self._active):
             rows[column][k] = 1.0
         for row, column in enumerate(self._passive):
-            rows[column] = tape.loads(0, result.start("gamma") + row * n, n)
+            for k in range(n):
+                if (row, k) in at:
+                    rows[column][k] = tape.load(0, at[row, k])
         program.add("whole", 1, [entry for row in rows for entry in row])
         arrays = ("numbers", "q", "out")
         with program.routine("gammas", counts=("count",), arrays=arrays) as r:
@@ -302,9 +323,9 @@ class FastClosure:
         q, n = tape.loads(0, 0, self._nq), self._n
         target = tape.loads(1, 0, n)
         change = [target[k] - q[column] for k, column in enumerate(self._active)]
-        moves = [
-            dot(tape.loads(0, self._nq + row * n, n), change) for row in range(len(self._passive))
-        ]
+        moves: list[Number] = [0.0] * len(self._passive)
+        for i, (row, k) in enumerate(self._pairs):
+            moves[row] = moves[row] + tape.load(0, self._nq + i) * change[k]
         for column, move in zip(self._passive, moves, strict=True):
             q[column] = q[column] + move
         for column, value in zip(self._active, target, strict=True):

@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.clusters import Cluster, clusters
+from crane.closure.clusters import Cluster, clusters_of
 from crane.closure.traced import Bodies, Loops, MovingBodies
 from crane.codegen.factors import Positive
 from crane.codegen.scalar import Number, add, cross, dot, scale, times
@@ -61,9 +61,6 @@ def planned(machine: Machine) -> Plan:
     """
     if len(machine.active) <= _FEW:
         return ()
-    equations = machine.closure.equations
-    ties = [np.flatnonzero(row) + 1 for row in (*equations.sign, *equations.factors)]
-    found = clusters(machine.coordinates.parents, (tie.tolist() for tie in ties if len(tie)))
     active = {int(column) + 1 for column in machine.closure.active}
     light = _light(machine)
 
@@ -72,7 +69,9 @@ def planned(machine: Machine) -> Plan:
             return True
         return len(active & set(cluster.joints)) > _TIED and not light & set(cluster.joints)
 
-    return tuple((cluster, by_forces(cluster)) for cluster in found)
+    return tuple(
+        (cluster, by_forces(cluster)) for cluster in clusters_of(machine.closure.equations)
+    )
 
 
 def _light(machine: Machine) -> set[int]:
