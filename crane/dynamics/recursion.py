@@ -83,8 +83,7 @@ def _light(machine: Machine) -> set[int]:
     data = model.createData()
     mass = pin.crba(model, data, machine.coordinates.configuration(machine.home))
     pin.cholesky.decompose(model, data)
-    left = data.D / np.diag(mass)
-    return set((np.flatnonzero(~(left > _LIGHT)) + 1).tolist())
+    return set((np.flatnonzero(~(data.D > _LIGHT * np.diag(mass))) + 1).tolist())
 
 
 @dataclass(frozen=True)
