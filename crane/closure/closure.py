@@ -107,8 +107,6 @@ class Closure:
 
     @cached_property
     def _made(self) -> FastClosure | None:
-        if self.equations.coordinates.floating:
-            return None
         branch = self._branch
         try:
             return FastClosure(

@@ -131,6 +131,7 @@ class FastClosure:
         return (
             geometry.parents,
             geometry.revolute,
+            geometry.flyers,
             geometry.frame_bodies,
             folded(geometry.numbers),
             tuple(loop.type for loop in equations.loops),

@@ -28,6 +28,7 @@ class Coordinates:
         floating: First column of each free-flyer.
         parents: (nv + 1,) what carries what, as if each coordinate i moved a body i + 1 of its
             own: the six of a free-flyer in a row; 0 is the world.
+        bodies: By joint of the model its body in that count.
     """
 
     def __init__(self, model: pin.Model):
@@ -47,6 +48,7 @@ class Coordinates:
             places += range(joint.idx_q, joint.idx_q + joint.nv)
         self.joints = np.array(joints, dtype=np.intp)
         last = {0: 0} | {joint: i + 1 for i, joint in enumerate(joints)}
+        self.bodies: tuple[int, ...] = tuple(last[joint] for joint in range(model.njoints))
         self.parents: tuple[int, ...] = (0,) + tuple(
             i if i and joints[i - 1] == joint else last[model.parents[joint]]
             for i, joint in enumerate(joints)

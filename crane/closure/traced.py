@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from crane.closure.equations import LoopEquations, aligned_axes, turned
+from crane.closure.rotations import turned_by
 from crane.closure.structure import Indices, Structure
 from crane.codegen.scalar import (
     Number,
@@ -22,6 +23,7 @@ from crane.codegen.scalar import (
     solve,
     subtract,
     times,
+    transposed,
 )  # fmt: skip
 from crane.common.samples import Array
 
@@ -34,11 +36,13 @@ class Geometry:
     """What the formulas of a machine's positions depend on.
 
     Body i (1 to nb) is moved by joint i, which turns about or slides along the body's own z;
-    body 0 is the world.
+    body 0 is the world. A free-flyer is six bodies in a row on the world, at the place of the last
+    one, which alone has mass: its velocities are along and about the axes of that body.
 
     Attributes:
         parents: (nb + 1,) parent bodies.
         revolute: (nb + 1,) whether the joint turns.
+        flyers: First body of each free-flyer.
         turns: (nb + 1, 3, 3) from the body's directions here to those of Pinocchio's joint.
         numbers: (12 (nb + frames),) rotation and origin of every joint frame in its parent body,
             then of every loop frame in its body.
@@ -47,6 +51,7 @@ class Geometry:
 
     parents: tuple[int, ...]
     revolute: tuple[bool, ...]
+    flyers: tuple[int, ...]
     turns: Array
     numbers: Array
     frame_bodies: tuple[int, ...]
@@ -58,36 +63,52 @@ class Geometry:
         Seen from there its own joint moves nothing but the world, and what lies in a plane of it
         stays in that plane.
         """
-        return int(self.parents.count(0) == 2 and 0 not in self.frame_bodies)
+        if self.parents.count(0) != 2 or 0 in self.frame_bodies:
+            return 0
+        return 6 if self.flyers else 1
+
+    @property
+    def flying(self) -> frozenset[int]:
+        """All bodies of free-flyers."""
+        return frozenset(i + k for i in self.flyers for k in range(6))
+
+    @property
+    def massless(self) -> frozenset[int]:
+        """Those of them that are none."""
+        return frozenset(i + k for i in self.flyers for k in range(5))
 
 
 def geometry_of(equations: LoopEquations) -> Geometry:
     """Read the geometry off an assembled model."""
-    model = equations.model
-    parents, revolute, turns = [0], [False], [pin.SE3.Identity()]
+    model, coordinates = equations.model, equations.coordinates
+    parents, turns = coordinates.parents, [pin.SE3.Identity()]
+    revolute = [False, *(not slides for slides in coordinates.slides)]
+    last = coordinates.bodies
     places = []
     for i in range(1, model.njoints):
         joint = model.joints[i]
+        place = turns[last[model.parents[i]]].inverse() * model.jointPlacements[i]
+        if joint.nv == 6:
+            places += [place, *[pin.SE3.Identity()] * 5]
+            turns += [pin.SE3.Identity()] * 6
+            continue
         data = joint.createData()
         joint.calc(data, np.zeros(model.nq))
         column = np.asarray(data.S).ravel()
-        turning = bool(np.linalg.norm(column[3:]) > 0.5)
-        axis = column[3:] if turning else column[:3]
+        axis = column[3:] if revolute[last[i]] else column[:3]
         turn = pin.SE3(np.eye(3) if axis[2] == 1 else turned(axis.tolist()), np.zeros(3))
-        parent = model.parents[i]
-        places.append(turns[parent].inverse() * model.jointPlacements[i] * turn)
-        parents.append(parent)
-        revolute.append(turning)
+        places.append(place * turn)
         turns.append(turn)
     frames = equations.frames
-    places += [turns[body].inverse() * place for body, place in frames]
+    places += [turns[last[body]].inverse() * place for body, place in frames]
     numbers = [np.concatenate([_clean(p.rotation).ravel(), p.translation]) for p in places]
     return Geometry(
-        tuple(parents),
+        parents,
         tuple(revolute),
+        tuple(column + 1 for column in coordinates.floating),
         np.array([turn.rotation for turn in turns]),
         np.concatenate(numbers) if numbers else np.zeros(0),
-        tuple(body for body, _ in frames),
+        tuple(last[body] for body, _ in frames),
     )
 
 
@@ -151,21 +172,38 @@ class Bodies:
         self.origin: list[Vector] = [[0.0] * 3]
         self.arms: list[Vector] = [[0.0] * 3]
         self.columns: list[tuple[Vector, Vector]] = [([0.0] * 3, [0.0] * 3)]
-        for i in range(1, len(geometry.parents)):
-            rotation, arm = self._moved(i, q[i - 1])
-            parent = geometry.parents[i]
-            origin = add(self.origin[parent], arm)
-            self.arms.append(arm if parent else [0.0] * 3)
-            if i == geometry.trunk:
-                back = [list(column) for column in zip(*rotation, strict=True)]
-                self.rotation[0], self.origin[0] = back, scale(-1.0, times(back, origin))
-                rotation, origin = still, [0.0] * 3
-            axis = [row[2] for row in rotation]
+        for i, parent in enumerate(geometry.parents[1:], start=1):
+            arm: Vector = [0.0] * 3
+            if i in geometry.flying - set(geometry.flyers):
+                rotation, origin = self.rotation[parent], self.origin[parent]
+            else:
+                flies = i in geometry.flyers
+                rotation, arm = self._flown(i) if flies else self._moved(i, q[i - 1])
+                origin = add(self.origin[parent], arm)
+                if geometry.trunk and parent == 0:
+                    back = transposed(rotation)
+                    self.rotation[0], self.origin[0] = back, scale(-1.0, times(back, origin))
+                    rotation, origin = still, [0.0] * 3
+            self.arms.append(scale(float(parent > 0), arm))
+            self.rotation.append(rotation)
+            self.origin.append(origin)
+            axis = self.axis(i)
             self.columns.append(
                 (cross(origin, axis), axis) if geometry.revolute[i] else (axis, [0.0] * 3)
             )
-            self.rotation.append(rotation)
-            self.origin.append(origin)
+
+    def axis(self, i: int) -> Vector:
+        """Along or about which joint i moves."""
+        flyers = self.geometry.flyers
+        along = 2 if i not in self.geometry.flying else (i - max(j for j in flyers if j <= i)) % 3
+        return [row[along] for row in self.rotation[i]]
+
+    def _flown(self, i: int) -> tuple[list[Vector], Vector]:
+        """Rotation and origin of a free-flyer, from its place and rotation vector."""
+        turn, place = self._constants.place(i - 1)
+        position, vector = self.q[i - 1 : i + 2], self.q[i + 2 : i + 5]
+        # the world is at its origin, and turned if the trunk flies
+        return product(turn, turned_by(vector)), add(place, times(turn, position))
 
     def _moved(self, i: int, q: Number) -> tuple[list[Vector], Vector]:
         """Rotation of body i and its origin from its parent's, whose rotation is known."""
@@ -366,8 +404,10 @@ class MovingBodies:
             linear, angular = (scale(rates[i], part) for part in posture.columns[i])
             v, w = self.velocity[parent]
             a, e = self.acceleration[parent]
-            bent = add(a, cross(w, linear), cross(v, angular)), add(e, cross(w, angular))
-            self.acceleration.append(bent)
+            if i not in posture.geometry.flying:  # whose columns turn with the last of its bodies
+                a = add(a, cross(w, linear), cross(v, angular))
+                e = add(e, cross(w, angular))
+            self.acceleration.append((a, e))
             self.velocity.append((add(v, linear), add(w, angular)))
 
     @cached_property

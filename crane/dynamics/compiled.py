@@ -29,7 +29,7 @@ QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
     "passive": lambda sweep, x: sweep.passive,
     "energy": lambda sweep, x: [sweep.kinetic, sweep.potential],
     "rates": lambda sweep, x: [
-        *sweep.rates[1:],
+        *sweep.slopes,
         *sweep.forward(x, friction=True),
         sweep.dissipation,
     ],

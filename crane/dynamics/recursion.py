@@ -83,7 +83,7 @@ def _light(machine: Machine) -> set[int]:
     data = model.createData()
     mass = pin.crba(model, data, machine.coordinates.configuration(machine.home))
     pin.cholesky.decompose(model, data)
-    return set((np.flatnonzero(~(data.D > _LIGHT * np.diag(mass))) + 1).tolist())
+    return set((np.flatnonzero(~(_LIGHT * np.diag(mass) < data.D)) + 1).tolist())
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Moving:
     def axes(self) -> list[Pair]:
         """The motion of each body's origin and directions per unit of its joint's."""
         revolute = self.posture.geometry.revolute
-        axes = [[row[2] for row in rotation] for rotation in self.posture.rotation]
+        axes = [_NONE[0], *(self.posture.axis(i) for i in range(1, len(revolute)))]
         return [
             (_NONE[0], axis) if turns else (axis, _NONE[0])
             for axis, turns in zip(axes, revolute, strict=True)
@@ -131,12 +131,21 @@ class Moving:
     def bent(self) -> list[Pair]:
         """What each body accelerates beyond its parent while no joint does."""
         out = [_NONE]
-        for i, parent in enumerate(self.posture.geometry.parents[1:], start=1):
+        geometry = self.posture.geometry
+        for i, parent in enumerate(geometry.parents[1:], start=1):
+            if i in geometry.flying:
+                out.append(_NONE if i in geometry.massless else (self._flown(i), _NONE[0]))
+                continue
             spin, arm = self.turning[parent], self.posture.arms[i]
             linear, angular = by(self.rates[i], self.axes[i])
             bent = add(cross(spin, cross(spin, arm)), scale(2.0, cross(spin, linear)))
             out.append((bent, cross(spin, angular)))
         return out
+
+    def _flown(self, i: int) -> Vector:
+        """What the origin of a free-flyer accelerates while its twist in its axes stays."""
+        parts = [scale(self.rates[j], self.axes[j][0]) for j in range(i - 5, i - 2)]
+        return cross(self.turning[i], add(*parts))
 
     def rigid(self, i: int, arm: Vector) -> Hanging:
         """Inertia of a body, and the wrench that its turning asks for.

@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from crane.closure.rotations import turned_by, vector_rate
 from crane.closure.traced import Bodies, Constants, Geometry, Loops, MovingBodies, Vector
 from crane.codegen.factors import Positive
 from crane.codegen.scalar import (
@@ -37,7 +38,11 @@ def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Arr
     inertia.
     """
     bodies = []
-    for turn, inertia in zip(geometry.turns[1:], list(machine.model.inertias)[1:], strict=True):
+    for i, joint in enumerate(machine.coordinates.joints, start=1):
+        if i in geometry.massless:
+            bodies.append([0.0] * BODY)
+            continue
+        turn, inertia = geometry.turns[i], machine.model.inertias[int(joint)]
         tensor = turn.T @ inertia.inertia @ turn
         bodies.append([inertia.mass, *(turn.T @ inertia.lever), *tensor[_UPPER]])
     gravity = machine.model.gravity.linear
@@ -174,7 +179,7 @@ class Sweep:
         out: Vector = [0.0] * self._size
         for i in range(self._size - 1, 0, -1):
             force, moment = forces[i - 1], moments[i - 1]
-            axis = [row[2] for row in self._posture.rotation[i]]
+            axis = self._posture.axis(i)
             out[i] = dot(axis, moment if self._posture.geometry.revolute[i] else force)
             carrier = self._carriers[i]
             if carrier:
@@ -263,6 +268,17 @@ class Sweep:
         return force, friction, lost, stored
 
     @property
+    def slopes(self) -> Vector:
+        """Time derivatives of the coordinates (nb,): the rates, but of rotation vectors."""
+        out = list(self.rates[1:])
+        for i in self._posture.geometry.flyers:
+            linear, angular = out[i - 1 : i + 2], out[i + 2 : i + 5]
+            vector = self._q[i + 2 : i + 5]
+            out[i - 1 : i + 2] = times(turned_by(vector), linear)
+            out[i + 2 : i + 5] = vector_rate(vector, angular)
+        return out
+
+    @property
     def passive(self) -> Vector:
         """gamma^T f."""
         return self._projected(self._at_joints[0])
@@ -333,7 +349,7 @@ class Sweep:
         """Y_A (n, 10 nb + nr), inertial parameters in Pinocchio's joint frames, then rotors'."""
         velocity, acceleration = self._motion.velocity, self._motion.acceleration
         out: list[Vector] = [[] for _ in range(self._n)]
-        for i in range(1, self._size):
+        for i in sorted(set(range(1, self._size)) - self._posture.geometry.massless):
             turn = self._posture.geometry.turns[i]
             axes = product(self._posture.rotation[i], turn.T.tolist())  # columns: joint's axes
             local = list(zip(*axes, strict=True))  # rows: trunk to joint

@@ -336,7 +336,7 @@ class _FastPoint:
     def __init__(self, machine: Machine, frame: int):
         fast = self._closure = machine.closure.fast
         placed = machine.model.frames[frame]
-        self._body = placed.parentJoint
+        self._body = machine.coordinates.bodies[placed.parentJoint]
         self._place = fast.geometry.turns[self._body].T @ placed.placement.translation
         self._n = len(machine.active)
         key = (type(self), self._body, folded(self._place))

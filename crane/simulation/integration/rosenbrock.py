@@ -13,7 +13,13 @@ from crane.dynamics import Dynamics
 from crane.dynamics.traced import Sweep
 from crane.simulation.integration.blocks import in_blocks
 from crane.simulation.integration.state import seen_layout, state_layout
-from crane.simulation.integration.traced import columns_of, form_of, machine_at, settings_of
+from crane.simulation.integration.traced import (
+    columns_of,
+    form_of,
+    machine_at,
+    settings_of,
+    wrapped,
+)
 
 # ROS34PW2 of Rang and Angermann (2005): order 3 with any Jacobian, L-stable, stiffly accurate,
 # with an embedded method of order 2.
@@ -129,7 +135,7 @@ class StiffStepper:
         tau, own_rate = control.trace(at)
         a_a = sweep.forward(tau, friction=True)
         powers = [dot(tau, at.v_a), sweep.dissipation]
-        program.add("rate", 6, [*sweep.rates[1:], *a_a, *own_rate, *powers])
+        program.add("rate", 6, [*sweep.slopes, *a_a, *own_rate, *powers])
         tape = Tape()
         sweep, at = self._trace(tape, 4, None)
         tau, _ = control.trace(at)
@@ -258,4 +264,5 @@ class StiffStepper:
         usable = minimum(maximum(error, 1e-9), 1e9)
         change = _SAFETY * apply("exp", (-1.0 / 3.0) * apply("log", usable))
         change = minimum(maximum(change, _SLOWER), _FASTER)
+        after = wrapped(self._dynamics, after)
         program.add("finish", 3, {"state": after, "error": [error], "change": [change]})

@@ -10,7 +10,13 @@ from crane.control import At, TracedController
 from crane.dynamics import Dynamics
 from crane.simulation.integration.blocks import in_blocks
 from crane.simulation.integration.state import seen_layout, state_layout
-from crane.simulation.integration.traced import columns_of, form_of, machine_at, settings_of
+from crane.simulation.integration.traced import (
+    columns_of,
+    form_of,
+    machine_at,
+    settings_of,
+    wrapped,
+)
 
 
 class CompiledStepper:
@@ -48,7 +54,7 @@ class CompiledStepper:
             tau, own_rate = control.trace(at)
             a_a = sweep.forward(tau, friction=True)
             powers = [dot(tau, at.v_a), sweep.dissipation]
-            outputs = {"rate": [*sweep.rates[1:], *a_a, *own_rate, *powers]}
+            outputs = {"rate": [*sweep.slopes, *a_a, *own_rate, *powers]}
             if name == "observe":
                 outputs["seen"] = [*tau, *sweep.friction, sweep.kinetic, sweep.potential]
             program.add(name, 5, outputs)
@@ -135,7 +141,7 @@ class CompiledStepper:
         k1, k2, k3, k4 = (tape.loads(array, 0, size) for array in range(1, 5))
         h = tape.load(5, 0)
         mean = add(k1, scale(2.0, add(k2, k3)), k4)
-        after = add(state, scale(h * (1.0 / 6.0), mean))
+        after = wrapped(self._dynamics, add(state, scale(h * (1.0 / 6.0), mean)))
         # the largest of all changes, so that NaN and infinity anywhere show
         move = h * largest(
             [*k1[coordinates], *k2[coordinates], *k3[coordinates], *scale(1e-9, mean)]

@@ -4,6 +4,7 @@ from collections.abc import Hashable, Sequence
 
 import numpy as np
 
+from crane.closure import rotations
 from crane.closure.traced import Constants
 from crane.codegen import Expression, Layout, Number, Parts, Tape
 from crane.common.errors import InputError
@@ -30,6 +31,14 @@ def machine_at(
     constants = Constants(tape, 1, dynamics.numbers)
     sweep = Sweep(posture, loops, constants, q, parts.v_a, dynamics.carriers, dynamics.plan)
     return sweep, [q[i] for i in closure.active], parts
+
+
+def wrapped(dynamics: Dynamics, state: Sequence[Number]) -> list[Number]:
+    """A state, q first, with rotation vectors of at most pi."""
+    out = list(state)
+    for column in dynamics.machine.coordinates.floating:
+        out[column + 3 : column + 6] = rotations.wrapped(out[column + 3 : column + 6])
+    return out
 
 
 def form_of(control: TracedController, columns: int, n: int, states: int, fold: bool) -> Hashable:
