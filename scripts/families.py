@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-FAMILIES = ("chain", "tree", "ring", "spatial ring")
+FAMILIES = {"chain": 4, "tree": 4, "ring": 3, "spatial ring": 6}  # and their fewest joints
 TURN = 3  # four-bars in a plane, before the next ones turn out of it by 90 degrees
+DRAWS = 50  # of axes of a ring
 Array = np.ndarray
 
 
@@ -25,18 +26,21 @@ def write(family: str, joints: int, folder: Path) -> Path:
 
     Args:
         family: One of `FAMILIES`.
-        joints: How many joints its tree has at most: a chain and a tree have 3 k + 1 of them, the
-            least k is 1; rings have at least 3 and 6.
+        joints: How many joints its tree has at most; a chain and a tree have 3 k + 1 of them.
         folder: Where to.
 
     Returns:
         The file.
+
+    Raises:
+        ValueError: There is none of so few joints.
     """
-    size, random = joints, np.random.default_rng([FAMILIES.index(family), joints])
+    if joints < FAMILIES[family]:
+        raise ValueError(f"a {family} has {FAMILIES[family]} joints or more")
+    random = np.random.default_rng([list(FAMILIES).index(family), joints])
     urdf = Urdf(f"{family.replace(' ', '_')}_{joints}", random)
     if family in ("chain", "tree"):
-        size = max(1, (joints - 1) // 3)
-        _four_bars(urdf, list(_places(family, size)))
+        _four_bars(urdf, list(_places(family, (joints - 1) // 3)))
     else:
         _ring(urdf, joints, family == "spatial ring")
     path = folder / f"{urdf.name}.urdf"
@@ -147,27 +151,41 @@ def _four_bar(urdf: Urdf, i: int, parent: str, place: pin.SE3, size: float) -> t
 def _ring(urdf: Urdf, joints: int, spatial: bool) -> None:
     """A loop of so many bodies from the ground to the ground.
 
-    Its passive joints lie apart from each other: two in a plane, five in space.
+    Its passive joints lie apart from each other: two in a plane, five in space, whose axes are
+    the least dependent ones of some that are drawn.
     """
-    draw = urdf.random
-    passive = 5 if spatial else 2
-    if joints <= passive:
-        raise SystemExit(f"error: {joints} joints make no ring, take {passive + 1} or more")
+    draw, passive = urdf.random, 5 if spatial else 2
     angles = np.linspace(np.pi, -np.pi, joints + 1, endpoint=False)
     angles += draw.uniform(-0.2, 0.2, joints + 1) / joints
     radius = 0.08 * (joints + 1)
     points = radius * np.stack([np.cos(angles), 0 * angles, np.sin(angles)], axis=1)
     if spatial:
         points[:, 1] = draw.uniform(-0.3, 0.3, joints + 1)
-    led = {round((k + 1) * joints / (passive + 1)) for k in range(passive)}
-    here, parent = pin.SE3.Identity(), "ground"
-    for i, (point, far) in enumerate(zip(points[:-1], points[1:], strict=True)):
-        way = far - point
-        frame = pin.SE3(_frame(way, draw.uniform(-1.2, 1.2) if spatial else 0), point)
-        urdf.body(f"body{i}", parent, here.inverse() * frame, np.linalg.norm(way), i not in led)
-        here, parent = frame, f"body{i}"
-    end = pin.SE3(here.rotation @ pin.utils.rotate("x", 0.5 * spatial), points[-1])
-    urdf.pin("clasp", (parent, here.inverse() * end), ("ground", end))
+    led = [int((k + 0.5) * joints / passive) for k in range(passive)]
+    drawn = [_frames(points, spatial * draw.uniform(-1.2, 1.2, joints + 1)) for _ in range(DRAWS)]
+    frames = min(drawn, key=lambda frames: _dependence([frames[k] for k in (*led, -1)], radius))
+    parent, below = "ground", pin.SE3.Identity()
+    for i, (frame, far) in enumerate(zip(frames[:-1], points[1:], strict=True)):
+        length = float(np.linalg.norm(far - frame.translation))
+        urdf.body(f"body{i}", parent, below.inverse() * frame, length, i not in led)
+        parent, below = f"body{i}", frame
+    urdf.pin("clasp", (parent, below.inverse() * frames[-1]), ("ground", frames[-1]))
+
+
+def _frames(points: Array, tilts: Array) -> list[pin.SE3]:
+    """At every point of a ring, x to the next one, or at the last one from that before it."""
+    ways = np.diff(points, axis=0)
+    ways = np.vstack([ways, ways[-1:]])
+    return [
+        pin.SE3(_frame(way, tilt), point)
+        for way, tilt, point in zip(ways, tilts, points, strict=True)
+    ]
+
+
+def _dependence(frames: list[pin.SE3], size: float) -> float:
+    """Condition number of the screws of all y, lengths by the size [m]."""
+    axes = [(frame.rotation[:, 1], frame.translation / size) for frame in frames]
+    return float(np.linalg.cond([np.hstack([y, np.cross(at, y)]) for y, at in axes]))
 
 
 def _frame(way: Array, turn: float) -> Array:

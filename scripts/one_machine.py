@@ -29,11 +29,15 @@ Sample = tuple[Array, Array, Array]
 
 
 def motion(machine: crane.Machine, count: int) -> list[Sample]:
-    """Coordinates, velocities and forces (n,) along a motion about home, every 10 ms."""
+    """Coordinates, velocities and forces (n,) along a motion about home, every 10 ms.
+
+    Less of it the longer the loops are, so that they can be closed.
+    """
     n, random = len(machine.active), np.random.default_rng(1)
     rate, phase = random.uniform(0.5, 1.5, n), random.uniform(0, 2 * np.pi, n)
     turn = 0.01 * np.arange(count)[:, None] * rate + phase
-    home, reach = machine.home[machine.closure.active], 0.1
+    loops = machine.closure.equations.loops
+    home, reach = machine.home[machine.closure.active], min(0.1, len(loops) / machine.model.nv)
     q_a = home + reach * (np.sin(turn) - np.sin(phase))
     tau = 10 * random.normal(size=(count, n))
     return list(zip(q_a, reach * rate * np.cos(turn), tau, strict=True))
