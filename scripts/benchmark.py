@@ -8,34 +8,21 @@ given. Ratios carry over to other machines, times do not. Needs MuJoCo (extra "b
 """
 
 import argparse
-import importlib.metadata
-import os
-import platform
 import warnings
 from pathlib import Path
 
 from engines import work_precision
 from evaluations import agree, forward_dynamics, one_step, task
 from hydraulic_crane import hydraulic_crane
+from results import conditions, put
 from stacks import stacks, threads
 from starting import starts
 from subject import swinging
 
 import crane
 
-BEGIN, END = "<!-- results: written by scripts/benchmark.py -->", "<!-- end of results -->"
+MARKS = "<!-- results: written by scripts/benchmark.py -->", "<!-- end of results -->"
 PICTURE = "images/work_precision.png"
-
-
-def conditions() -> str:
-    """What it was measured on."""
-    names = ("pin", "mujoco", "numpy", "scipy", "llvmlite")
-    versions = ", ".join(f"{name} {importlib.metadata.version(name)}" for name in names)
-    return (
-        f"Measured with Python {platform.python_version()}, {versions} on {platform.system()}, "
-        f"{platform.machine()}, {os.cpu_count()} cores, with other work on them as of a load "
-        f"average of {os.getloadavg()[0]:.1f}: wall times suffer from it, CPU times hardly."
-    )
 
 
 def main() -> None:
@@ -62,11 +49,7 @@ def main() -> None:
         parts += [f"### {title}", part()]
         print("\n\n".join(parts[-4:] if title == "Forward dynamics" else parts[-2:]) + "\n")
     if options.write:
-        page = options.write.read_text(encoding="utf-8")
-        before, rest = page.split(BEGIN)
-        _, after = rest.split(END)
-        text = "\n\n".join([before + BEGIN, *parts, END + after])
-        options.write.write_text(text, encoding="utf-8")
+        put(options.write, MARKS, parts)
 
 
 if __name__ == "__main__":

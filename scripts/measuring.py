@@ -11,7 +11,14 @@ Clock = Callable[[], float]
 def measure(
     calls: dict[str, Call], rounds: int, clock: Clock = time.process_time
 ) -> dict[str, float]:
-    """Median time of each call [s]; they take turns, after one turn that does not count."""
+    """Median time of each call [s] over `turns`."""
+    return {name: statistics.median(t) for name, t in turns(calls, rounds, clock).items()}
+
+
+def turns(
+    calls: dict[str, Call], rounds: int, clock: Clock = time.process_time
+) -> dict[str, list[float]]:
+    """Times of each call [s]; they take turns, after one turn that does not count."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     for turn in range(rounds + 1):
         for name, call in calls.items():
@@ -19,7 +26,7 @@ def measure(
             call()
             if turn:
                 times[name].append(clock() - start)
-    return {name: statistics.median(samples) for name, samples in times.items()}
+    return times
 
 
 def table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:

@@ -17,17 +17,26 @@ INTEGRATORS = ("Euler", "implicitfast", "RK4")
 
 
 class ConstraintDynamics:
-    """pin.constraintDynamics with one point of contact per loop, which is enough in a plane.
+    """pin.constraintDynamics with points of contact at each loop, one is enough in a plane.
 
-    mu = 1e-4 and at most 3 iterations suit it best: the redundant rows of plane loops keep it
-    from its residual for ever, and with these it gives the accelerations to rounding all the
-    same.
+    mu = 1e-4 and at most 3 iterations suit the mini forwarder best: the redundant rows of plane
+    loops keep it from its residual for ever, and with these it gives the accelerations to
+    rounding all the same.
 
     Args:
         machine: The machine.
+        along: Where the points of a loop are, on its axis [m].
+        mu: Of the proximal method.
+        iterations: Its most.
     """
 
-    def __init__(self, machine: crane.Machine):
+    def __init__(
+        self,
+        machine: crane.Machine,
+        along: tuple[float, ...] = (0.0,),
+        mu: float = 1e-4,
+        iterations: int = 3,
+    ):
         model = machine.model
         self.machine, self.model, self.data = machine, model, model.createData()
         self._models = pin.StdVec_RigidConstraintModel()
@@ -36,22 +45,23 @@ class ConstraintDynamics:
             one, two = (
                 model.frames[machine.frame(name)] for name in (loop.predecessor, loop.successor)
             )
-            self._models.append(
-                pin.RigidConstraintModel(
-                    pin.ContactType.CONTACT_3D,
-                    model,
-                    one.parentJoint,
-                    one.placement,
-                    two.parentJoint,
-                    two.placement,
-                    pin.LOCAL,
+            for distance in along:
+                offset = pin.SE3(np.eye(3), distance * np.array(loop.axis))
+                self._models.append(
+                    pin.RigidConstraintModel(
+                        pin.ContactType.CONTACT_3D,
+                        model,
+                        one.parentJoint,
+                        one.placement * offset,
+                        two.parentJoint,
+                        two.placement * offset,
+                        pin.LOCAL,
+                    )
                 )
-            )
         for constraint in self._models:
             self._datas.append(constraint.createData())
         pin.initConstraintDynamics(model, self.data, self._models, self._datas)
-        self._along = crane.Dynamics(machine)
-        self._settings = pin.ProximalSettings(1e-12, 1e-4, 3)
+        self._settings = pin.ProximalSettings(1e-12, mu, iterations)
         self._stiffness, self._rest, self._damping = np.zeros((3, model.nv))
         for element in machine.forces:
             column = machine.column(element.joint)
@@ -78,7 +88,7 @@ class ConstraintDynamics:
         """
         closure, half = self.machine.closure, step / 2
         active = closure.active
-        rest = np.zeros(len(active))
+        rest, dynamics = np.zeros(len(active)), crane.Dynamics(self.machine)
         for _ in range(steps):
             a1 = self.acceleration(q, v).copy()
             v2 = v + half * a1
@@ -90,7 +100,7 @@ class ConstraintDynamics:
             q = q + step / 6 * (v + 2 * (v2 + v3) + v4)
             v = v + step / 6 * (a1 + 2 * (a2 + a3) + a4)
             q = closure.solve(q[active], guess=q)
-            v = self._along.at("rates", q, v[active], rest)[: len(v)]  # gamma v_A, fast
+            v = dynamics.at("rates", q, v[active], rest)[: len(v)]  # gamma v_A, fast
         return q
 
 

@@ -1,0 +1,54 @@
+"""Picture of the times of large machines over their number of joints."""
+
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from crane.view.plots.recording import INK, STYLE
+
+COLOURS = {"chain": "#1f5fa8", "tree": "#3c8c4a", "ring": "#c8501a", "spatial ring": "#8a4fa0"}
+CALLS = {"one": ("one call of crane", "o-"), "stack": ("crane, in a stack", ":"),
+         "theirs": ("pin.constraintDynamics", "^--")}  # fmt: skip
+STARTS = {"first": ("first call", "o-"), "kept": ("kept", ":")}
+
+
+def draw(results: list[dict], path: Path) -> None:
+    """Time of a call, and of the first call.
+
+    Args:
+        results: As `one_machine.py` prints them, those without times left out.
+        path: Where to.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(9.6, 4.6), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        _lines(left, results, CALLS, 1e6)
+        _lines(right, results, STARTS, 1.0)
+        left.set(ylabel="CPU time [us]", title="A call of forward dynamics")
+        right.set(ylabel="CPU time [s]", title="Tracing and compiling")
+        right.plot([100], [10.0], "k_", [100], [0.1], "k_", ms=14)
+        for axes in (left, right):
+            axes.set(xlabel="joints", xscale="log", yscale="log")
+            ticks = [4, 10, 20, 30, 60, 100, 200]
+            axes.set_xticks(ticks, [str(tick) for tick in ticks])
+            axes.minorticks_off()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=160)
+
+
+def _lines(axes: Axes, results: list[dict], kinds: dict[str, tuple[str, str]], by: float) -> None:
+    for family, colour in COLOURS.items():
+        own = [found for found in results if found["family"] == family and "kept" in found]
+        joints = [found["joints"] for found in own]
+        for name, (_, style) in kinds.items():
+            axes.plot(joints, [by * found[name] for found in own], style, color=colour, ms=4)
+    handles = [Line2D([], [], color=colour, label=family) for family, colour in COLOURS.items()]
+    handles += [
+        Line2D([], [], color=INK, marker=style[0] if style[0] in "o^" else "",
+               ls=style.lstrip("o^"), ms=4, label=label)
+        for label, style in kinds.values()
+    ]  # fmt: skip
+    axes.legend(handles=handles, loc="upper left", fontsize=7)
