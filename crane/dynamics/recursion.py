@@ -1,7 +1,8 @@
 """Forward dynamics by recursion over clusters of joints, as traced formulas.
 
-From the outermost cluster inwards, what hangs on a body answers its acceleration A = [a, e] with
-the wrench
+At a reference acceleration of the joints, inverse dynamics tells what wrenches the bodies need;
+what the joints accelerate more follows from the forces. From the outermost cluster inwards, what
+hangs on a body answers what it accelerates more, A = [a, e], with the wrench
 
     F = I A + p
 
@@ -16,7 +17,7 @@ two ways which say the same:
   cluster hangs. Takes as many operations as it has joints, but every joint must move a mass.
 
 Accelerations are those of the point on the joint's axis that is the origin of its body, in
-directions of the trunk; weights are an acceleration of the world.
+directions of the trunk.
 """
 
 import functools
@@ -29,7 +30,7 @@ import pinocchio as pin
 from crane.closure.clusters import Cluster, clusters_of
 from crane.closure.traced import Bodies, Loops, MovingBodies
 from crane.codegen.factors import Positive
-from crane.codegen.scalar import Number, add, cross, dot, scale, times
+from crane.codegen.scalar import Number, add, dot, scale
 from crane.dynamics.inertia import (
     Inertia,
     Pair,
@@ -88,16 +89,16 @@ def _light(machine: Machine) -> set[int]:
 
 @dataclass(frozen=True)
 class Moving:
-    """A machine in motion, before it is known how it accelerates.
+    """A machine in motion, whose joints accelerate with `reference` and something more.
 
     Attributes:
         posture: Its bodies.
         loops: Its loops.
         motion: Velocities, for the loops' second derivatives.
-        rates: (nb + 1,) joint velocities.
-        drift: (nb + 1,) accelerations of the joints at a_A = 0.
-        gravity: (3,) in the trunk's directions.
+        reference: (nb + 1,) accelerations of the joints that `wrenches` belong to: what the loops
+            ask for at a_A = 0 where clusters are projected, else 0.
         masses: Of every body mass, lever from its origin to the COM, inertia about the COM.
+        wrenches: Of every body, about its COM, what it takes to accelerate it so, weight included.
         rotors: (nb + 1,) rotor inertias of the joints.
         forces: (nb + 1,) forces along the joints, those of the drives included.
     """
@@ -105,60 +106,26 @@ class Moving:
     posture: Bodies
     loops: Loops
     motion: MovingBodies
-    rates: Vector
-    drift: Vector
-    gravity: Vector
+    reference: Vector
     masses: Sequence[tuple[Number, Vector, list[Vector]]]
+    wrenches: Sequence[Pair]
     rotors: Vector
     forces: Vector
 
-    @functools.cached_property
-    def axes(self) -> list[Pair]:
-        """The motion of each body's origin and directions per unit of its joint's."""
-        revolute = self.posture.geometry.revolute
-        axes = [_NONE[0], *(self.posture.axis(i) for i in range(1, len(revolute)))]
-        return [
-            (_NONE[0], axis) if turns else (axis, _NONE[0])
-            for axis, turns in zip(axes, revolute, strict=True)
-        ]
+    def axis(self, i: int) -> Pair:
+        """How the origin and the directions of a body move per unit of its joint's motion."""
+        along = self.posture.axis(i)
+        return (_NONE[0], along) if self.posture.geometry.revolute[i] else (along, _NONE[0])
 
-    @functools.cached_property
-    def turning(self) -> list[Vector]:
-        """Angular velocities."""
-        return [angular for _, angular in self.motion.velocity]
-
-    @functools.cached_property
-    def bent(self) -> list[Pair]:
-        """What each body accelerates beyond its parent while no joint does."""
-        out = [_NONE]
-        geometry = self.posture.geometry
-        for i, parent in enumerate(geometry.parents[1:], start=1):
-            if i in geometry.flying:
-                out.append(_NONE if i in geometry.massless else (self._flown(i), _NONE[0]))
-                continue
-            spin, arm = self.turning[parent], self.posture.arms[i]
-            linear, angular = by(self.rates[i], self.axes[i])
-            bent = add(cross(spin, cross(spin, arm)), scale(2.0, cross(spin, linear)))
-            out.append((bent, cross(spin, angular)))
-        return out
-
-    def _flown(self, i: int) -> Vector:
-        """What the origin of a free-flyer accelerates while its twist in its axes stays."""
-        parts = [scale(self.rates[j], self.axes[j][0]) for j in range(i - 5, i - 2)]
-        return cross(self.turning[i], add(*parts))
+    def force(self, i: int) -> Number:
+        """What is left along a joint for more than the reference."""
+        return self.forces[i] - self.rotors[i] * self.reference[i]
 
     def rigid(self, i: int, arm: Vector) -> Hanging:
-        """Inertia of a body, and the wrench that its turning asks for.
-
-        Args:
-            i: Which.
-            arm: From the point that both refer to, to the body's origin.
-        """
+        """Inertia and wrench of a body, referred to the point from which `arm` leads to it."""
         mass, lever, tensor = self.masses[i - 1]
-        spin, lever_there = self.turning[i], add(arm, lever)
-        force = scale(mass, cross(spin, cross(spin, lever)))
-        moment = add(cross(spin, times(tensor, spin)), cross(lever_there, force))
-        return Inertia.rigid(mass, lever_there, tensor), (force, moment)
+        lever = add(arm, lever)
+        return Inertia.rigid(mass, lever, tensor), carried(self.wrenches[i - 1], lever)
 
     def all_on(self, i: int, arm: Vector, hung: "Hung") -> Hanging:
         """A body and what hangs on it, referred to the point from which `arm` leads to it."""
@@ -168,8 +135,8 @@ class Moving:
         return inertia + hung[i][0].carried(arm), plus(wrench, carried(hung[i][1], arm))
 
     def moved(self, i: int, carrier: Pair, rate: Number) -> Pair:
-        """Acceleration of a body whose joint accelerates, from that of its parent."""
-        return plus(shifted(carrier, self.posture.arms[i]), self.bent[i], by(rate, self.axes[i]))
+        """What a body accelerates more, from what its parent does."""
+        return plus(shifted(carrier, self.posture.arms[i]), by(rate, self.axis(i)))
 
 
 Hung = dict[int, Hanging]  # what hangs on bodies, by their number, at their origin
@@ -188,12 +155,12 @@ def accelerations(moving: Moving, plan: Plan) -> Vector:
         answer = (Multiplied if by_forces else Projected)(moving, cluster, hung)
         answers.append(answer)
         hang(hung, cluster.base, answer.inertia, answer.bias)
-    bodies = [(scale(-1.0, moving.gravity), _NONE[0])] * len(moving.rates)
-    out: Vector = [0.0] * len(moving.rates)
+    out = list(moving.reference)
+    bodies = [_NONE] * len(out)
     for answer in reversed(answers):
         for i, rate in answer.rates(bodies):
             parent = moving.posture.geometry.parents[i]
-            out[i], bodies[i] = rate, moving.moved(i, bodies[parent], rate)
+            out[i], bodies[i] = out[i] + rate, moving.moved(i, bodies[parent], rate)
     return out
 
 
@@ -207,10 +174,10 @@ def hang(hung: Hung, body: int, inertia: Inertia, bias: Pair) -> None:
 class Projected:
     """A cluster that gives way by its independent coordinates.
 
-    With W_b the motion of body b per unit of these and c_b its acceleration without them,
+    With W_b the motion of body b per unit of these,
 
-        D = sum W_b^T I_b W_b,  U = sum I_b W_b,  u = tau - sum W_b^T (p_b + I_b c_b)
-        I = sum I_b - U D^-1 U^T,  p = sum (p_b + I_b c_b) + U D^-1 u
+        D = sum W_b^T I_b W_b,  U = sum I_b W_b,  u = tau - sum W_b^T p_b
+        I = sum I_b - U D^-1 U^T,  p = sum p_b + U D^-1 u
 
     all referred to the origin of the body that the cluster hangs on.
 
@@ -231,33 +198,30 @@ class Projected:
         self._gamma = {i: [loops.gamma[i][k] for k in own] for i in cluster.joints}
         links = list(self._links(hung))
         answers = [[link.inertia.of(way) for way in link.ways] for link in links]
-        wrenches = [plus(link.wrench, link.inertia.of(link.bent)) for link in links]
         columns = [plus(_NONE, *(answer[k] for answer in answers)) for k in range(len(own))]
         self._factors = Positive(
             [[self._mass(links, answers, k, j) for j in range(k + 1)] for k in range(len(own))]
         )
-        pull = [self._pull(links, wrenches, k) for k in range(len(own))]
+        pull = [self._pull(links, k) for k in range(len(own))]
         self._columns, self._pulls = columns, pull
         inertia = functools.reduce(Inertia.__add__, (link.inertia for link in links))
         self.inertia = inertia.less(halved(self._factors, columns), self._factors.inverse)
         given = [by(x, u) for x, u in zip(self._factors.solve(pull), columns, strict=True)]
-        self.bias = plus(*wrenches, *given)
+        self.bias = plus(*(link.wrench for link in links), *given)
 
     def _links(self, hung: Hung) -> Iterator["_Link"]:
         """The bodies as seen from the cluster's base."""
         moving, base = self._moving, self._cluster.base
         still = [_NONE] * len(next(iter(self._gamma.values())))
-        arms, ways, bent = {base: _NONE[0]}, {base: still}, {base: _NONE}
+        arms, ways = {base: _NONE[0]}, {base: still}
         for i, factors in self._gamma.items():
             parent = moving.posture.geometry.parents[i]
             arms[i] = add(arms[parent], moving.posture.arms[i])
-            back = scale(-1.0, arms[i])
-            axis = shifted(moving.axes[i], back)
+            axis = shifted(moving.axis(i), scale(-1.0, arms[i]))
             ways[i] = [
                 plus(way, by(x, axis)) for way, x in zip(ways[parent], factors, strict=True)
             ]
-            bent[i] = moving.moved(i, bent[parent], moving.drift[i])
-            yield _Link(ways[i], shifted(bent[i], back), *moving.all_on(i, arms[i], hung))
+            yield _Link(ways[i], *moving.all_on(i, arms[i], hung))
 
     def _mass(
         self, links: "Sequence[_Link]", answers: Sequence[Sequence[Pair]], k: int, j: int
@@ -270,22 +234,20 @@ class Projected:
             total = total + self._moving.rotors[i] * row[k] * row[j]
         return total
 
-    def _pull(self, links: "Sequence[_Link]", wrenches: Sequence[Pair], k: int) -> Number:
+    def _pull(self, links: "Sequence[_Link]", k: int) -> Number:
         """An entry of u."""
-        moving = self._moving
         total: Number = 0.0
         for i, row in self._gamma.items():
-            force = moving.forces[i] - moving.rotors[i] * moving.drift[i]
-            total = total + force * row[k]
-        for link, wrench in zip(links, wrenches, strict=True):
-            total = total - paired(wrench, link.ways[k])
+            total = total + self._moving.force(i) * row[k]
+        for link in links:
+            total = total - paired(link.wrench, link.ways[k])
         return total
 
     def rates(self, bodies: Sequence[Pair]) -> Iterator[tuple[int, Number]]:
-        """Accelerations of the joints, by joint, from that of the body that carries them.
+        """What the joints accelerate more, by joint, from what the body that carries them does.
 
         Args:
-            bodies: Accelerations of all bodies.
+            bodies: What all bodies accelerate more than with the reference.
         """
         base = bodies[self._cluster.base]
         right = [
@@ -294,7 +256,7 @@ class Projected:
         ]
         x = self._factors.solve(right)
         for i, row in self._gamma.items():
-            yield i, dot(row, x) + self._moving.drift[i]
+            yield i, dot(row, x)
 
 
 @dataclass(frozen=True)
@@ -303,13 +265,11 @@ class _Link:
 
     Attributes:
         ways: W_b, by column.
-        bent: c_b.
         inertia: I_b.
         wrench: p_b.
     """
 
     ways: list[Pair]
-    bent: Pair
     inertia: Inertia
     wrench: Pair
 
@@ -320,8 +280,8 @@ class Multiplied:
     A joint with the axis s, and for the force of every loop equation a further right side, whose
     force along the joint is the equation's slope J:
 
-        D = s^T I s,  U = I s,  u = tau - s^T (p + I c),  u_r = J_r - s^T P_r
-        I' = I - U U^T / D,  p' = p + I c + U u / D,  P_r' = P_r + U u_r / D
+        D = s^T I s,  U = I s,  u = tau - s^T p,  u_r = J_r - s^T P_r
+        I' = I - U U^T / D,  p' = p + U u / D,  P_r' = P_r + U u_r / D
 
     At the base the equations J a = -b of all joints give the forces l:
 
@@ -371,13 +331,12 @@ class Multiplied:
 
     def _give_way(self, i: int, inside: Hung) -> None:
         """A joint, and what it hands to the body that carries it."""
-        moving, axis = self._moving, self._moving.axes[i]
+        moving, axis = self._moving, self._moving.axis(i)
         parent, arm = moving.posture.geometry.parents[i], moving.posture.arms[i]
         inertia, wrench = moving.all_on(i, _NONE[0], inside)
         column = inertia.of(axis)
         inverse = 1.0 / (paired(axis, column) + moving.rotors[i])
-        wrench = plus(wrench, inertia.of(moving.bent[i]))
-        pull = moving.forces[i] - paired(axis, wrench)
+        pull = moving.force(i) - paired(axis, wrench)
         sides = [
             row.slopes.get(i, 0.0) - paired(axis, force)
             for row, force in zip(self._rows, self._forces[i], strict=True)
@@ -391,10 +350,11 @@ class Multiplied:
         ]
 
     def rates(self, bodies: Sequence[Pair]) -> Iterator[tuple[int, Number]]:
-        """Accelerations of the joints, by joint, from that of the body that carries them.
+        """What the joints accelerate more, by joint, from what the body that carries them does.
 
         Args:
-            bodies: Accelerations of all bodies, those of the cluster as they become known.
+            bodies: What all bodies accelerate more than with the reference, those of the cluster
+                as they become known.
         """
         base = bodies[self._cluster.base]
         columns = self._forces[self._cluster.base]

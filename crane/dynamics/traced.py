@@ -188,8 +188,8 @@ class Sweep:
                 moments[carrier - 1] = add(moments[carrier - 1], moment, cross(arm, force))
         return out
 
-    def _along_inertial(self, rates: Sequence[Number]) -> Vector:
-        """Forces along the joints (nb + 1,) that accelerate them so, weights included."""
+    def _wrenches(self, rates: Sequence[Number]) -> list[Pair]:
+        """Wrenches about the COMs that accelerate the joints so (nb + 1,), weights included."""
         gained: list[Pair] = [([0.0] * 3, [0.0] * 3)]
         wrenches: list[Pair] = []
         for i in range(1, self._size):
@@ -203,8 +203,12 @@ class Sweep:
             )
             at = add(a, cross(e, centre), cross(w, add(v, cross(w, centre))))
             wrenches.append((scale(mass, at), add(times(tensor, e), cross(w, times(tensor, w)))))
+        return wrenches
+
+    def _along_inertial(self, rates: Sequence[Number]) -> Vector:
+        """Forces along the joints (nb + 1,) that accelerate them so, weights included."""
         rotors = [inertia * rate for inertia, rate in zip(self._rotors, rates, strict=True)]
-        return add(self._along_tree(wrenches), rotors)
+        return add(self._along_tree(self._wrenches(rates)), rotors)
 
     @cached_property
     def inertial_bias(self) -> Vector:
@@ -338,9 +342,11 @@ class Sweep:
         forces = list(self._forces(friction))
         for joint, force in zip(self._loops.active_joints, tau, strict=True):
             forces[joint] = forces[joint] + force
+        still = {i for cluster, by_forces in self._plan if by_forces for i in cluster.joints}
+        reference = [0.0 if i in still else x for i, x in enumerate(self.drift)]
         moving = Moving(
-            self._posture, self._loops, self._whole, self.rates, self.drift, self._gravity,
-            self._masses, self._rotors, forces,
+            self._posture, self._loops, self._whole, reference, self._masses,
+            self._wrenches(reference), self._rotors, forces,
         )  # fmt: skip
         rates = accelerations(moving, self._plan)
         return [rates[joint] for joint in self._loops.active_joints]

@@ -50,6 +50,10 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
     with replacing(path) as part:
         part.write_bytes(content)
     lost = plain_friction(machine) + only_in_machine_files(machine)
+    floating = [
+        machine.joints[column + i] for column in machine.coordinates.floating for i in range(6)
+    ]
+    lost += [f"the friction of {joint}" for joint in floating if joint in machine.friction]
     lost += [f"the constant force on {item.joint}" for item in machine.forces if item.force]
     left_out(machine, "MJCF", lost)
 
@@ -64,12 +68,17 @@ class _Writer:
     def __init__(self, machine: Machine):
         self.machine, self.model, self.tree = machine, machine.model, machine.tree
         self.joints = range(1, self.model.njoints)
-        moved = [self.tree.joints[name].child for name in machine.joints]
-        self.links = [self.tree.root, *moved]  # by index of the joint
+        bodies = machine.coordinates.bodies[1:]  # by index of the joint the last of its columns
+        self.links = [
+            self.tree.root,
+            *(self.tree.joints[machine.joints[body - 1]].child for body in bodies),
+        ]
         self.frames = [  # all other links
             frame
             for frame in self.model.frames
-            if frame.type == pin.FrameType.BODY and frame.name not in self.links
+            if frame.type == pin.FrameType.BODY
+            and frame.name not in self.links
+            and self.tree.links[frame.name].between is None
         ]
         self.root = etree.Element("mujoco", model=machine.name)
         self.bodies: dict[int, etree._Element] = {}  # by index of the joint
@@ -163,6 +172,10 @@ class _Writer:
     def _joint(self, body: etree._Element, joint: int, place: pin.SE3) -> None:
         """A joint, placed in its body's frame at zero."""
         machine, name = self.machine, self.model.names[joint]
+        column = self.model.joints[joint].idx_v
+        if column in machine.coordinates.floating:
+            self._flyer(body, joint)
+            return
         described = self.tree.joints[name]
         values = {
             "name": name,
@@ -186,7 +199,16 @@ class _Writer:
             rest = sum(item.stiffness * item.rest for item in acting) / stiffness
             values |= {"stiffness": text([stiffness]), "springref": text([rest])}
         etree.SubElement(body, "joint", values)
-        self.home.append(float(machine.home[self.model.joints[joint].idx_q]))
+        self.home.append(float(machine.home[column]))
+
+    def _flyer(self, body: etree._Element, joint: int) -> None:
+        """A free joint, whose position is the body's pose in the world."""
+        machine = self.machine
+        etree.SubElement(body, "freejoint", name=self.model.names[joint])
+        data = self.model.createData()
+        pin.forwardKinematics(self.model, data, machine.coordinates.configuration(machine.home))
+        *place, x, y, z, w = pin.SE3ToXYZQUAT(data.oMi[joint])
+        self.home += [float(value) for value in (*place, w, x, y, z)]
 
     def _site(self, body: etree._Element, name: str, place: pin.SE3) -> str:
         """A site, under a name that no other has."""
