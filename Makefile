@@ -54,6 +54,7 @@ lint: $(READY)
 
 bench: $(READY_BENCH)
 	$(BIN)/python scripts/benchmark.py --write docs/performance.md
+	$(BIN)/python scripts/large_machines.py --write docs/performance.md
 
 reproduce: $(READY)
 	$(BIN)/python scripts/reproduce_mini_forwarder.py --write docs/validation/mini_forwarder.md

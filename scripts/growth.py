@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from crane.view.plots.recording import INK, STYLE
 
 COLOURS = {"chain": "#1f5fa8", "tree": "#3c8c4a", "ring": "#c8501a", "spatial ring": "#8a4fa0"}
-CALLS = {"one": ("one call of crane", "o-"), "stack": ("crane, in a stack", ":"),
+CALLS = {"one": ("one call of crane", "o-"), "stack": ("crane, of a stack", ":"),
          "theirs": ("pin.constraintDynamics", "^--")}  # fmt: skip
 STARTS = {"first": ("first call", "o-"), "kept": ("kept", ":")}
 

@@ -8,10 +8,8 @@ reading what is kept), and of a call, the medians of `rounds` turns; 0 rounds le
 
 import argparse
 import json
-import statistics
 import time
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -83,26 +81,30 @@ def suited(
     return best[1:]
 
 
-def compare(machine: crane.Machine, ours: Callable[..., Array], rounds: int) -> dict[str, float]:
-    """Times of a call [s], of both and their ratio, medians over rounds in turn."""
-    few = motion(machine, 5)
+def compare(machine: crane.Machine, dynamics: crane.Dynamics, rounds: int) -> dict[str, float]:
+    """Times of a call [s] and their ratios to the peer's, medians over rounds in turn.
+
+    `one`: a sample called from Python; `stack`: of a stack; `given`: of a stack of postures that
+    are closed already, as the peer gets them.
+    """
+    few, ours = motion(machine, 5), dynamics.forward
     start = time.process_time()
     a_a = np.array([ours(*sample) for sample in few])
     count = int(np.clip(5 * SHARE / (time.process_time() - start), 5, MOST))
     peer, told = suited(machine, a_a, closed(machine, few))
     samples = motion(machine, count)
-    full, stack = closed(machine, samples), [np.array(x) for x in zip(*samples, strict=True)]
+    q_a, v_a, tau_a = (np.array(x) for x in zip(*samples, strict=True))
+    full = closed(machine, samples)
+    q = np.array([x for x, _, _ in full])
     calls: dict[str, Call] = {
         "one": lambda: [ours(*sample) for sample in samples],
-        "stack": lambda: ours(*stack),
+        "stack": lambda: ours(q_a, v_a, tau_a),
+        "given": lambda: dynamics.at("forward", q, v_a, tau_a),
         "theirs": lambda: [peer.forward(*sample) for sample in full],
     }
     times = {name: np.array(spent) / count for name, spent in turns(calls, rounds).items()}
-    ratios = {
-        f"{name} ratio": statistics.median(times["theirs"] / times[name])
-        for name in ("one", "stack")
-    }
-    return told | {name: statistics.median(spent) for name, spent in times.items()} | ratios
+    ratios = {f"{name} ratio": np.median(times["theirs"] / times[name]) for name in calls}
+    return told | {name: np.median(spent) for name, spent in times.items()} | ratios
 
 
 def main() -> None:
@@ -126,7 +128,7 @@ def main() -> None:
         "first": time.process_time() - loaded,
     }
     if options.rounds:
-        found |= compare(machine, dynamics.forward, options.rounds)
+        found |= compare(machine, dynamics, options.rounds)
     print(json.dumps(found))
 
 
