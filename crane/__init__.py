@@ -1,5 +1,6 @@
 """crane: machines with closed kinematic chains, computed in their actuators."""
 
+import time
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
     from crane.view.sketch import sketch
 
 __version__ = "0.1.0"
+LOADED = time.time()  # before any other file of the package was read
 
 _HOMES = {
     "crane.closure": "Closure",

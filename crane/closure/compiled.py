@@ -1,5 +1,6 @@
 """Closing loops in machine code made for one machine."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from weakref import WeakValueDictionary
 
@@ -93,8 +94,10 @@ class FastClosure:
         key = self._key(signs)
         shared = _SHARED.get(key)
         if shared is None:
-            shared = _SHARED[key] = _Shared(self._compile(signs))
+            loops = Program.kept(("loops", key), lambda program: self._build(program, signs))
+            shared = _SHARED[key] = _Shared(loops)
         self._shared = shared  # the functions live as long as it
+        self._formulas = key
         program, self.programs = shared.loops, shared.programs
         self._loops = program
         self.address = program.address("follow")
@@ -140,15 +143,24 @@ class FastClosure:
             *(np.asarray(array).tobytes() for array in arrays),
         )
 
-    def _compile(self, signs: Array) -> Program:
-        program = Program()
+    def _build(self, program: Program, signs: Array) -> None:
         self.add_newton(program, signs)
         self._add_moves(program)
         self._add_close(program)
         self._add_follow(program)
         self._add_gamma(program)
-        program.compile()
-        return program
+
+    def kept(self, key: tuple, build: Callable[[Program], None]) -> Program:
+        """Further machine code for this machine, see `Program.kept`.
+
+        Args:
+            key: What it depends on besides the loops.
+            build: Adds formulas and routines.
+
+        Raises:
+            TooLongError: It would take too long to compile.
+        """
+        return Program.kept((self._formulas, key), build)
 
     def outputs(self, formula: str) -> Layout:
         """Parts of what a formula of the loops' own program writes."""

@@ -11,7 +11,7 @@ stop, and arrays of its own. Nothing here is written in a machine's language: an
         r.give(r.count)
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from ctypes import addressof, c_char
 from functools import partial
@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from crane.codegen.kept import Note, Signature, place_of
 from crane.codegen.layout import Layout, laid_out
 from crane.codegen.llvm.engine import Code
 from crane.codegen.representation import Formula, Routine
@@ -29,19 +30,65 @@ MOST = 400_000  # operations of a formula; longer ones take minutes to compile
 
 
 class TooLongError(Exception):
-    """A formula has more than `MOST` operations."""
+    """A formula has more than `MOST` operations.
+
+    Args:
+        operations: How many, where it is known.
+    """
+
+    def __init__(self, operations: int = 0):
+        super().__init__(operations)
+        self.operations = operations
 
 
 class Program:
     """Formulas and routines, compiled together.
 
     Attributes:
-        functions: By name, in the order in which they were added.
+        functions: By name, in the order in which they were added; none of a program that was kept.
+        longest: Operations of the longest formula.
     """
 
     def __init__(self) -> None:
         self.functions: dict[str, Formula | Routine] = {}
+        self.longest = 0
+        self._signatures: dict[str, Signature] = {}
         self._code: Any = None
+
+    @classmethod
+    def kept(cls, depends: Any, build: Callable[["Program"], None]) -> "Program":
+        """A compiled program, which is built only where none is kept between runs.
+
+        Args:
+            depends: All that it depends on besides the package's own files, see `place_of`; None
+                where it depends on more.
+            build: Adds its formulas and routines.
+
+        Raises:
+            TooLongError: A formula has too many operations.
+        """
+        place = place_of(depends)
+        note = Note.read(place)
+        if note is not None and note.longest > MOST:
+            raise TooLongError(note.longest)
+        code = None if note is None else Code.kept(note.code)
+        if note is not None and code is not None:
+            return cls._of(note, code)
+        program = cls()
+        try:
+            build(program)
+        except TooLongError as error:
+            Note("", error.operations, {}).write(place)
+            raise
+        program.compile()
+        Note(program._code.name, program.longest, program._signatures).write(place)
+        return program
+
+    @classmethod
+    def _of(cls, note: Note, code: Code) -> "Program":
+        program = cls()
+        program.longest, program._signatures, program._code = note.longest, note.functions, code
+        return program
 
     def add(
         self, name: str, arrays: int, outputs: Sequence[Number] | Mapping[str, Sequence[Number]]
@@ -61,9 +108,12 @@ class Program:
         """
         parts = outputs if isinstance(outputs, Mapping) else {"all": outputs}
         flat = [value for part in parts.values() for value in part]
-        if len(needed(flat)) > MOST:
-            raise TooLongError
+        operations = len(needed(flat))
+        if operations > MOST:
+            raise TooLongError(operations)
+        self.longest = max(self.longest, operations)
         formula = self.functions[name] = Formula(name, arrays, flat, laid_out(parts))
+        self._signatures[name] = Signature(formula.kinds, formula.layout)
         return formula.layout
 
     @contextmanager
@@ -80,16 +130,17 @@ class Program:
         routine = Routine(name, self.functions, counts, functions, named)
         yield routine
         self.functions[name] = routine
+        self._signatures[name] = Signature(routine.kinds, None)
 
     def outputs(self, name: str) -> Layout:
         """Parts of what a formula writes."""
-        formula = self.functions[name]
-        assert isinstance(formula, Formula)
-        return formula.layout
+        layout = self._signatures[name].outputs
+        assert layout is not None
+        return layout
 
     def compile(self) -> None:
         """Translate everything that was added."""
-        self._code = Code(self.functions.values())
+        self._code = Code.of(self.functions.values())
 
     def address(self, name: str) -> int:
         """Where a compiled function is, for as long as the program lives."""
@@ -113,7 +164,7 @@ class Program:
         return Bound(self, self._entry(name, arguments), arguments)
 
     def _entry(self, name: str, arguments: Sequence["int | np.ndarray"]) -> Any:
-        expected = len(self.functions[name].kinds)
+        expected = len(self._signatures[name].kinds)
         if len(arguments) != expected:
             raise TypeError(f"'{name}' takes {expected} arguments, not {len(arguments)}")
         return self._code.entry(name)

@@ -47,7 +47,8 @@ def _is_free(spec: MachineSpec, series: list[Joint]) -> bool:
     names = {joint.name for joint in series}
     forced = {part.joint for part in spec.forces} | {part.joint for part in spec.gas_springs}
     forced |= {part.joint for part in spec.end_stops}
-    driven = {*(spec.active or ()), *(joint for drive in spec.drives for joint in drive.factors)}
+    driven = set(spec.active or ()) - set(spec.free)
+    driven |= {joint for drive in spec.drives for joint in drive.factors}
     bound = {joint for coupling in spec.couplings for joint in coupling.factors}
     if names & (forced | driven | bound):
         return False

@@ -70,7 +70,10 @@ class QuantityCode:
         nq, n = machine.model.nv, len(machine.active)
         key = (quantity, folded(numbers), carriers, plan)
         if key not in fast.programs:
-            fast.programs[key] = _compile(quantity, fast, numbers, n, carriers, plan)
+            fast.programs[key] = fast.kept(
+                ("quantity", *key),
+                lambda program: _build(program, quantity, fast, numbers, n, carriers, plan),
+            )
         self._program = program = fast.programs[key]
         self.size = program.outputs("formula").size
         self.cursor = fast.cursor()
@@ -127,26 +130,24 @@ class QuantityCode:
         return (fast.address, *arrays, self.cursor.at, self._q, out, fast.bounds)
 
 
-def _compile(
+def _build(
+    program: Program,
     quantity: str,
     fast: FastClosure,
     numbers: Array,
     n: int,
     carriers: tuple[int, ...],
     plan: Plan,
-) -> Program:
+) -> None:
     tape = Tape()
     q, posture, loops = fast.trace(tape, 0, 2)
     constants = Constants(tape, 1, numbers)
     sweep = Sweep(posture, loops, constants, q, tape.loads(3, 0, n), carriers, plan)
     outputs = QUANTITIES[quantity](sweep, tape.loads(3, n, n))
-    program = Program()
     program.add("formula", 4, outputs)
     tape = Tape()  # what is not finite is left to the checks that name it
     program.add("scan", 2, [largest([*tape.loads(0, 0, n), *tape.loads(1, 0, 2 * n)])])
     _add_loop(program, len(q), n)
-    program.compile()
-    return program
 
 
 def _add_loop(program: Program, nq: int, n: int) -> None:

@@ -338,10 +338,11 @@ class _FastPoint:
         placed = machine.model.frames[frame]
         self._body = machine.coordinates.bodies[placed.parentJoint]
         self._place = fast.geometry.turns[self._body].T @ placed.placement.translation
-        self._n = len(machine.active)
+        self._nq, self._n = machine.model.nv, len(machine.active)
         key = (type(self), self._body, folded(self._place))
         if key not in fast.programs:
-            fast.programs[key] = self._compile(machine.model.nv)
+            said = ("frame", type(self).__name__, *key[1:])
+            fast.programs[key] = fast.kept(said, self._build)
         self._program = fast.programs[key]
 
     def rows(self, q: Array, v_a: Array | None = None) -> Array:
@@ -370,8 +371,8 @@ class _FastPoint:
         """A vector seen from the trunk, in the world's directions."""
         return times([list(axis) for axis in zip(*posture.rotation[0], strict=True)], vector)
 
-    def _compile(self, nq: int) -> Program:
-        program, n = Program(), self._n
+    def _build(self, program: Program) -> None:
+        nq, n = self._nq, self._n
         size = program.add("formula", 4, self._outputs(Tape())).size
         arrays = ("geometry", "place", "q", "v", "out")
         with program.routine("rows", counts=("count",), arrays=arrays) as r:
@@ -379,8 +380,6 @@ class _FastPoint:
                 rows = r.q.row(i, nq), r.v.row(i, n), r.out.row(i, size)
                 r.call("formula", r.geometry, r.place, *rows)
             r.give(r.count)
-        program.compile()
-        return program
 
 
 class _FastFrame(_FastPoint):

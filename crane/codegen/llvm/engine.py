@@ -1,10 +1,11 @@
 """From LLVM's text to functions that can be called."""
 
 import ctypes
+import functools
 from collections.abc import Iterable
 from typing import Any
 
-from crane.codegen.llvm.objects import object_code
+from crane.codegen.llvm.objects import named, object_code, read
 from crane.codegen.llvm.text import ENTRY, text_of
 from crane.codegen.representation import Formula, Routine
 
@@ -16,19 +17,31 @@ class Code:
     """Machine code of a program.
 
     Args:
-        functions: What to translate.
+        name: Under which it is kept, see `crane.codegen.llvm.objects`.
+        code: As LLVM put it out.
     """
 
-    def __init__(self, functions: Iterable[Formula | Routine]):
+    def __init__(self, name: str, code: bytes):
         import llvmlite.binding as llvm
 
-        text, target = text_of(functions), _target()
-        depends = f"{llvm.llvm_version_info} {target.triple} {_cpu()} {_SPEED} {_TUNING} {text}"
-        code = object_code(depends, lambda: _translated(text, target))
-        self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), target)
+        self.name = name
+        self._engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target())
         self._engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         self._engine.finalize_object()
         self._entries: dict[str, Any] = {}
+
+    @classmethod
+    def of(cls, functions: Iterable[Formula | Routine]) -> "Code":
+        """Translate functions, or read what became of them before."""
+        text = text_of(functions)
+        depends = f"{settings()} {text}"
+        return cls(named(depends), object_code(depends, lambda: _translated(text, _target())))
+
+    @classmethod
+    def kept(cls, name: str) -> "Code | None":
+        """What is kept under a name; None if nothing is, or the name is empty."""
+        code = read(name) if name else None
+        return None if code is None else cls(name, code)
 
     def address(self, name: str) -> int:
         """Where a function is."""
@@ -42,6 +55,16 @@ class Code:
             kind = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
             found = self._entries[name] = kind(self.address(ENTRY.format(name)))
         return found
+
+
+@functools.cache
+def settings() -> str:
+    """All that machine code depends on besides the program: LLVM, the processor, what is asked."""
+    import llvmlite
+    import llvmlite.binding as llvm
+
+    version = llvmlite.__version__, llvm.llvm_version_info
+    return f"{version} {llvm.get_default_triple()} {_cpu()} {_SPEED} {_TUNING}"
 
 
 def _cpu() -> tuple[str, str]:

@@ -1,14 +1,15 @@
 """Machine code kept between runs: what was compiled once is read from a folder of the user's.
 
-A file per program, named by a digest of all that its code depends on. It begins with a digest of
-the rest, so that a damaged one is compiled anew. Where the folder cannot be written or belongs to
-someone else, nothing is kept.
+A file per program, named by a digest of all that its code depends on, and small files that other
+modules keep beside. Each begins with a digest of its own name and the rest, so that one that is
+damaged or belongs elsewhere is made anew. Where the folder cannot be written or belongs to someone
+else, nothing is kept.
 """
 
 import hashlib
 import os
 import stat
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -26,6 +27,11 @@ def folder() -> Path:
     return user_cache_path("crane", appauthor=False) / "objects"
 
 
+def named(depends: str, kind: str = "code") -> str:
+    """The name of a file whose content depends on this alone."""
+    return f"{hashlib.sha256(depends.encode()).hexdigest()}.{kind}"
+
+
 def object_code(depends: str, make: Callable[[], bytes]) -> bytes:
     """Machine code from the folder, or else made and put there.
 
@@ -33,34 +39,43 @@ def object_code(depends: str, make: Callable[[], bytes]) -> bytes:
         depends: All that it depends on.
         make: Makes it.
     """
-    file = folder() / f"{hashlib.sha256(depends.encode()).hexdigest()}.o"
-    found = _read(file)
+    name = named(depends)
+    found = read(name)
     if found is None:
         found = make()
-        with suppress(OSError, OutputError):
-            _write(file, found)
+        write(name, found)
     return found
 
 
-def _read(file: Path) -> bytes | None:
+def read(name: str) -> bytes | None:
+    """What is kept under a name; None where nothing is that was written whole under this name."""
+    file = folder() / name
     try:
         if not _own(file.parent):
             return None
         data = file.read_bytes()
-        os.utime(file)
     except OSError:
         return None
+    with suppress(OSError):  # a folder that may only be read serves as well
+        os.utime(file)
     code = data[_DIGEST:]
-    return code if hashlib.sha256(code).digest() == data[:_DIGEST] else None
+    return code if _digest(name, code) == data[:_DIGEST] else None
 
 
-def _write(file: Path, code: bytes) -> None:
-    file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if not _own(file.parent):
-        return
-    _make_room(file.parent, len(code))
-    with replacing(file) as part:
-        part.write_bytes(hashlib.sha256(code).digest() + code)
+def write(name: str, code: bytes) -> None:
+    """Keep something under a name, if possible."""
+    file = folder() / name
+    with suppress(OSError, OutputError):
+        file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not _own(file.parent):
+            return
+        _make_room(file.parent, len(code))
+        with replacing(file) as part:
+            part.write_bytes(_digest(name, code) + code)
+
+
+def _digest(name: str, code: bytes) -> bytes:
+    return hashlib.sha256(f"{name} ".encode() + code).digest()
 
 
 def _own(place: Path) -> bool:
@@ -73,10 +88,19 @@ def _own(place: Path) -> bool:
 
 def _make_room(place: Path, size: int) -> None:
     """Remove what was used least lately until there is room for so many bytes."""
-    files = [(item.stat(), item) for item in place.iterdir()]
-    total = size + sum(about.st_size for about, _ in files)
-    for about, item in sorted(files, key=lambda pair: pair[0].st_mtime):
+    files = sorted(_files(place))
+    total = size + sum(length for _, length, _ in files)
+    for _, length, item in files:
         if total <= MOST:
             return
         item.unlink(missing_ok=True)
-        total -= about.st_size
+        total -= length
+
+
+def _files(place: Path) -> Iterator[tuple[float, int, Path]]:
+    """When used last, length, and path of what is there, also of what a killed process left."""
+    for item in place.iterdir():
+        with suppress(FileNotFoundError):  # another process made room
+            about = item.stat()
+            if stat.S_ISREG(about.st_mode):
+                yield about.st_mtime, about.st_size, item

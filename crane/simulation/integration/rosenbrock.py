@@ -17,8 +17,13 @@ from crane.simulation.integration.traced import (
     columns_of,
     form_of,
     machine_at,
+<<<<<<< HEAD
     settings_of,
     wrapped,
+=======
+    program_of,
+    settings_of,
+>>>>>>> large
 )
 
 # ROS34PW2 of Rang and Angermann (2005): order 3 with any Jacobian, L-stable, stiffly accurate,
@@ -79,7 +84,7 @@ class StiffStepper:
         form = form_of(control, self._columns, len(machine.active), len(control.scales), fold=True)
         key = ("stiff", form, self._stiff, folded(self._numbers), dynamics.carriers, dynamics.plan)
         if key not in self._fast.programs:
-            self._fast.programs[key] = self._compile()
+            self._fast.programs[key] = program_of(control, self._fast, key, self._build)
         self._program = self._fast.programs[key]
         self._scales = np.concatenate(
             [
@@ -128,8 +133,8 @@ class StiffStepper:
             reference = [dot(shares, values) for values in zip(*rows, strict=True)]
         return sweep, At(q_a, parts.v_a, parts.own, settings, reference, sweep.inverse)
 
-    def _compile(self) -> Program:
-        program, control = Program(), self._control
+    def _build(self, program: Program) -> None:
+        control = self._control
         tape = Tape()
         sweep, at = self._trace(tape, 5, 4)
         tau, own_rate = control.trace(at)
@@ -144,8 +149,6 @@ class StiffStepper:
         factors, mass = self._add_prepare(program)
         self._add_sums(program, factors, mass)
         self._add_run(program)
-        program.compile()
-        return program
 
     def _add_run(self, program: Program) -> None:
         """run: recorded steps of length h[0], each in as many parts as their error asks for.

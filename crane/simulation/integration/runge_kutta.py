@@ -14,8 +14,13 @@ from crane.simulation.integration.traced import (
     columns_of,
     form_of,
     machine_at,
+<<<<<<< HEAD
     settings_of,
     wrapped,
+=======
+    program_of,
+    settings_of,
+>>>>>>> large
 )
 
 
@@ -39,12 +44,16 @@ class CompiledStepper:
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
         form = form_of(control, self._columns, len(machine.active), states, fold=False)
         key = ("rk4", form, states, folded(self._numbers), dynamics.carriers, dynamics.plan)
+        self._key = key
         if key not in self._fast.programs:
             self._fast.programs[key] = self._compile()
         self._program = self._fast.programs[key]
 
     def _compile(self) -> Program:
-        program, control = Program(), self._control
+        return program_of(self._control, self._fast, self._key, self._build)
+
+    def _build(self, program: Program) -> None:
+        control = self._control
         for name in ("observe", "rate"):
             tape = Tape()
             sweep, q_a, parts = machine_at(self._dynamics, tape, self._state, 4)
@@ -60,8 +69,6 @@ class CompiledStepper:
             program.add(name, 5, outputs)
         self._add_sums(program)
         self._add_run(program)
-        program.compile()
-        return program
 
     def _add_run(self, program: Program) -> None:
         """run: steps, each recorded before it is made, until one needs a closer look."""

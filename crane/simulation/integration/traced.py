@@ -1,12 +1,16 @@
 """A machine and its controller as formulas of the state."""
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 
 import numpy as np
 
+<<<<<<< HEAD
 from crane.closure import rotations
+=======
+from crane.closure.compiled import FastClosure
+>>>>>>> large
 from crane.closure.traced import Constants
-from crane.codegen import Expression, Layout, Number, Parts, Tape
+from crane.codegen import Expression, Layout, Number, Parts, Program, Tape
 from crane.common.errors import InputError
 from crane.control import At, TracedController, ValveDrive
 from crane.dynamics import Dynamics
@@ -75,6 +79,29 @@ def form_of(control: TracedController, columns: int, n: int, states: int, fold: 
     ]
     # as text, in which the constant 2.0 and operation number 2 differ
     return repr((columns, len(control.settings), tape.operations, outputs))
+
+
+def program_of(
+    control: TracedController, fast: FastClosure, key: tuple, build: Callable[[Program], None]
+) -> Program:
+    """Machine code of a machine and its controller.
+
+    Found by what it depends on only where the package wrote the controller: what a user's class
+    does with a machine may depend on more than its formulas tell.
+
+    Args:
+        control: The controller.
+        fast: Of the machine.
+        key: What the code depends on, `form_of` among it.
+        build: Adds formulas and routines.
+
+    Raises:
+        TooLongError: It would take too long to compile.
+    """
+    parts = [control, control.command] if isinstance(control, ValveDrive) else [control]
+    if all(type(part).__module__.startswith("crane.") for part in parts):
+        return fast.kept(key, build)
+    return Program.kept(None, build)
 
 
 def settings_of(control: TracedController, tape: Tape, array: int, fold: bool) -> list[Number]:

@@ -1,0 +1,105 @@
+"""What is kept of a program between runs: how to call it, and where its machine code is.
+
+It is found by what the program's formulas depend on, so that a later process need not trace them.
+"""
+
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from crane.codegen.layout import Layout
+from crane.codegen.llvm import objects, settings
+from crane.codegen.package import changed, package_digest
+from crane.codegen.representation import ArgumentKind
+
+
+@dataclass(frozen=True)
+class Signature:
+    """How a compiled function is called.
+
+    Attributes:
+        kinds: Of its arguments.
+        outputs: Parts of what a formula writes, None of a routine.
+    """
+
+    kinds: tuple[ArgumentKind, ...]
+    outputs: Layout | None
+
+
+def place_of(depends: Any) -> str | None:
+    """The name of a program's note, or None where it cannot be kept.
+
+    A program also depends on the package's files, on what traces it and on what compiles it.
+
+    Args:
+        depends: Numbers, texts, bytes, arrays, dataclasses and tuples of them, which say all that
+            the program's formulas depend on besides; None where they depend on other code.
+
+    Raises:
+        TypeError: Something else, which may mean another thing to another process.
+    """
+    if depends is None:
+        return None
+    said = _plain(depends)
+    package = package_digest()
+    if package is None:
+        return None
+    tracing = sys.version, np.__version__
+    return objects.named(repr((package, tracing, settings(), said)), "note")
+
+
+def _plain(value: Any) -> Any:
+    """The same in types whose text says all of it and nothing else."""
+    if value is None or type(value) in (bool, int, float, str, bytes):
+        return value
+    if isinstance(value, tuple):
+        return tuple(map(_plain, value))
+    if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
+        return value.dtype.str, value.shape, value.tobytes()
+    if is_dataclass(value) and not isinstance(value, type):
+        parts = [_plain(getattr(value, field.name)) for field in fields(value)]
+        return type(value).__qualname__, tuple(parts)
+    raise TypeError(f"what a program depends on is not told by a {type(value).__name__}")
+
+
+@dataclass(frozen=True)
+class Note:
+    """What is kept of a program beside its machine code.
+
+    Attributes:
+        code: Name of the machine code, none of a program that is too long to compile.
+        longest: Operations of its longest formula.
+        functions: How each function is called, by name.
+    """
+
+    code: str
+    longest: int
+    functions: Mapping[str, Signature]
+
+    @classmethod
+    def read(cls, place: str | None) -> "Note | None":
+        """The note at a place, if there is one."""
+        text = None if place is None else objects.read(place)
+        if text is None:
+            return None
+        said = json.loads(text)
+        functions = {
+            name: Signature(tuple(kinds), None if parts is None else Layout(**parts))
+            for name, (kinds, parts) in said["functions"].items()
+        }
+        return cls(said["code"], said["longest"], functions)
+
+    def write(self, place: str | None) -> None:
+        """Keep it, unless the package has changed while the program was made."""
+        if place is None or changed():
+            return
+        functions = {
+            name: (function.kinds, None if function.outputs is None else function.outputs.parts)
+            for name, function in self.functions.items()
+        }
+        said = {"code": self.code, "longest": self.longest, "functions": functions}
+        objects.write(place, json.dumps(said).encode())

@@ -1,0 +1,85 @@
+"""What the package's own files say, as far as that is what runs."""
+
+import functools
+import hashlib
+import os
+import sys
+from types import FunctionType
+from typing import Any
+
+import crane
+
+_ROOT = os.path.dirname(os.path.abspath(crane.__file__))
+_CLOCK = 2.0  # [s] by which the times of files may be coarse
+_ROOMS = ("codegen", "hydraulics", "closure", "dynamics", "motion", "control", "simulation")
+_KNOWN = sys.stdlib_module_names | {
+    "crane", "llvmlite", "numpy", "pinocchio", "platformdirs", "scipy",
+}  # fmt: skip
+
+
+def package_digest() -> str | None:
+    """A digest of all files of the package; None where something else runs.
+
+    That is where a file has changed since the package was loaded, or where a function or a class
+    of someone else's has been put into one of the modules that make formulas. Numbers put in place
+    of the package's own while Python runs are not noticed.
+    """
+    try:
+        digest = _digest()
+    except OSError:
+        return None
+    return None if changed() or patched() else digest
+
+
+def changed() -> bool:
+    """Whether a file may have changed since the package was loaded, or there are none."""
+    try:
+        times = [max(file.st_mtime, file.st_ctime) for file in map(os.stat, _files())]
+    except OSError:
+        return True
+    return not times or max(times) > crane.LOADED - _CLOCK
+
+
+def patched() -> bool:
+    """Whether functions or classes of the modules that make formulas are not theirs."""
+    for name, module in list(sys.modules.items()):
+        if name.startswith("crane.") and name.split(".")[1] in _ROOMS:
+            there = list(vars(module).values())
+            own = [x for x in there if isinstance(x, type) and x.__module__ == name]
+            methods = [_function(x) for kind in own for x in list(vars(kind).values())]
+            if any(map(_foreign, there)) or any(map(_foreign, methods)):
+                return True
+    return False
+
+
+def _function(value: Any) -> Any:
+    """What stands behind a property or a method of a class."""
+    for name in ("__func__", "fget", "func"):
+        value = getattr(value, name, value)
+    return value
+
+
+def _foreign(value: Any) -> bool:
+    if not isinstance(value, FunctionType | type):
+        return False
+    root = str(value.__module__).partition(".")[0]
+    return root not in _KNOWN and not root.startswith("namedtuple_")
+
+
+@functools.cache
+def _digest() -> str:
+    """Of names and contents."""
+    digest = hashlib.sha256()
+    for path in _files():
+        with open(path, "rb") as file:
+            text = file.read()
+        digest.update(f"{path[len(_ROOT) :]} {len(text)} ".encode() + text)
+    return digest.hexdigest()
+
+
+@functools.cache
+def _files() -> list[str]:
+    found = []
+    for folder, _, names in os.walk(_ROOT):
+        found += [os.path.join(folder, name) for name in names if name.endswith(".py")]
+    return sorted(found)
