@@ -7,7 +7,7 @@ from pathlib import Path
 from crane.common.errors import DescriptionError, known
 
 WITH = " with "  # between a machine and the numbers of it that are changed, see `Machine.call`
-SUFFIXES = (".yaml", ".yml", ".urdf", ".xml", ".mjcf")
+SUFFIXES = (".yaml", ".yml", ".urdf", ".xacro", ".sdf", ".world", ".xml", ".mjcf")
 
 
 def _models() -> Path:
@@ -56,7 +56,8 @@ def find(name: str | Path) -> Path:
 
     Args:
         name: A bundled machine, a robot of example-robot-data, or a path that ends in .yaml,
-            .yml, .urdf, .xml or .mjcf, or of a folder with a robot.yaml.
+            .yml, .urdf, .xacro, .sdf, .world, .xml or .mjcf, or of a folder with a robot.yaml or a
+            model.sdf.
 
     Raises:
         DescriptionError: There is none.
@@ -74,6 +75,8 @@ def find(name: str | Path) -> Path:
         ) from None
     if is_folder and (path / "robot.yaml").is_file():  # as in example-parallel-robots
         return (path / "robot.yaml").resolve()
+    if is_folder and (path / "model.sdf").is_file():  # as in Gazebo's folders of models
+        return (path / "model.sdf").resolve()
     if path.suffix.lower() in SUFFIXES:
         if is_file:
             return path.resolve()
@@ -86,7 +89,8 @@ def find(name: str | Path) -> Path:
         return robots[text]
     if is_file or is_folder:
         raise DescriptionError(
-            f"{path}: not a machine, give a machine file (.yaml), a URDF (.urdf) or a MJCF (.xml)"
+            f"{path}: not a machine, give a machine file (.yaml), a URDF (.urdf, .xacro), an "
+            "SDF (.sdf) or a MJCF (.xml)"
         )
     hint = known([*machines, *robots], text)
     if hint.startswith("known"):
