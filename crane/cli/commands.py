@@ -8,6 +8,7 @@ import typer
 
 from crane.cli.shared import (
     Active,
+    Argument,
     Floating,
     Force,
     Free,
@@ -15,6 +16,7 @@ from crane.cli.shared import (
     NoOpen,
     Out,
     OutFile,
+    Packages,
     app,
     load,
     progress_bar,
@@ -54,6 +56,8 @@ def info(
     active: Active = None,
     free: Free = None,
     floating: Floating = False,
+    packages: Packages = None,
+    argument: Argument = None,
 ) -> None:
     """Show what a machine consists of."""
     if parameters:
@@ -65,7 +69,8 @@ def info(
         for name, value in values.items():
             print(f"{name:{width}}  {value:.6g}")
         return
-    for line in _describe(load(machine, active=active, free=free, floating=floating)):
+    loaded = load(machine, None, None, active, free, floating, packages, argument)
+    for line in _describe(loaded):
         print(line)
 
 

@@ -102,7 +102,9 @@ def values_by_name(given: object) -> Mapping[str, object]:
         InputError: They are not given by name.
     """
     if not isinstance(given, Mapping | None):
-        raise InputError(f"arguments is {given!r}, give values by name such as {{'name': 'value'}}")
+        raise InputError(
+            f"arguments is {given!r}, give values by name such as {{'name': 'value'}}"
+        )
     return given or {}
 
 

@@ -85,7 +85,11 @@ def _in_yaml(spec: MachineSpec) -> bool:
 
 def _values(spec: MachineSpec, names: Sequence[str], values: Array) -> str:
     """Coordinates as a file has them."""
-    pattern = '<joint name="{}" value="{:.4g}"/>' if spec.path.suffix in (".urdf", ".xacro") else "{}: {:.4g}"
+    pattern = (
+        '<joint name="{}" value="{:.4g}"/>'
+        if spec.path.suffix in (".urdf", ".xacro")
+        else "{}: {:.4g}"
+    )
     return ", ".join(
         pattern.format(name, value) for name, value in zip(names, values, strict=True)
     )

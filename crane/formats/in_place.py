@@ -54,9 +54,7 @@ def write_home(
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
-        machine = load(
-            name, active=active, free=free, packages=packages, arguments=arguments
-        )
+        machine = load(name, active=active, free=free, packages=packages, arguments=arguments)
         path = machine.path.resolve()
         _check_place(machine, path)
         try:

@@ -30,18 +30,23 @@ def add_inertial(element: etree._Element, scope: Scope, link: Item, frames: Fram
         _add_computed(element, scope, link, given, frames)
         return
     if given is None:
-        warnings.warn(
-            f"{link.where}: {link.what} has no <inertial>, which is 1 kg and 1 kg m2 in SDF: write "
-            "what it has",
-            CraneWarning,
-            stacklevel=2,
-        )
         given = Item(link.xml, etree.Element("inertial"), link.what)
     place, _ = given.pose()
     mass = given.number("mass", 1.0)
     tensor = given.only("inertia") or Item(given.xml, etree.Element("inertia"), given.what)
     values = [tensor.number(key, 1.0 if key[1] == key[2] else 0.0) for key in _KEYS]
     _write(element, mass, placement(place), values)
+
+
+def warn_of_no_inertial(link: Item) -> None:
+    """Warn of a link that moves without saying what it weighs."""
+    if link.only("inertial") is None:
+        warnings.warn(
+            f"{link.where}: {link.what} has no <inertial>, which is 1 kg and 1 kg m2 in SDF: write "
+            "what it has",
+            CraneWarning,
+            stacklevel=2,
+        )
 
 
 def _write(

@@ -17,7 +17,7 @@ from crane.formats.sdf.frames import Frames, link_of
 from crane.formats.sdf.scope import Scope
 from crane.formats.sdf.values import Item
 
-WORLD = "world"
+WORLD = "::world"  # as no link can be called
 _ONE = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 _TWO = ("universal", "revolute2")
 TYPES = (*_ONE, *_TWO, "fixed", "ball", "screw", "gearbox")
@@ -148,7 +148,7 @@ class Joints:
         if ends[0] == ends[1]:
             raise joint.xml.fail(joint.element, f"{joint.what} joins '{ends[0]}' to itself")
         child = joint.text("child")
-        in_scope = self._frames.of(scope, joint, "" if child == WORLD else child)
+        in_scope = self._frames.of(scope, joint, "" if ends[1] == WORLD else child)
         place = self._frames.in_top(scope, self._top) * in_scope
         axes = [
             self._axis(scope, joint, tag, in_scope)
@@ -223,9 +223,7 @@ class Joints:
             Edge(names[1], kinds[1], middle, ends[1], place, joint, axes[1]),
         ]
 
-    def _screw(
-        self, name: str, ends: list[str], place: pin.SE3, joint: Item, axis: Axis
-    ) -> None:
+    def _screw(self, name: str, ends: list[str], place: pin.SE3, joint: Item, axis: Axis) -> None:
         slope = joint.number("screw_thread_pitch", 0.0) / (2 * math.pi)
         if joint.only("screw_thread_pitch") is None:
             pitch = joint.number("thread_pitch", 1.0)  # [rad/m], of a left-handed thread
@@ -257,7 +255,9 @@ class Joints:
         leader = str(mimic.element.get("joint", "")).strip()
         parts = self._axes.get(f"{scope.prefix}{leader}")
         if parts is None:
-            names = [x.removeprefix(scope.prefix) for x in self._axes if x.startswith(scope.prefix)]
+            names = [
+                x.removeprefix(scope.prefix) for x in self._axes if x.startswith(scope.prefix)
+            ]
             raise mimic.xml.fail(
                 mimic.element, f"{mimic.what} mimics the unknown joint '{leader}', "
                 f"{known(names, leader)}"

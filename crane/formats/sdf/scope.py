@@ -137,7 +137,8 @@ class Reader:
             raise part.xml.fail(part.element, f'a {part.element.tag} has no name, add name="..."')
         if name in kind:
             raise part.xml.fail(
-                part.element, f"{part.what} is there twice (first in {kind[name].where}), rename one"
+                part.element,
+                f"{part.what} is there twice (first in {kind[name].where}), rename one",
             )
         kind[name] = part
 
@@ -217,7 +218,9 @@ class Reader:
         if file not in self._files:
             self._files[file] = xml = XmlFile(file)
             if xml.root.tag != "sdf":
-                raise xml.fail(xml.root, f"an SDF starts with <sdf>, this file with <{xml.root.tag}>")
+                raise xml.fail(
+                    xml.root, f"an SDF starts with <sdf>, this file with <{xml.root.tag}>"
+                )
         return self._files[file]
 
 
@@ -279,5 +282,6 @@ def lookup(scope: Scope, name: str, asker: Item) -> tuple[Scope, str]:
     if len(parts) > 1 and parts[0] == scope.name:  # as some write it
         return lookup(scope, "::".join(parts[1:]), asker)
     raise asker.xml.fail(
-        asker.element, f"{asker.what} names '{name}', which is unknown, {known(scope.names(), name)}"
+        asker.element,
+        f"{asker.what} names '{name}', which is unknown, {known(scope.names(), name)}",
     )

@@ -19,7 +19,7 @@ from crane.common.packages import given
 from crane.description.rigid import placement
 from crane.description.spec import ForceElement
 from crane.description.tree import NO_LIMIT
-from crane.formats.sdf.bodies import add_inertial
+from crane.formats.sdf.bodies import add_inertial, warn_of_no_inertial
 from crane.formats.sdf.frames import Frames, canonical
 from crane.formats.sdf.gears import followers_of, with_gears
 from crane.formats.sdf.graph import Groups, downwards, spanning
@@ -57,9 +57,10 @@ def _chosen(xml: XmlFile, world: Scope) -> Scope:
     moving = [name for name, model in world.models.items() if model.can_move]
     if len(moving) == 1:
         return world.models[moving[0]]
-    what = f"{len(moving)} models that move" if moving else "no model that moves"
+    if not moving:
+        raise DescriptionError(f"{xml.file.name}: none of its models moves ({', '.join(names)})")
     raise DescriptionError(
-        f"{xml.file.name}: {what} among {', '.join(moving or names)}, choose one: "
+        f"{xml.file.name}: {len(moving)} models move ({', '.join(moving)}), choose one: "
         "--arg model:=NAME, arguments={'model': NAME} in Python"
     )
 
@@ -75,6 +76,7 @@ class _Translation:
         self._in_world = self._frames.within(world, top.name, top.item)
         self._at: dict[str, pin.SE3] = {WORLD: self._in_world.inverse()}
         self._links: dict[str, tuple[Scope, Item]] = {}
+        self._names: dict[str, str] = {}  # of the nodes that are called otherwise than in SDF
         self._springs: list[ForceElement] = []
         self._homes: list[tuple[str, Axis]] = []
 
@@ -87,7 +89,8 @@ class _Translation:
             self._notes.of_model(scope)
             for name, link in scope.links.items():
                 self._read_link(scope, name, link)
-        self._check_world()
+        if not self._links:
+            canonical(self._top, self._top.item)  # raises
         joints = Joints(self._top, self._frames)
         groups = _rigid(joints.edges)
         edges, gears = with_gears([_stiff(edge, self._notes) for edge in joints.edges],
@@ -124,50 +127,47 @@ class _Translation:
         inside = self._frames.of(scope, link, link.base)
         self._at[full] = self._frames.in_top(scope, self._top) * inside
 
-    def _check_world(self) -> None:
-        if WORLD in self._links:
-            _, link = self._links[WORLD]
-            raise link.xml.fail(link.element, "a link is named 'world', which is the ground's")
-        if not self._links:
-            canonical(self._top, self._top.item)
-
     def _welds(self, edges: list[Edge]) -> list[Edge]:
-        """What ties parts to the world that no joint ties to it."""
+        """What ties parts to the world that no joint ties to it.
+
+        Where none is, all stand on the ground as they are drawn, or the first floats with the
+        root; where some are, the file lets the others float.
+        """
         groups = Groups()
-        groups.of(WORLD)
         for edge in edges:
             groups.join(edge.parent, edge.child)
-        first = canonical(self._top, self._top.item)
-        order = [] if first is None else [f"{first[0].prefix}{first[1]}"]
-        children = {edge.child for edge in edges}
-        roots = [link for link in self._links if link not in children]
+        grounded = any(WORLD in (edge.parent, edge.child) for edge in edges)
         welds: list[Edge] = []
-        alone: list[str] = []
-        for link in (*[x for x in order if x in roots], *roots, *order, *self._links):
-            if link not in self._links or groups.of(link) == groups.of(WORLD):
-                continue
-            stands = not welds and len({groups.of(x) for x in self._links}
-                                       & {groups.of(WORLD)}) == 0  # fmt: skip
-            item = self._links[link][1]
-            kind = "fixed" if stands else "floating"
-            name = self._free_name(f"{link}_{'world' if stands else 'free'}", edges)
-            welds.append(Edge(name, kind, WORLD, link, self._at[link], item))
-            alone += [link] * (not stands)
-            groups.join(WORLD, link)
-            if stands:
-                self._tell_of_ground(link, item)
-        if alone:
-            self._notes.differ("links that no joint ties to the others float", *alone)
+        for link in self._roots(edges):
+            if groups.join(WORLD, link):
+                stands = not grounded and not (welds and given().floating)
+                kind = "fixed" if stands else "floating"
+                name = self._free_name(f"{link}_{'world' if stands else 'free'}", edges)
+                place, item = self._at[link], self._links[link][1]
+                welds.append(Edge(name, kind, WORLD, link, place, item))
+        self._tell_of_welds(welds)
         return welds
 
-    def _tell_of_ground(self, link: str, item: Item) -> None:
-        if not given().floating:
+    def _roots(self, edges: list[Edge]) -> list[str]:
+        """All links, those first that a part may stand on: no joint's child, canonical ones."""
+        first = canonical(self._top, self._top.item)
+        chosen = "" if first is None else f"{first[0].prefix}{first[1]}"
+        children = {edge.child for edge in edges}
+        return sorted(self._links, key=lambda link: (link in children, link != chosen))
+
+    def _tell_of_welds(self, welds: list[Edge]) -> None:
+        standing = [weld for weld in welds if weld.kind == "fixed"]
+        floating = [weld.child for weld in welds if weld.kind != "fixed"]
+        if floating:
+            self._notes.differ("links that no joint ties to the others float", *floating)
+        if standing and not given().floating:
+            names = ", ".join(f"'{weld.child}'" for weld in standing[:4])
             warnings.warn(
-                f"{item.where}: nothing joins '{self._top.name}' to the world, it is taken as "
-                f"standing on the ground by link '{link}': --floating (floating=True) lets it "
-                "float",
+                f"{standing[0].item.where}: nothing joins '{self._top.name}' to the world, it is "
+                f"taken as standing on the ground by link {names}: --floating (floating=True) "
+                "lets it float",
                 CraneWarning,
-                stacklevel=2,
+                stacklevel=3,
             )
 
     def _free_name(self, name: str, edges: list[Edge]) -> str:
@@ -179,8 +179,13 @@ class _Translation:
     # --- what is written ---------------------------------------------------------------------
 
     def _add_links(self, edges: list[Edge]) -> None:
-        self._put(etree.SubElement(self._robot, "link", name=WORLD), self._top.item)
+        self._names[WORLD] = self._free_link("world")
+        ground = etree.SubElement(self._robot, "link", name=self._names[WORLD])
+        self._put(ground, self._top.item)
+        bodies = _rigid(edges)
         for name, (scope, link) in self._links.items():
+            if bodies.of(name) != bodies.of(WORLD):
+                warn_of_no_inertial(link)
             element = etree.SubElement(self._robot, "link", name=name)
             add_inertial(element, scope, link, self._frames)
             add_shapes(element, scope, link, self._frames, self._notes.lose)
@@ -200,7 +205,7 @@ class _Translation:
             kind = "continuous"
         joint = etree.SubElement(self._robot, "joint", name=edge.name, type=kind)
         _origin(joint, self._at[ends[0]].actInv(edge.place))
-        etree.SubElement(joint, "parent", link=ends[0])
+        etree.SubElement(joint, "parent", link=self._names.get(ends[0], ends[0]))
         etree.SubElement(joint, "child", link=link)
         if axis is not None:
             _axis(joint, axis.direction if forward else -axis.direction)
@@ -215,13 +220,13 @@ class _Translation:
         """The link that a joint moves: one in its frame, if the link's is another."""
         offset = edge.place.actInv(self._at[link])
         if offset.isIdentity(_SAME):
-            return link
+            return self._names.get(link, link)
         name = self._free_link(f"{edge.name}_frame")
         self._put(etree.SubElement(self._robot, "link", name=name), edge.item)
         fixed = etree.SubElement(self._robot, "joint", name=f"{name}_fixed", type="fixed")
         _origin(fixed, offset)
         etree.SubElement(fixed, "parent", link=name)
-        etree.SubElement(fixed, "child", link=link)
+        etree.SubElement(fixed, "child", link=self._names.get(link, link))
         self._put(fixed, edge.item)
         return name
 
@@ -276,7 +281,7 @@ class _Translation:
             kind = _LOOPS.get(edge.kind, edge.kind)
             loop = etree.SubElement(self._robot, "loop", name=edge.name, type=kind)
             for tag, link in (("predecessor", edge.parent), ("successor", edge.child)):
-                end = etree.SubElement(loop, tag, link=link)
+                end = etree.SubElement(loop, tag, link=self._names.get(link, link))
                 _origin(end, self._at[link].actInv(edge.place))
             if edge.axis is not None:
                 _axis(loop, edge.axis.direction)
