@@ -47,13 +47,14 @@ def live(
     argument: Argument = None,
 ) -> None:
     """Move a machine with sliders in a browser, its loops closed at every move."""
+    from crane.cli.commands import is_run
     from crane.cli.runs import machine_of, read_run
     from crane.view.live.playback import Playback
     from crane.view.live.serve import serve
     from crane.view.live.session import Session
 
     recording = None
-    if Path(what).is_dir() or Path(what).suffix.lower() in (".csv", ".npz"):
+    if is_run(what):
         if run is not None:
             raise InputError(f"'{what}' is a run already, leave --run out")
         if change or lock or active or free or floating or packages or argument:

@@ -156,8 +156,8 @@ def find_package(name: str, folder: Path) -> Path | None:
 
 
 def _sought(name: str, folder: Path, packages: Sequence[str]) -> Path | None:
-    for top in packages:
-        if (found := _below(name, Path(top))) is not None:
+    for folder_given in packages:
+        if (found := _below(name, Path(folder_given))) is not None:
             return found
     for above in (folder, *folder.parents):
         for place in (above, above / name):

@@ -7,6 +7,7 @@ from pathlib import Path
 from crane.common.errors import DescriptionError, known
 
 WITH = " with "  # between a machine and the numbers of it that are changed, see `Machine.call`
+FOLDERS = ("robot.yaml", "model.sdf")  # of example-parallel-robots, of Gazebo
 SUFFIXES = (".yaml", ".yml", ".urdf", ".xacro", ".sdf", ".world", ".xml", ".mjcf")
 
 
@@ -73,10 +74,9 @@ def find(name: str | Path) -> Path:
         raise DescriptionError(
             f"{path}: cannot be read ({error.strerror}), check the path"
         ) from None
-    if is_folder and (path / "robot.yaml").is_file():  # as in example-parallel-robots
-        return (path / "robot.yaml").resolve()
-    if is_folder and (path / "model.sdf").is_file():  # as in Gazebo's folders of models
-        return (path / "model.sdf").resolve()
+    inside = [path / name for name in FOLDERS if is_folder and (path / name).is_file()]
+    if inside:
+        return inside[0].resolve()
     if path.suffix.lower() in SUFFIXES:
         if is_file:
             return path.resolve()

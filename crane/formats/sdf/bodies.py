@@ -42,8 +42,8 @@ def warn_of_no_inertial(link: Item) -> None:
     """Warn of a link that moves without saying what it weighs."""
     if link.only("inertial") is None:
         warnings.warn(
-            f"{link.where}: {link.what} has no <inertial>, which is 1 kg and 1 kg m2 in SDF: write "
-            "what it has",
+            f"{link.where}: {link.what} has no <inertial>, which SDF takes as 1 kg and 1 kg m2: "
+            "write what it has",
             CraneWarning,
             stacklevel=2,
         )

@@ -144,7 +144,7 @@ class Joints:
             problem = f"the type '{kind}', {known(TYPES, kind)}" if kind else "no type"
             raise joint.xml.fail(joint.element, f"{joint.what} has {problem}")
         name = f"{scope.prefix}{joint.name}"
-        ends = [self._end(scope, joint, tag) for tag in ("parent", "child")]
+        ends = self._end(scope, joint, "parent"), self._end(scope, joint, "child")
         if ends[0] == ends[1]:
             raise joint.xml.fail(joint.element, f"{joint.what} joins '{ends[0]}' to itself")
         child = joint.text("child")
@@ -190,13 +190,16 @@ class Joints:
         return Axis(
             axis,
             self._direction(scope, axis, in_scope),
-            _bound(limit.number("lower", -math.inf)),
-            _bound(limit.number("upper", math.inf)),
-            *(_most(limit.number(key, -1.0)) for key in ("effort", "velocity")),
-            *(dynamics.number(key, 0.0) for key in (
-                "damping", "friction", "spring_stiffness", "spring_reference")),
-            None if given is None else axis.number("initial_position", 0.0),
-        )  # fmt: skip
+            lower=_bound(limit.number("lower", -math.inf)),
+            upper=_bound(limit.number("upper", math.inf)),
+            effort=_most(limit.number("effort", -1.0)),
+            velocity=_most(limit.number("velocity", -1.0)),
+            damping=dynamics.number("damping", 0.0),
+            friction=dynamics.number("friction", 0.0),
+            stiffness=dynamics.number("spring_stiffness", 0.0),
+            reference=dynamics.number("spring_reference", 0.0),
+            initial=None if given is None else axis.number("initial_position", 0.0),
+        )
 
     def _direction(self, scope: Scope, axis: Item, in_scope: pin.SE3) -> np.ndarray:
         """An axis in the joint's frame; in the model's up to version 1.4."""
@@ -212,7 +215,7 @@ class Joints:
         return np.asarray(in_scope.rotation.T @ turn @ xyz)
 
     def _pair(
-        self, names: list[str], kinds: tuple[str, str], ends: list[str], place: pin.SE3,
+        self, names: list[str], kinds: tuple[str, str], ends: tuple[str, str], place: pin.SE3,
         joint: Item, axes: list[Axis],
     ) -> None:  # fmt: skip
         """Two edges with a link between them."""
@@ -223,7 +226,9 @@ class Joints:
             Edge(names[1], kinds[1], middle, ends[1], place, joint, axes[1]),
         ]
 
-    def _screw(self, name: str, ends: list[str], place: pin.SE3, joint: Item, axis: Axis) -> None:
+    def _screw(
+        self, name: str, ends: tuple[str, str], place: pin.SE3, joint: Item, axis: Axis
+    ) -> None:
         slope = joint.number("screw_thread_pitch", 0.0) / (2 * math.pi)
         if joint.only("screw_thread_pitch") is None:
             pitch = joint.number("thread_pitch", 1.0)  # [rad/m], of a left-handed thread
@@ -235,7 +240,7 @@ class Joints:
         self.followers.append(Follower(slide, name, slope, 0.0, joint))
 
     def _gear(
-        self, scope: Scope, ends: list[str], place: pin.SE3, joint: Item, axes: list[Axis]
+        self, scope: Scope, ends: tuple[str, str], place: pin.SE3, joint: Item, axes: list[Axis]
     ) -> None:
         reference = self._end(scope, joint, "gearbox_reference_body")
         one, two = (np.asarray(place.rotation @ axis.direction) for axis in axes)

@@ -64,9 +64,9 @@ class Scope:
     @property
     def placement_frame(self) -> str:
         """The frame of it that its pose places, empty for its own."""
-        if self.include is not None and self.placed is self.include:
-            if given := self.include.text("placement_frame"):
-                return given
+        placed = self.placed
+        if placed is self.include and (given := placed.text("placement_frame")):
+            return given
         return str(self.item.element.get("placement_frame", "")).strip()
 
     def names(self) -> list[str]:
@@ -187,7 +187,7 @@ class Reader:
         self._nest(scope, item, include, version_of(xml), depth)
 
     def _merge(self, scope: Scope, item: Item, include: Item, depth: int) -> None:
-        """The parts of a model as parts of the one that includes it, about a frame of their own."""
+        """The parts of a model as parts of the one that includes it, with a frame of their own."""
         if depth > _DEEP:
             raise item.xml.fail(item.element, "models include each other without end, break it")
         name = f"_merged__{include.text('name') or item.name}__model__"
