@@ -235,7 +235,8 @@ class Search:
     @staticmethod
     def _step(slope: Array, gap: Array) -> Array:
         gram = slope.T @ slope
-        damping = _DAMPING * min(1.0, float(gap @ gap)) + 1e-14
+        rounding = 1e-14 + 1e-15 * float(gram.diagonal().max(initial=0.0))
+        damping = _DAMPING * min(1.0, float(gap @ gap)) + rounding
         step = np.linalg.solve(gram + damping * np.eye(len(gram)), -slope.T @ gap)
         return np.asarray(step * min(1.0, _STEP / max(np.abs(step).max(initial=0.0), 1e-300)))
 

@@ -92,8 +92,7 @@ def settle(
             moved = np.flatnonzero(search.apart(home, guess) > CLOSED)
             return usable, Sought(reason, len(found), moved, search.farthest(home))
         if usable is not None and outside is None:
-            refused = usable
-            break
+            raise refused if isinstance(refused, ActiveError) else usable
     if outside is not None:
         return outside, None
     raise refused
