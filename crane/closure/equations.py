@@ -22,10 +22,10 @@ def frame_id(model: pin.Model, link: str) -> int:
 
 def turned(axis: Sequence[float]) -> Array:
     """A rotation (3, 3) whose third column is the axis."""
-    third = np.asarray(axis)
-    first = np.cross(np.eye(3)[np.argmin(np.abs(third))], third)
+    third = np.array([axis])
+    first = _cross(np.eye(3)[[np.argmin(np.abs(third))]], third)
     first /= np.linalg.norm(first)
-    return np.column_stack([first, np.cross(third, first), third])
+    return np.column_stack([first[0], _cross(third, first)[0], third[0]])
 
 
 def _columns(jacobian: Array) -> Array:

@@ -12,6 +12,7 @@ import crane
 _ROOT = os.path.dirname(os.path.abspath(crane.__file__))
 _CLOCK = 2.0  # [s] by which the times of files may be coarse
 _ROOMS = ("codegen", "hydraulics", "closure", "dynamics", "motion", "control", "simulation")
+_CODE, _METHODS = (FunctionType, type), (staticmethod, classmethod)
 _KNOWN = sys.stdlib_module_names | {
     "crane", "llvmlite", "numpy", "pinocchio", "platformdirs", "scipy",
 }  # fmt: skip
@@ -24,11 +25,7 @@ def package_digest() -> str | None:
     of someone else's has been put into one of the modules that make formulas. Numbers put in place
     of the package's own while Python runs are not noticed.
     """
-    try:
-        digest = _digest()
-    except OSError:
-        return None
-    return None if changed() or patched() else digest
+    return None if patched() else _digest()
 
 
 def changed() -> bool:
@@ -54,27 +51,35 @@ def patched() -> bool:
 
 def _function(value: Any) -> Any:
     """What stands behind a property or a method of a class."""
-    for name in ("__func__", "fget", "func"):
-        value = getattr(value, name, value)
-    return value
+    if isinstance(value, property):
+        return value.fget
+    if isinstance(value, functools.cached_property):
+        return value.func
+    return value.__func__ if isinstance(value, _METHODS) else value
 
 
 def _foreign(value: Any) -> bool:
-    if not isinstance(value, FunctionType | type):
-        return False
-    root = str(value.__module__).partition(".")[0]
-    return root not in _KNOWN and not root.startswith("namedtuple_")
+    return isinstance(value, _CODE) and not _known(value.__module__)
 
 
 @functools.cache
-def _digest() -> str:
-    """Of names and contents."""
+def _known(module: str | None) -> bool:
+    root = str(module).partition(".")[0]
+    return root in _KNOWN or root.startswith("namedtuple_")
+
+
+@functools.cache
+def _digest() -> str | None:
+    """Of names and contents; None where they may not be those that were loaded."""
     digest = hashlib.sha256()
     for path in _files():
-        with open(path, "rb") as file:
-            text = file.read()
+        try:
+            with open(path, "rb", buffering=0) as file:
+                text = file.read()
+        except OSError:
+            return None
         digest.update(f"{path[len(_ROOT) :]} {len(text)} ".encode() + text)
-    return digest.hexdigest()
+    return None if changed() else digest.hexdigest()
 
 
 @functools.cache

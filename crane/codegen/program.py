@@ -87,7 +87,8 @@ class Program:
     @classmethod
     def _of(cls, note: Note, code: Code) -> "Program":
         program = cls()
-        program.longest, program._signatures, program._code = note.longest, note.functions, code
+        program.longest, program._code = note.longest, code
+        program._signatures = dict(note.functions)
         return program
 
     def add(
