@@ -339,7 +339,7 @@ REFUSED = [
      "arm.sdf:3: the limits of joint 'p' are reversed (1 > -1), swap them"),
     ("gear", TWO + hinge("g", "a", "b", kind="gearbox",
      beside="<gearbox_reference_body>world</gearbox_reference_body>"),
-     "arm.sdf:5: joint 'g': no joint turns 'b' against '::world' about the gear's axis, name "
+     "arm.sdf:5: joint 'g': no joint turns 'b' against 'world' about the gear's axis, name "
      "another gearbox_reference_body"),
 ]  # fmt: skip
 
