@@ -183,7 +183,9 @@ def test_macros_without_end(tmp_path):
         '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:macro name="m" params="">'
         "<xacro:m/></xacro:macro><xacro:m/></robot>"
     )
-    with pytest.raises(CraneError, match=r"ring.xacro: xacro refuses it \(its macros or files use"):
+    with pytest.raises(
+        CraneError, match=r"ring.xacro: xacro refuses it \(its macros or files use"
+    ):
         load(path)
 
 
