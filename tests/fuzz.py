@@ -56,6 +56,67 @@ FOUR_BAR_MJCF = """<mujoco model="bar">
 </mujoco>
 """
 
+FOUR_BAR_SDF = """<sdf version="1.9">
+  <model name="bar">
+    <frame name="plane"><pose>0 0.1 0 0 0 0.4</pose></frame>
+    <link name="crank"><pose relative_to="plane">0 0 0 0.1 0.2 0.3</pose>
+      <inertial><pose>0 0 0.1 0.3 0 0</pose><mass>0.7</mass>
+        <inertia><ixx>0.01</ixx><iyy>0.012</iyy><izz>0.004</izz><ixy>0.001</ixy></inertia>
+      </inertial></link>
+    <link name="rod"><pose relative_to="plane">0 0 0.2 0 0 0</pose>
+      <inertial><pose>0.2 0 0.05 0 0 0</pose><mass>0.5</mass>
+        <inertia><ixx>0.01</ixx><iyy>0.02</iyy><izz>0.025</izz></inertia></inertial></link>
+    <model name="right"><pose relative_to="plane">0.5 0 0 0 0 0</pose>
+      <link name="rocker">
+        <inertial><pose>0 0 0.15 0 0 0</pose><mass>0.3</mass>
+          <inertia><ixx>0.006</ixx><iyy>0.005</iyy><izz>0.004</izz></inertia></inertial></link>
+      <link name="top"><pose>0 0 0.3 0 0 0</pose>
+        <inertial><mass>0.2</mass>
+          <inertia><ixx>0.006</ixx><iyy>0.005</iyy><izz>0.004</izz></inertia></inertial></link>
+    </model>
+    <joint name="a" type="revolute"><parent>world</parent><child>crank</child>
+      <axis><xyz expressed_in="plane">0 1 0</xyz>
+        <limit><lower>-2</lower><upper>1.5</upper><effort>30</effort></limit>
+        <dynamics><damping>0.3</damping><friction>0.1</friction></dynamics>
+        <initial_position>0.05</initial_position></axis></joint>
+    <joint name="b" type="revolute"><parent>crank</parent><child>rod</child>
+      <axis><xyz expressed_in="plane">0 1 0</xyz>
+        <dynamics><spring_stiffness>1.5</spring_stiffness>
+          <spring_reference>0.2</spring_reference></dynamics></axis></joint>
+    <joint name="c" type="revolute"><parent>world</parent><child>right::rocker</child>
+      <axis><xyz>0 1 0</xyz></axis></joint>
+    <joint name="d" type="revolute"><pose relative_to="right::rocker">0 0 0.2 0 0 0</pose>
+      <parent>rod</parent><child>right::rocker</child>
+      <axis><xyz>0 1 0</xyz></axis></joint>
+    <joint name="f" type="revolute"><parent>world</parent><child>right::top</child>
+      <axis><xyz>0 1 0</xyz>
+        <mimic joint="c"><multiplier>0.5</multiplier></mimic></axis></joint>
+  </model>
+</sdf>
+"""
+
+ARM_XACRO = """<robot name="arm" xmlns:xacro="http://www.ros.org/wiki/xacro">
+  <xacro:arg name="long" default="true"/>
+  <xacro:property name="r" value="${0.5 * pi}"/>
+  <xacro:macro name="segment" params="name length:=0.5 mass:=^|1.5 *place">
+    <link name="${name}">
+      <inertial><origin xyz="0 0 ${length / 2}"/><mass value="${mass}"/>
+        <inertia ixx="${mass * length**2 / 12}" ixy="0" ixz="0" iyy="${mass * length**2 / 12}"
+          iyz="0" izz="${0.01 * mass}"/></inertial>
+    </link>
+    <joint name="${name}_joint" type="revolute">
+      <xacro:insert_block name="place"/><child link="${name}"/><axis xyz="0 1 0"/>
+      <limit lower="${-r}" upper="${r}" effort="1" velocity="2"/>
+    </joint>
+  </xacro:macro>
+  <link name="base"/>
+  <xacro:segment name="upper" length="0.6"><parent link="base"/></xacro:segment>
+  <xacro:if value="$(arg long)">
+    <xacro:segment name="lower"><parent link="upper"/></xacro:segment>
+  </xacro:if>
+</robot>
+"""
+
 PARALLEL_YAML = (
     "closed_loop: [[tip, eye]]\ntype: ['6d']\nname_mot: [crank]\n"
     "joint_name: [pin, coupler]\njoint_type: ['SPHERICAL', 'UJOINT_YZ']\n"
@@ -96,6 +157,10 @@ def make(kind, folder):
         (folder / "robot.urdf").write_text(text)
         (folder / "robot.yaml").write_text(PARALLEL_YAML)
         return folder / "robot.yaml", [folder / "robot.yaml", folder / "robot.urdf"]
+    if kind in ("sdf", "xacro"):
+        path = folder / f"bar.{kind}"
+        path.write_text(FOUR_BAR_SDF if kind == "sdf" else ARM_XACRO)
+        return path, [path]
     (folder / "bar.xml").write_text(FOUR_BAR_MJCF)
     return folder / "bar.xml", [folder / "bar.xml"]
 
@@ -130,7 +195,7 @@ def mutated(data, seed):
 IGNORED = {  # what a machine does not have
     ("geom", "contype"), ("geom", "conaffinity"), ("motor", "name"), ("mujoco", "model"),
     ("key", "name"), ("fixed", "name"),  # the only key is home, and nothing refers to the tendon
-    ("robot", "name"),
+    ("robot", "name"), ("sdf", "version"), ("model", "name"),
 }  # fmt: skip
 
 
@@ -163,6 +228,7 @@ def said_xml(data, known=None):
             if key == "polycoef":
                 value += (0.0,) * (5 - len(value))
             said.append((here, key, value))
+        said.append((here, "text", words(element.text)))
         for child in element:
             walk(child, here)
         said.append((here, "end", ()))
@@ -221,7 +287,7 @@ def judge(kind, seed, folder):
     """None if all is well, or what is wrong."""
     main, files = make(kind, folder)
     known = {f.name: vocabulary(f.read_bytes()) for f in files if f.suffix != ".yaml"}
-    original = said(files, known), got(read(main))
+    original = None if kind == "xacro" else said(files, known), got(read(main))
     file = files[seed % len(files)]
     file.write_bytes(mutated(file.read_bytes(), seed))
     problem = None
@@ -243,6 +309,8 @@ def judge(kind, seed, folder):
         return problem
     if not np.isfinite(machine.home).all() or machine.closure.residual(machine.home) > 1e-8:
         return "loaded without being closed"
+    if kind == "xacro":  # whose words are a program
+        return None
     try:
         says = said(files, known)
     except Exception as error:

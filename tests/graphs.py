@@ -207,6 +207,43 @@ def mujoco(rng, folder):
     return folder / "odd.xml", odd >= 0.2
 
 
+def sdf(rng, count, joints, folder):
+    """The same graph as SDF, where rings are loops; its number of loops if all joints turn."""
+    kinds = {"floating": ("ball", "universal", "screw", "prismatic", "gearbox")}
+    places = [f"0.{i + 1} {rng.choice((0.1, 0))} 0 0 0 0" for i in range(count)]
+    lines = [
+        f'<link name="l{i}"><pose>{place}</pose><inertial><mass>{i % 3 + 1}</mass></inertial></link>'
+        for i, place in enumerate(places)
+    ]
+    for i, (parent, child, kind, mimic) in enumerate(joints):
+        style = rng.choice(kinds.get(kind, (kind,)))
+        follows = f'<mimic joint="j{mimic}"/>' if mimic is not None else ""
+        ends = f"l{parent}" if rng.random() < 0.9 else "world", f"l{child}"
+        joints[i] = [parent if ends[0] != "world" else -1, child, style, mimic]
+        lines.append(
+            f'<joint name="j{i}" type="{style}"><parent>{ends[0]}</parent><child>{ends[1]}</child>'
+            f"<axis><xyz>0 0 1</xyz>{follows}</axis></joint>"
+        )
+    rng.shuffle(lines)
+    path = folder / "odd.sdf"
+    text = "\n".join(lines)
+    path.write_text(f'<sdf version="1.11"><model name="odd">\n{text}\n</model></sdf>')
+    return path
+
+
+def loops_of(count, joints):
+    """How many joints of a graph are more than a tree, if all turn, the world being -1."""
+    if any(kind != "continuous" or mimic is not None for *_, kind, mimic in joints):
+        return None
+    groups = [{i} for i in range(-1, count)]
+    for parent, child, *_ in joints:
+        one, two = (next(g for g in groups if x in g) for x in (parent, child))
+        if one is not two:
+            groups.remove(two)
+            one |= two
+    return len(joints) - (count + 1 - len(groups))
+
+
 def judge(kind, seed, folder):
     """None if all is well, or what is wrong."""
     rng = random.Random(seed)
@@ -221,14 +258,18 @@ def judge(kind, seed, folder):
         path, sound = chains(rng, folder)
     elif kind == "parallel":
         path = parallel(rng, count, joints, folder)
+    elif kind == "sdf":
+        path = sdf(rng, count, joints, folder)
+        sound = all(parent != child for parent, child, *_ in joints)
     else:
         path, sound = mujoco(rng, folder)
+    machine = None
     told = None
     try:
         with at_most(MOST):
             report = check(path)
         with at_most(MOST):
-            crane.load(path)
+            machine = crane.load(path)
     except CraneError as error:
         told = str(error)
     except TooMuchWorkError as error:
@@ -240,6 +281,13 @@ def judge(kind, seed, folder):
         return f"load says {told}, check {found}"
     if not sound and not found:
         return f"nothing is said of {count} links and {joints}"
+    if kind == "sdf" and machine is not None:
+        if machine.closure.residual(machine.home) > 1e-8:
+            return "loaded without being closed"
+        expected = loops_of(count, joints)
+        found_loops = len(machine.closure.equations.loops)
+        if expected not in (None, found_loops):
+            return f"{found_loops} loops, {expected} joints more than a tree"
     if kind in ("urdf", "urdf+"):
         if heavy == "-1" and not any("link 'l1' has the mass -1" in line for line in found):
             return f"nothing is said of the mass: {found}"

@@ -35,22 +35,74 @@ class Drawn:
     links: dict = field(default_factory=dict)  # name -> pose, mass, COM pose, principal moments
     joints: dict = field(default_factory=dict)  # name -> kind, parent, child, pose, axes
     frames: dict = field(default_factory=dict)  # name -> pose, attached to
+    surplus: tuple = ()  # joints that close loops
 
 
 def draw(rng, count=5, kinds=KINDS):
     """A tree of links from the world on."""
     drawn = Drawn(random_pose(rng))
     for i in range(count):
-        moments = rng.uniform(0.5, 1.0, 3) * 0.05
-        drawn.links[f"l{i}"] = (
-            random_pose(rng), float(rng.uniform(0.5, 2)), random_pose(rng, 0.2), moments.tolist(),
-        )  # fmt: skip
+        drawn.links[f"l{i}"] = link(rng)
         kind = rng.choice(kinds) if i else "revolute"
         parent = f"l{rng.integers(i)}" if i else "world"
-        axes = [v / np.linalg.norm(v) for v in rng.normal(size=(2, 3))]
+        axes = np.linalg.qr(rng.normal(size=(3, 2)))[0].T  # at right angles, as SDF wants them
         drawn.joints[f"j{i}"] = (str(kind), parent, f"l{i}", random_pose(rng), axes)
     for i in range(3):
         drawn.frames[f"f{i}"] = random_pose(rng), f"l{rng.integers(count)}"
+    return drawn
+
+
+def link(rng, moments=0.05):
+    """Pose, mass, pose of the centre of mass, and principal moments."""
+    drawn = rng.uniform(0.5, 1.0, 3) * moments
+    return random_pose(rng), float(rng.uniform(0.5, 2)), random_pose(rng, 0.2), drawn.tolist()
+
+
+def facing(rng, normal, place):
+    """A frame at a place, turned at random, and in it the axis along a normal of the model."""
+    turn = Rotation.random(random_state=rng)
+    return pose(turn, place), turn.inv().apply(normal)
+
+
+def planar(rng, pins):
+    """A closed polygon of bars, the first of which is the ground, in a plane at random."""
+    drawn = Drawn(random_pose(rng))
+    plane = Rotation.random(random_state=rng)
+    normal = plane.apply([0.0, 1.0, 0.0])
+    bodies = ["world", *(f"l{i}" for i in range(1, len(pins)))]
+    for name in bodies[1:]:
+        drawn.links[name] = link(rng)
+    for i, (x, z) in enumerate(pins):
+        place, axis = facing(rng, normal, plane.apply([x, rng.uniform(-0.1, 0.1), z]))
+        ends = bodies[i], bodies[(i + 1) % len(pins)]
+        if i > len(pins) // 2:  # from the ground on, too
+            ends, axis = ends[::-1], -axis
+        drawn.joints[f"j{i}"] = ("revolute", *ends, place, [axis])
+    drawn.surplus = (f"j{len(pins) // 2}",)
+    return drawn
+
+
+def stewart(rng, legs=6):
+    """A platform on legs of a universal joint, a slide and a ball each."""
+    drawn = Drawn(random_pose(rng))
+    drawn.links["platform"] = link(rng)
+    for i in range(legs):
+        low, high = (np.array([r * np.cos(a), r * np.sin(a), z]) for r, a, z in (
+            (1.0, 2 * np.pi * (i // 2 * 2 + (i % 2) * 0.4) / legs + rng.uniform(0, 0.1), 0.0),
+            (0.6, 2 * np.pi * (i // 2 * 2 + (i % 2) * 1.6 - 0.6) / legs, 1.0)))  # fmt: skip
+        along = (high - low) / np.linalg.norm(high - low)
+        drawn.links[f"barrel{i}"], drawn.links[f"rod{i}"] = link(rng), link(rng)
+        first = np.cross(along, rng.normal(size=3))
+        first /= np.linalg.norm(first)
+        foot, axis = facing(rng, first, low)
+        second = foot[:3, :3].T @ np.cross(along, first)
+        slide, direction = facing(rng, along, low + 0.4 * (high - low))
+        drawn.joints |= {
+            f"foot{i}": ("universal", "world", f"barrel{i}", foot, [axis, second]),
+            f"slide{i}": ("prismatic", f"barrel{i}", f"rod{i}", slide, [direction]),
+            f"ball{i}": ("ball", f"rod{i}", "platform", facing(rng, along, high)[0], []),
+        }
+    drawn.surplus = tuple(f"ball{i}" for i in range(1, legs))
     return drawn
 
 
@@ -131,13 +183,17 @@ class SdfWriter:
         if kind == "continuous" and self.version < 8:
             kind = "revolute"
         axes = list(axes)
-        if parent != "world" and kind != "universal" and self.rng.random() < self.reverse:
+        if (
+            "world" not in (parent, child)
+            and kind in ("revolute", "prismatic")
+            and self.rng.random() < self.reverse
+        ):
             parent, child = child, parent  # the same coordinate about the axis turned round
             axes = [-axis for axis in axes]
         text = f'<joint name="{name}" type="{kind}"><parent>{parent}</parent>'
         text += f"<child>{child}</child>"
         text += self.relative(x, child, self.drawn.links[child][0])
-        if kind != "fixed":
+        if kind not in ("fixed", "ball"):
             text += self.axis("axis", axes[0], x)
         if kind == "universal":
             text += self.axis("axis2", axes[1], x)
@@ -164,9 +220,10 @@ def urdf(drawn):
     """The same as URDF, each link in the frame of the joint that moves it."""
     lines = ['<robot name="drawn"><link name="world"/>']
     above = {"world": inverse(drawn.model)}
-    for kind, _, child, x, _ in drawn.joints.values():
+    tree = {name: x for name, x in drawn.joints.items() if name not in drawn.surplus}
+    for kind, _, child, x, _ in tree.values():
         if kind == "universal":
-            lines.append(f'<link name="{child}_middle"/>')
+            lines.append(f'<link name="{child}_middle" between="{child}"/>')
         place, mass, com, (ixx, iyy, izz) = drawn.links[child]
         lines.append(
             f'<link name="{child}"><inertial>{origin(inverse(x) @ place @ com)}'
@@ -174,8 +231,23 @@ def urdf(drawn):
             'ixz="0" iyz="0"/></inertial></link>'
         )
         above[child] = x
-    for name, (kind, parent, child, x, axes) in drawn.joints.items():
+    for name in drawn.surplus:
+        kind, parent, child, x, axes = drawn.joints[name]
+        axis = f'<axis xyz="{numbers(axes[0])}"/>' if axes else ""
+        style = {"ball": "spherical"}.get(kind, kind)
+        ends = "".join(
+            f'<{tag} link="{body}">{origin(inverse(above[body]) @ x)}</{tag}>'
+            for tag, body in (("predecessor", parent), ("successor", child))
+        )
+        lines.append(f'<loop name="{name}" type="{style}">{ends}{axis}</loop>')
+    for name, (kind, parent, child, x, axes) in tree.items():
         place = origin(inverse(above[parent]) @ x)
+        if kind == "ball":
+            lines.append(
+                f'<joint name="{name}" type="spherical"><parent link="{parent}"/>'
+                f'<child link="{child}"/>{place}</joint>'
+            )
+            continue
         steps = [(name, kind, parent, child, place, axes[0])]
         if kind == "universal":
             steps = [

@@ -8,12 +8,13 @@ the file. In graphs.py it is that whatever is no tree is told, ring by ring, wit
 import pytest
 from judge import judge
 
-FORMATS = ("machine", "urdf", "urdf+", "parallel", "mjcf")
+FORMATS = ("machine", "urdf", "urdf+", "parallel", "mjcf", "sdf", "xacro")
+GRAPHS = FORMATS[:-1]
 
 
 def run(kind, first, count, program="fuzz.py"):
-    if kind == "mjcf":
-        pytest.importorskip("mujoco")
+    if kind in ("mjcf", "xacro"):
+        pytest.importorskip({"mjcf": "mujoco"}.get(kind, kind))
     assert judge(program, kind, first, count) == count
 
 
@@ -22,13 +23,13 @@ def test_some_changed_files(kind):
     run(kind, 0, 60)
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", GRAPHS)
 def test_some_odd_graphs(kind):
     run(kind, 0, 40, "graphs.py")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", GRAPHS)
 def test_hundreds_of_odd_graphs(kind):
     run(kind, 0, 400, "graphs.py")
 

@@ -5,10 +5,12 @@ import warnings
 import numpy as np
 import pinocchio as pin
 import pytest
-from sdf_models import SdfWriter, draw, urdf
+from sdf_models import SdfWriter, draw, planar, stewart, urdf
+from typed import typed
 
 import crane
-from crane.common.errors import CraneWarning
+from crane.common.errors import CraneError, CraneWarning
+from crane.formats.opening import robots
 
 
 def load(path, **options):
@@ -44,3 +46,333 @@ def test_poses_and_axes_mean_what_they_say(version, seed, tmp_path):
     (tmp_path / "drawn.sdf").write_text(SdfWriter(rng, drawn, version).text())
     (tmp_path / "drawn.urdf").write_text(urdf(drawn))
     assert_same(load(tmp_path / "drawn.sdf"), load(tmp_path / "drawn.urdf"), rng)
+
+
+def assert_same_driven(one, two, rng, reach, count=4):
+    """Mass matrix and gravity in the same active coordinates, the loops closed."""
+    assert one.active == two.active
+    here, there = crane.Dynamics(one), crane.Dynamics(two)
+    for _ in range(count):
+        q = one.home[one.closure.active] + rng.uniform(-reach, reach, len(one.active))
+        full = one.closure.solve(q)
+        assert one.closure.residual(full) < 1e-12
+        mass, gravity = here.mass_matrix(q), here.gravity(q)
+        assert np.abs(mass - there.mass_matrix(q)).max() < 1e-10 * np.abs(mass).max()
+        weight = 9.81 * one.tree.mass
+        assert np.abs(gravity - there.gravity(q)).max() < 1e-12 * weight
+
+
+PINS = {
+    "four bars": [(0, 0), (0, 0.3), (0.5, 0.45), (0.5, 0)],
+    "five bars": [(0, 0), (-0.1, 0.3), (0.25, 0.6), (0.6, 0.3), (0.5, 0)],
+    "parallelogram": [(0, 0), (0.1, 0.3), (0.6, 0.3), (0.5, 0)],
+}
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", PINS)
+def test_rings_of_joints_are_loops(kind, seed, tmp_path):
+    """However the joints of a ring are turned and listed, it closes as URDF+ says it does."""
+    rng = np.random.default_rng([seed, len(kind)])
+    drawn = planar(rng, PINS[kind])
+    (tmp_path / "ring.sdf").write_text(SdfWriter(rng, drawn, 9).text())
+    (tmp_path / "ring.urdf").write_text(urdf(drawn))
+    active = ["j0", f"j{len(PINS[kind]) - 1}"] if kind == "five bars" else ["j0"]
+    one, two = (load(tmp_path / f"ring.{end}", active=active) for end in ("sdf", "urdf"))
+    assert len(one.closure.equations.loops) == 1
+    assert_same_driven(one, two, rng, 0.2)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_platform_on_legs(seed, tmp_path):
+    """Universal joints, slides and balls: five balls close loops, one is in the tree."""
+    rng = np.random.default_rng([seed, 6])
+    drawn = stewart(rng)
+    (tmp_path / "legs.sdf").write_text(SdfWriter(rng, drawn, 11).text())
+    (tmp_path / "legs.urdf").write_text(urdf(drawn))
+    active = [f"slide{i}" for i in range(6)]
+    one, two = (load(tmp_path / f"legs.{end}", active=active) for end in ("sdf", "urdf"))
+    assert [loop.type for loop in one.closure.equations.loops] == ["spherical"] * 5
+    assert_same_driven(one, two, rng, 0.05, 2)
+
+
+MASS = (
+    "<inertial><pose>0.1 0 0.2 0 0 0</pose><mass>1.5</mass><inertia><ixx>0.02</ixx><iyy>0.03</iyy>"
+    "<izz>0.025</izz></inertia></inertial>"
+)
+
+
+def arm(joints, version="1.9", more="", links=("a", "b"), name="arm"):
+    """An SDF of a few links, one above the other."""
+    bodies = "".join(
+        f'<link name="{x}"><pose>0 0 {i} 0 0 0</pose>{MASS}</link>' for i, x in enumerate(links)
+    )
+    return (
+        f'<sdf version="{version}"><model name="{name}">\n{bodies}\n{joints}{more}</model></sdf>'
+    )
+
+
+def hinge(name, parent, child, axis="0 1 0", inside="", kind="revolute", beside=""):
+    return (
+        f'<joint name="{name}" type="{kind}"><parent>{parent}</parent><child>{child}</child>{beside}'
+        f"<axis><xyz>{axis}</xyz>{inside}</axis></joint>\n"
+    )
+
+
+TWO = hinge("p", "world", "a") + hinge("q", "a", "b")
+
+
+def written(folder, text, name="arm.sdf"):
+    (folder / name).write_text(text)
+    return folder / name
+
+
+def warnings_of(path, **options):
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        machine = crane.load(path, **options)
+    return machine, [str(one.message) for one in heard]
+
+
+def test_limits_friction_springs_and_home(tmp_path):
+    inside = (
+        "<limit><lower>-1</lower><upper>2</upper><effort>30</effort></limit><dynamics><damping>0.5"
+        "</damping><friction>0.25</friction><spring_stiffness>7</spring_stiffness>"
+        "<spring_reference>0.4</spring_reference></dynamics>"
+        "<initial_position>0.3</initial_position>"
+    )
+    joints = hinge("p", "world", "a", inside=inside) + hinge("q", "a", "b")
+    machine = load(written(tmp_path, arm(joints)))
+    assert (machine.lower.tolist(), machine.upper.tolist()) == ([-1, -np.inf], [2, np.inf])
+    assert machine.home.tolist() == [0.3, 0]
+    assert (machine.friction["p"].viscous, machine.friction["p"].coulomb) == (0.5, 0.25)
+    (spring,) = machine.forces
+    assert (spring.joint, spring.stiffness, spring.rest) == ("p", 7, 0.4)
+    assert machine.model.effortLimit.tolist() == [30, np.inf]
+
+
+def test_a_screw_turns_and_slides(tmp_path):
+    """One turn of a right-handed thread moves it by its pitch; older files say minus rad/m."""
+    for text, version in (
+        ("<screw_thread_pitch>0.3</screw_thread_pitch>", "1.10"),
+        (f"<thread_pitch>{-2 * np.pi / 0.3!r}</thread_pitch>", "1.6"),
+    ):
+        joints = hinge("p", "world", "a") + hinge(
+            "s", "a", "b", "0 0 1", kind="screw", beside=text
+        )
+        machine = load(written(tmp_path, arm(joints, version)), active=["p", "s"])
+        q = machine.closure.solve([0.0, 2 * np.pi])
+        assert q[machine.column("s_slide")] == pytest.approx(0.3, abs=1e-14)
+
+
+def test_a_gearbox_turns_the_second_link_backwards(tmp_path):
+    """theta_2 = -ratio theta_1, angles from the reference about the axes of the gearbox."""
+    gear = (
+        '<joint name="g" type="gearbox"><parent>a</parent><child>b</child><gearbox_ratio>3'
+        "</gearbox_ratio><gearbox_reference_body>base</gearbox_reference_body>"
+        "<axis><xyz>0 1 0</xyz></axis><axis2><xyz>0 1 0</xyz></axis2></joint>"
+    )
+    joints = (
+        '<joint name="f" type="fixed"><parent>world</parent><child>base</child></joint>'
+        + hinge("p", "base", "a") + hinge("q", "base", "b", "0 -1 0") + gear
+    )  # fmt: skip
+    machine = load(written(tmp_path, arm(joints, links=("base", "a", "b"))), active=["p"])
+    assert machine.closure.solve([0.2])[machine.column("q")] == pytest.approx(0.6, abs=1e-14)
+
+
+def test_a_joint_follows_another(tmp_path):
+    """q = multiplier (leader - reference) + offset."""
+    mimic = (
+        '<mimic joint="p"><multiplier>2</multiplier><offset>0.1</offset><reference>0.3</reference>'
+        "</mimic>"
+    )
+    joints = hinge("p", "world", "a") + hinge("q", "a", "b", inside=mimic)
+    machine = load(written(tmp_path, arm(joints, "1.11")))
+    assert machine.closure.solve([0.5])[machine.column("q")] == pytest.approx(0.5, abs=1e-14)
+
+
+def test_nothing_drives_a_joint_without_effort(tmp_path):
+    zero = "<limit><effort>0</effort></limit>"
+    joints = hinge("p", "world", "a", inside=zero) + hinge("q", "a", "b")
+    machine = load(written(tmp_path, arm(joints)))
+    assert machine.free == ("p",)
+
+
+def test_stands_on_the_ground_or_floats(tmp_path):
+    path = written(tmp_path, arm(hinge("q", "a", "b")))
+    machine, told = warnings_of(path)
+    assert machine.joints == ("q",)
+    assert told == [
+        "arm.sdf:2: nothing joins 'arm' to the world, it is taken as standing on the ground by "
+        "link 'a': --floating (floating=True) lets it float"
+    ]
+    machine, told = warnings_of(path, floating=True)
+    assert len(machine.joints) == 7 and not any("ground" in line for line in told)
+    total = pin.crba(machine.model, machine.model.createData(), pin.neutral(machine.model))[0, 0]
+    assert total == pytest.approx(3.0)
+
+
+def test_a_link_without_mass_weighs_what_sdf_says(tmp_path):
+    text = arm(TWO).replace(MASS, "", 1).replace('name="b"><pose>', 'name="b" ><pose>')
+    machine, told = warnings_of(written(tmp_path, text))
+    assert machine.tree.mass == 2.5
+    assert told == [
+        "arm.sdf:2: link 'a' has no <inertial>, which SDF takes as 1 kg and 1 kg m2: write what it "
+        "has"
+    ]
+
+
+def test_mass_of_collisions(tmp_path):
+    """A box of water and a ball of steel beside it."""
+    shapes = (
+        '<inertial auto="true"/><collision name="x"><pose>0 0 0.5 0 0 0.3</pose><geometry><box>'
+        "<size>0.1 0.2 1</size></box></geometry></collision><collision name='y'><pose>1 0 0 0 0 0"
+        "</pose><density>7800</density><geometry><sphere><radius>0.1</radius></sphere></geometry>"
+        "</collision>"
+    )
+    machine = load(written(tmp_path, arm(TWO).replace(MASS, shapes, 1)))
+    inertial = machine.tree.links["a"].inertial
+    masses = np.array([20.0, 7800 * 4 / 3 * np.pi * 1e-3])
+    assert inertial.mass == pytest.approx(masses.sum(), rel=1e-14)
+    com = (masses @ [[0, 0, 0.5], [1, 0, 0]]) / masses.sum()
+    assert np.allclose(inertial.com, com, atol=1e-14)
+    about = inertial.tensor[2 + 1]  # yy: both turned about the common centre of mass
+    own = [20 / 12 * (1 + (0.1 * np.cos(0.3)) ** 2 + (0.2 * np.sin(0.3)) ** 2),
+           0.4 * masses[1] * 0.01]  # fmt: skip
+    steiner = masses @ (np.square([[0, 0.5], [1, 0]] - com[[0, 2]])).sum(axis=1)
+    assert about == pytest.approx(sum(own) + steiner, rel=1e-12)
+
+
+def test_models_within_models(tmp_path):
+    """An included hand by its grip, in a folder that is given, against the same written flat."""
+    hand = tmp_path / "models" / "my_hand"
+    hand.mkdir(parents=True)
+    (hand / "model.config").write_text(
+        '<model><name>Hand</name><sdf version="1.9">hand.sdf</sdf></model>'
+    )
+    (hand / "hand.sdf").write_text(
+        f'<sdf version="1.9"><model name="hand"><link name="palm">{MASS}</link><frame name="grip">'
+        "<pose>0 0.2 0 0 0 0</pose></frame></model></sdf>"
+    )
+    include = (
+        "<include><uri>model://my_hand</uri><name>left</name><pose relative_to='b'>0 0 1 0 0 0"
+        "</pose><placement_frame>grip</placement_frame></include>"
+    )
+    path = written(tmp_path, arm(TWO + hinge("w", "b", "left"), more=include))
+    (tmp_path / "flat").mkdir()
+    palm = f"<link name='palm'><pose>0 -0.2 2 0 0 0</pose>{MASS}</link>"
+    flat = written(tmp_path / "flat", arm(TWO + hinge("w", "b", "palm"), more=palm))
+    rng = np.random.default_rng(0)
+    assert_same(load(path, packages=[tmp_path / "models"]), load(flat), rng)
+    machine = load(path, packages=[tmp_path / "models"])
+    assert crane.formats.recalled(machine.call).model == machine.model
+
+
+def test_a_world_with_one_machine(tmp_path):
+    """Models that stand still, and those that are not there, are no part of it."""
+    model = arm(TWO).removeprefix('<sdf version="1.9">').removesuffix("</sdf>")
+    world = (
+        '<sdf version="1.9"><world name="w"><include><uri>model://sun</uri></include>'
+        f'<model name="floor"><static>true</static><link name="l"/></model>{model}</world></sdf>'
+    )
+    machine, told = warnings_of(written(tmp_path, world, "arm.world"))
+    assert machine.joints == ("p", "q")
+    assert told == ["arm.world: left out of what SDF has: models that are not found (model://sun)"]
+    two = world.replace("</world>", model.replace('"arm"', '"other"') + "</world>")
+    path = written(tmp_path, two, "two.world")
+    with pytest.raises(CraneError, match=r"2 models move \(arm, other\), choose one: --arg model"):
+        crane.load(path)
+    assert load(path, arguments={"model": "other"}).name == "other"
+
+
+def test_what_is_drawn(tmp_path):
+    visual = (
+        "<visual name='v'><pose relative_to='b'>0 0 1 0 0 0</pose><geometry><box><size>1 2 3</size>"
+        "</box></geometry><material><diffuse>1 0 0 1</diffuse></material></visual>"
+    )
+    text = arm(TWO).replace(MASS, MASS + visual, 1)
+    machine = load(written(tmp_path, text))
+    (xml,) = robots(machine)
+    (drawn,) = xml.root.iter("visual")
+    assert drawn.find("origin").get("xyz").split() == ["0.0", "0.0", "2.0"]
+    crane.write_urdf_plus(machine, tmp_path / "out.urdf")
+    assert 'size="1 2 3"' in (tmp_path / "out.urdf").read_text()
+    assert_same(machine, load(tmp_path / "out.urdf"), np.random.default_rng(1))
+
+
+def test_commands(tmp_path):
+    path = written(tmp_path, arm(TWO))
+    assert typed("check", path).returncode == 0
+    assert "drive" not in typed("info", path).stderr
+    assert typed("convert", path, tmp_path / "arm.urdf").returncode == 0
+    assert typed("convert", path, tmp_path / "folder").returncode == 0
+    for made in (tmp_path / "arm.urdf", tmp_path / "folder" / "arm.yaml"):
+        assert_same(load(path), load(made), np.random.default_rng(2))
+    done = typed("check", path, "--write-home")
+    assert done.returncode == 2
+    assert "is an SDF, write it into a copy" in done.stderr
+
+
+REFUSED = [
+    ("type", TWO.replace('"revolute"', '"revolut"', 1),
+     "arm.sdf:3: joint 'p' has the type 'revolut', did you mean 'revolute'?"),
+    ("parent", hinge("p", "wolrd", "a"),
+     "arm.sdf:3: joint 'p' names 'wolrd', which is unknown, known: a, b, p"),
+    ("itself", hinge("p", "a", "a"), "arm.sdf:3: joint 'p' joins 'a' to itself"),
+    ("no child", "<joint name='p' type='fixed'><parent>a</parent></joint>",
+     "arm.sdf:3: joint 'p' has no <child>, add it"),
+    ("number", hinge("p", "a", "b", "0 x 0"),
+     "arm.sdf:3: <xyz> of joint 'p' is not a number, write digits"),
+    ("axis", hinge("p", "a", "b", "0 0 0"),
+     "arm.sdf:3: the axis of joint 'p' is zero, give a direction"),
+    ("ring", TWO + "<frame name='f'><pose relative_to='g'/></frame>"
+     "<frame name='g'><pose relative_to='f'/></frame><joint name='r' type='fixed'>"
+     "<parent>b</parent><child>f</child></joint>",
+     "arm.sdf:5: frame 'g' is relative to 'f' in a ring, break it"),
+    ("twice", TWO + hinge("p", "a", "b"),
+     "arm.sdf:5: joint 'p' is there twice (first in arm.sdf:3), rename one"),
+    ("include", "<include><uri>model://lost</uri></include>",
+     "arm.sdf:3: there is no model 'model://lost', say where it is: --packages FOLDER, "
+     "packages=[...] in Python"),
+    ("static", "<static>1</static>", "arm.sdf:1: model 'arm' is static: nothing in it moves"),
+    ("limits", hinge("p", "a", "b", inside="<limit><lower>1</lower><upper>-1</upper></limit>"),
+     "arm.sdf:3: the limits of joint 'p' are reversed (1 > -1), swap them"),
+    ("gear", TWO + hinge("g", "a", "b", kind="gearbox",
+     beside="<gearbox_reference_body>world</gearbox_reference_body>"),
+     "arm.sdf:5: joint 'g': no joint turns 'b' against 'world' about the gear's axis, name "
+     "another gearbox_reference_body"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("joints", "message"), [x[1:] for x in REFUSED], ids=[x[0] for x in REFUSED]
+)
+def test_is_refused(joints, message, tmp_path):
+    path = written(tmp_path, arm(joints))
+    with pytest.raises(CraneError) as caught:
+        load(path)
+    assert str(caught.value) == message
+    assert typed("check", path).returncode == 2
+
+
+def test_negative_mass_is_refused(tmp_path):
+    path = written(tmp_path, arm(TWO).replace("1.5", "-1.5", 1))
+    with pytest.raises(CraneError, match="arm.sdf:2: link 'a' has the mass -1.5 kg"):
+        load(path)
+
+
+def test_slips_are_told(tmp_path):
+    inside = "<limit><lowr>1</lowr></limit><damping>3</damping>"
+    path = written(tmp_path, arm(hinge("p", "world", "a", inside=inside) + hinge("q", "a", "b")))
+    _, told = warnings_of(path)
+    assert told == [
+        "arm.sdf:3: unknown <damping> in <axis> of joint 'p', it is left out, it belongs into "
+        "<dynamics>",
+        "arm.sdf:3: unknown <lowr> in <limit> of joint 'p', it is left out, did you mean <lower>?",
+    ]
+
+
+def test_plugins_and_sensors_are_told_once(tmp_path):
+    more = '<plugin name="drive" filename="x.so"/><plugin name="imu" filename="y.so"/>'
+    _, told = warnings_of(written(tmp_path, arm(TWO, more=more)))
+    assert told == ["arm.sdf: left out of what SDF has: plugins (drive, imu)"]

@@ -53,9 +53,13 @@ def _angle(
         return edge.name, float(np.sign(cosine)) * (1.0 if forward else -1.0)
     raise gear.item.xml.fail(
         gear.item.element,
-        f"{gear.item.what}: no joint turns '{link}' against '{gear.reference}' about the gear's "
+        f"{gear.item.what}: no joint turns '{_named(link)}' against '{_named(gear.reference)}' about the gear's "
         "axis, name another gearbox_reference_body",
     )
+
+
+def _named(node: str) -> str:
+    return node.removeprefix("::")  # the world
 
 
 def followers_of(gears: Sequence[Meshed]) -> list[Follower]:
