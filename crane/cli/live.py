@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from crane.cli.shared import Active, Change, Floating, Free, Lock, app, load
+from crane.cli.waiting import shown
 from crane.common.errors import InputError
 
 
@@ -58,4 +59,5 @@ def live(
         if run is not None:
             recording = read_run(run, loaded)
     playback = None if recording is None else Playback(loaded, recording)
-    serve(Session(loaded), playback, host, port)
+    with shown():
+        serve(Session(loaded), playback, host, port)
