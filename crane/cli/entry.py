@@ -22,6 +22,7 @@ from crane.cli import (  # noqa: F401  register their commands
     workspace,
 )
 from crane.cli.shared import app, say
+from crane.cli.waiting import watched
 from crane.common.errors import CraneError, CraneWarning, one_line
 
 _INTERRUPTED = 130
@@ -36,7 +37,8 @@ def main() -> None:
     warnings.showwarning = _show_warning
     warnings.simplefilter("once", CraneWarning)
     try:
-        status = app(args=arguments, standalone_mode=False, prog_name="crane")
+        with watched(" ".join(["crane", *arguments[:1]])):
+            status = app(args=arguments, standalone_mode=False, prog_name="crane")
         if status == _INTERRUPTED:  # what the parser makes of KeyboardInterrupt
             raise KeyboardInterrupt
         if sys.stdout is not None:  # it is where the shell has closed it

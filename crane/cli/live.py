@@ -16,6 +16,7 @@ from crane.cli.shared import (
     app,
     load,
 )
+from crane.cli.waiting import shown
 from crane.common.errors import InputError
 
 
@@ -71,4 +72,5 @@ def live(
         if run is not None:
             recording = read_run(run, loaded)
     playback = None if recording is None else Playback(loaded, recording)
-    serve(Session(loaded), playback, host, port)
+    with shown():
+        serve(Session(loaded), playback, host, port)

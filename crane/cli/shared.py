@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from crane.cli.waiting import shown
 from crane.common.errors import InputError, OutputError
 
 if TYPE_CHECKING:
@@ -162,7 +163,8 @@ def progress_bar(what: str) -> Iterator[Callable[[float], None]]:
     from rich.progress import Progress
 
     console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+    off = not console.is_terminal
+    with shown(), Progress(console=console, transient=True, disable=off) as bar:
         job = bar.add_task("compiling the machine's formulas", total=1.0)
 
         def report(share: float) -> None:
@@ -180,7 +182,7 @@ def status(what: str) -> Iterator[None]:
     if not console.is_terminal:
         yield
         return
-    with console.status(what):
+    with shown(), console.status(what):
         yield
 
 

@@ -27,8 +27,8 @@ _STEP = 1.0  # [rad], or share of the machine's size: of an iteration at most
 _HALVINGS = 12
 _DAMPING = 1e-3
 _SLOW, _PATIENCE = 0.99, 6  # ratio of residuals that is no progress, and how often it is borne
-_STARTS, _MORE = 24, 5  # until one closes, and from then on
-_WORK = 2000  # starts times joints at most
+_STARTS, _MORE = 24, (5, 24)  # until one closes, and at least and at most from then on
+_WORK, _SPARE = 2000, 120  # starts times joints at most: in all, and after one closes
 _RADII = (0.3, 1.0, 2.0, np.pi)  # of the starts [rad], or shares of the machine's size
 _SAME = 1e-3  # difference of postures that is none, likewise
 
@@ -113,12 +113,15 @@ class Search:
         equations: The loops.
         guess: (nq,) what is said of the posture.
         said: Columns for which it is the file that says so.
-        more: Starts from the first closed posture on.
+        more: Starts from the first closed posture on; if not given, more for smaller machines.
     """
 
-    def __init__(self, equations: LoopEquations, guess: Array, said: Indices, more: int = _MORE):
+    def __init__(
+        self, equations: LoopEquations, guess: Array, said: Indices, more: int | None = None
+    ):
         model = equations.model
-        self._residual, self._guess = Residual(equations), guess
+        more = min(max(_SPARE // max(len(guess), 1), _MORE[0]), _MORE[1]) if more is None else more
+        self._residual, self.guess = Residual(equations), guess
         self._unit, self._turns = units(model), ~slides(model)
         self._lower, self._upper = equations.coordinates.lower, equations.coordinates.upper
         self._said, self._more = said, more
@@ -129,7 +132,8 @@ class Search:
     def postures(self, free: Indices, beyond: Indices, enough: float) -> list[Array]:
         """Closed postures, the nearest to the guess first.
 
-        Nearest at what is said, then at all joints, where the farthest is [rad], [machine's size].
+        Nearest where the farthest of the joints that are said is nearest [rad], [machine's size];
+        if that is equal, by their sum of squares, then by all joints.
 
         Args:
             free: Columns of the joints that may move.
@@ -137,7 +141,7 @@ class Search:
             enough: Residual that counts as closed.
         """
         found: list[Array] = []
-        most = max(2, _WORK // len(self._guess))
+        most = max(2, _WORK // len(self.guess))
         last = min(_STARTS, most)
         for count, start in enumerate(self._starts(free)):
             if count >= last:
@@ -149,7 +153,7 @@ class Search:
                 last = min(most, count + 1 + self._more)
             if all(self.apart(q, other).max() > _SAME for other in found):
                 found.append(q)
-        return sorted(found, key=self._away)
+        return sorted(found, key=self.away)
 
     def _within(self, start: Array, free: Indices, beyond: Indices, enough: float) -> Array | None:
         """Along the limits from one start; else across them, where whole turns lead back."""
@@ -163,13 +167,26 @@ class Search:
                 return None
         return None
 
-    def _away(self, q: Array) -> tuple[float, float]:
-        apart = self.apart(q, self._guess)
-        return round(float(apart[self._said].max(initial=0.0)), 3), float(apart.max(initial=0.0))
+    def away(self, q: Array) -> tuple[float, float, float]:
+        """How far a posture is from the guess: what is said, its sum of squares, all joints."""
+        apart = self.apart(q, self.guess)
+        said = apart[self._said]
+        return (
+            round(float(said.max(initial=0.0)), 3),
+            round(float(np.linalg.norm(said)), 3),
+            float(apart.max(initial=0.0)),
+        )
+
+    def off_said(self, q: Array) -> tuple[int, float]:
+        """The joint that is farthest from what is said, and by how much [rad], [machine's size]."""
+        if not len(self._said):
+            return 0, 0.0
+        apart = self.apart(q, self.guess)[self._said]
+        return int(self._said[apart.argmax()]), float(apart.max())
 
     def farthest(self, q: Array) -> tuple[int, float]:
         """The joint that is farthest from the guess, and by how much [m], [rad]."""
-        apart = self.apart(q, self._guess)
+        apart = self.apart(q, self.guess)
         return int(apart.argmax()), float((apart * self._unit)[apart.argmax()])
 
     def apart(self, one: Array, two: Array) -> Array:
@@ -182,14 +199,14 @@ class Search:
 
         Multiples of the powers of 1 / phi, phi^(k + 1) = phi + 1 for k unknowns (Roberts 2018).
         """
-        yield self._guess.copy()
+        yield self.guess.copy()
         phi = 2.0
         for _ in range(40):
             phi = (1 + phi) ** (1 / (len(free) + 1))
         steps = phi ** -np.arange(1.0, len(free) + 1)
         for count in itertools.count(1):
             share = 2 * np.remainder(0.5 + count * steps, 1.0) - 1
-            start = self._guess.copy()
+            start = self.guess.copy()
             start[free] += _RADII[count % len(_RADII)] * self._unit[free] * share
             yield start
 
@@ -229,7 +246,7 @@ class Search:
             slow += int(gap @ gap > _SLOW * cost)
         winds = self._winds.copy()
         winds[np.setdiff1d(np.arange(len(q)), free)] = False
-        q = unwound(q, self._guess, winds, self._lower, self._upper)
+        q = unwound(q, self.guess, winds, self._lower, self._upper)
         return q, float(np.abs(gap).max(initial=0.0))
 
     @staticmethod

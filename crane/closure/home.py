@@ -7,8 +7,9 @@ Where the loops do not close from the guess, they are closed from anywhere
 2. with active joints free, too, whose home the file does not say, within their limits;
 3. the same two with passive joints beyond their limits.
 
-So are they where home as it closes from the guess is outside of limits, which is kept where there
-is no other, or where the active joints are too few or too many where it closes.
+So are they where the active joints are too few or too many where it closes, and where home as it
+closes from the guess is outside of limits or more than 0.5 rad (or of the machine's size) from what
+the file says. Then home is kept where none that is found is nearer, and told in any case.
 
 The first of these that closes counts, and of the postures that it finds the one that is nearest to
 the guess, see `Search.postures`.
@@ -27,6 +28,7 @@ from crane.common.errors import MechanismError
 from crane.common.samples import Array
 
 _TRIED = 4  # of the postures that are found
+_FAR = 0.5  # [rad], or share of the machine's size: a home that is farther off is doubted
 
 
 @dataclass(frozen=True)
@@ -68,34 +70,61 @@ def settle(
     Raises:
         MechanismError: There is no home posture, or see `analyse`.
     """
-    outside: Structure | None = None
-    refused: MechanismError
+    search = Search(equations, guess, np.array(sorted(said or ()), dtype=np.intp))
+    first: Structure | None = None
     try:
-        structure = _analysed(equations, active, passive, guess)
-        limited = _beyond(equations, structure.home, passive)
-        if said is None or limited is None:
-            return structure, None
-        outside, reason = structure, f"{limited} closes outside of its limits"
+        first = _analysed(equations, active, passive, guess)
     except HomeError as error:
-        refused, reason = error, error.reason
+        refused: MechanismError = error
+        reason = error.reason
     except ActiveError as error:  # or it is where the linkage collapses
         refused, reason = error, "the joints have other freedoms where it closes"
         if not len(active) or Exact(equations).is_closed(guess):
             raise
-    if said is None:
+    if first is not None:
+        reason = _doubt(search, equations, passive, first.home)
+        if said is None or not reason:
+            return first, None
+    elif said is None:
         raise refused
-    search = Search(equations, guess, np.array(sorted(said), dtype=np.intp))
-    for found in _found(search, equations, active, passive, said, loose, outside is None):
+    for found in _found(search, equations, active, passive, said, loose, first is None):
+        if first is not None:
+            found = _nearer(search, equations, passive, found, first.home)
         usable = _usable(equations, active, passive, found[:_TRIED])
         if isinstance(usable, Structure):
-            home = usable.home
-            moved = np.flatnonzero(search.apart(home, guess) > CLOSED)
-            return usable, Sought(reason, len(found), moved, search.farthest(home))
-        if usable is not None and outside is None:
+            return usable, _sought(search, reason, len(found), usable.home)
+        if usable is not None and first is None:
             raise refused if isinstance(refused, ActiveError) else usable
-    if outside is not None:
-        return outside, None
-    raise refused
+    if first is None:
+        raise refused
+    return first, _sought(search, reason, 1, first.home)
+
+
+def _doubt(search: Search, equations: LoopEquations, passive: Indices, home: Array) -> str:
+    """What speaks against home as it closes from the guess, nothing where all is well."""
+    names, coordinates = equations.coordinates.names, equations.coordinates
+    out = (home < coordinates.lower - CLOSED) | (home > coordinates.upper + CLOSED)
+    columns = passive[out[passive]]
+    if len(columns):
+        return f"{names[int(columns[0])]} closes outside of its limits"
+    joint, off = search.off_said(home)
+    return f"{names[joint]} closes far off" if off > _FAR else ""
+
+
+def _nearer(
+    search: Search, equations: LoopEquations, passive: Indices, found: list[Array], home: Array
+) -> list[Array]:
+    """Of some postures those that are nearer to what is said than home is, if it is in limits."""
+    coordinates = equations.coordinates
+    kept = (home >= coordinates.lower - CLOSED) & (home <= coordinates.upper + CLOSED)
+    if not kept[passive].all():
+        return found
+    return [q for q in found if search.away(q)[:2] < search.away(home)[:2]]
+
+
+def _sought(search: Search, reason: str, count: int, home: Array) -> Sought:
+    moved = np.flatnonzero(search.apart(home, search.guess) > CLOSED)
+    return Sought(reason, count, moved, search.farthest(home))
 
 
 def _usable(
