@@ -122,10 +122,7 @@ def add_cylinder(
     if not name or name != name.strip() or not name.isprintable():
         raise InputError(f"the cylinder's name is {name!r}, give a word")
     loaded = load(machine)
-    file = Path(f"{file_name(f'{loaded.name}_{name}')}.yaml" if out is None else out)
-    if file.suffix.lower() not in (".yaml", ".yml"):
-        raise InputError(f"{file}: a machine file is written, let its name end in .yaml")
-    check_file(file)
+    file = machine_file(out, f"{file_name(f'{loaded.name}_{name}')}.yaml")
     eyes = [eye_of(loaded, text) for text in between]
     draft = Draft(loaded, file.stem)
     _check_names(loaded, name)
@@ -144,10 +141,7 @@ def add_cylinder(
         notes.append(f"home: {span.joint} at {span.values[start]:.4g}, where the cylinder fits")
     notes += _assembled(draft, loaded, name, eyes, steel, span.q[start])
     _drive(draft, loaded, name, None if shares else span.joint)
-    for other in draft.files(file.name):
-        if (file.parent / other).exists() and not force:
-            place = file.parent / other
-            raise OutputError(f"{place}: exists already, choose another name or add --force")
+    check_free(draft, file, force)
     with staging(file.parent) as part:
         draft.write(part, file.name)
         with warnings.catch_warnings():
