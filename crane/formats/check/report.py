@@ -162,7 +162,7 @@ def check(
         summary = _summary(spec, closure)
     ordered = sorted(set(findings), key=lambda x: (x.file, x.line, not x.error, x.what))
     full = found.full or len(ordered) > _MOST
-    open_loops = ()
+    open_loops: tuple[Proposal, ...] = ()
     if spec is not None and closure is not None:
         open_loops = proposals(spec, closure.model, closure.home)
     what_next = _next(name, spec, closure, summary, bool(open_loops))
