@@ -8,8 +8,8 @@ from typing import Any
 from crane.common.errors import CraneError, CraneWarning, InputError, MechanismError
 from crane.common.output import file_name, staging
 from crane.description import MachineSpec
+from crane.formats.adding.open_loops import Proposal, proposals
 from crane.formats.adding.place import check_free, machine_file
-from crane.formats.adding.proposals import Proposal, proposals
 from crane.formats.loading import load
 from crane.formats.machine_file.read import read
 from crane.formats.machine_file.write import Draft

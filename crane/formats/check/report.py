@@ -15,7 +15,7 @@ from crane.description import MachineSpec, driven
 from crane.description.findings import Findings, collecting, recoverable
 from crane.description.floating import floated
 from crane.description.sources import find
-from crane.formats.adding.proposals import Proposal, proposals
+from crane.formats.adding.open_loops import Proposal, proposals
 from crane.formats.check.mechanism import check_mechanism
 from crane.formats.check.plausible import implausible
 from crane.formats.machine_file.read import read
