@@ -88,7 +88,8 @@ __all__ = [
     "Payload", "Recording", "Sampled", "Signals", "Study", "TipVelocity", "Trajectory",
     "ValveDrive", "ValvePD", "Workspace", "add_cylinder", "add_loops", "check", "excite",
     "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
-    "identify_valve", "joystick", "load", "point_to_point", "polynomial", "read_measured", "replay", "report",
+    "identify_valve", "joystick", "load", "point_to_point", "polynomial",
+    "read_measured", "replay", "report",
     "simulate", "simulate_batch", "sketch", "study", "task_trajectory", "tip_trajectory",
     "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip

@@ -10,7 +10,7 @@ import numpy as np
 from crane.common.errors import CraneWarning, InputError
 from crane.common.output import file_name, staging
 from crane.formats.adding.eyes import eye_of, path_between
-from crane.formats.adding.fitting import fitted, warn_of_strokes
+from crane.formats.adding.fitting import fitted, warn_of_masses, warn_of_strokes
 from crane.formats.adding.hanging import hung
 from crane.formats.adding.place import check_free, machine_file
 from crane.formats.adding.replaced import driven_instead
@@ -134,6 +134,7 @@ def add_cylinder(
             warnings.simplefilter("ignore", CraneWarning)
             closed = load(part / file.name)  # what does not load is not left behind
         warn_of_strokes(closed, name)
+    warn_of_masses(loaded, steel, eyes)
     return _added(file, name, loaded, steel, span, reached, shares, notes)
 
 

@@ -50,6 +50,25 @@ def fitted(
     return start, reached
 
 
+def warn_of_masses(machine: Machine, steel: SteelCylinder, eyes: Sequence[Eye]) -> None:
+    """Warn of bodies that are lighter than the cylinder between them, as placeholders are."""
+    model, own = machine.model, steel.barrel.mass + steel.piston_rod.mass
+    bodies = {eye.link: model.frames[machine.frame(eye.link)].parentJoint for eye in eyes}
+    light = {
+        link: model.inertias[body].mass
+        for link, body in bodies.items()
+        if body and model.inertias[body].mass < own
+    }
+    if light:
+        told = " and ".join(f"'{link}' {mass:.3g} kg" for link, mass in light.items())
+        warnings.warn(
+            f"the cylinder weighs {own:.4g} kg, and {told}: forces are little more than its own "
+            "weight, give the bodies the masses of the real machine",
+            CraneWarning,
+            stacklevel=4,
+        )
+
+
 def warn_of_strokes(machine: Machine, name: str) -> None:
     """Warn of strokes that the linkage does not let the cylinder have."""
     if name not in machine.active:  # it shares the load: others say how far they go
