@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from crane.description import EndStop, ForceElement, Friction, GasSpring, PIGains
     from crane.dynamics import Dynamics
     from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
-    from crane.formats.adding import add_cylinder
+    from crane.formats.adding import add_cylinder, add_loops
     from crane.formats.check import check
     from crane.hydraulics import PDGains
     from crane.identification.excitation.excite import Excitation, excite
@@ -61,7 +61,7 @@ _HOMES = {
     "crane.description": "EndStop ForceElement Friction GasSpring PIGains",
     "crane.dynamics": "Dynamics",
     "crane.formats": "load write_machine write_mjcf write_urdf_plus",
-    "crane.formats.adding": "add_cylinder",
+    "crane.formats.adding": "add_cylinder add_loops",
     "crane.formats.check": "check",
     "crane.hydraulics": "PDGains",
     "crane.identification.excitation.excite": "Excitation excite",
@@ -88,9 +88,10 @@ __all__ = [
     "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation", "ForceElement", "Friction",
     "GasSpring", "Identification", "Kinematics", "Law", "Machine", "PDGains", "PIGains",
     "Payload", "Recording", "Sampled", "Signals", "Study", "TipVelocity", "Trajectory",
-    "ValveDrive", "ValvePD", "Workspace", "add_cylinder", "check", "excite", "identify",
-    "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
-    "joystick", "load", "point_to_point", "polynomial", "read_measured", "replay", "report",
+    "ValveDrive", "ValvePD", "Workspace", "add_cylinder", "add_loops", "check", "excite",
+    "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
+    "identify_valve", "joystick", "load", "point_to_point", "polynomial",
+    "read_measured", "replay", "report",
     "simulate", "simulate_batch", "sketch", "study", "task_trajectory", "tip_trajectory",
     "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip

@@ -43,14 +43,19 @@ def test_ends_that_nothing_joins(tmp_path):
     (line,) = (str(one.message) for one in told)
     assert line.startswith(
         "bars.urdf:6: nothing closes what looks like 1 loop, closing_foot_1 and closing_foot_2 "
-        "(300 mm and 0 deg apart at zero): write loops: [{name: foot, type: revolute, "
-        "predecessor: closing_foot_1, successor: closing_foot_2}] in a machine file"
+        "(300 mm and 0 deg apart at zero): close them by crane add loops, paste what crane check "
     )
     assert line.isprintable()
     report = check(tmp_path / "bars.urdf")
     assert report.status == 1 and line.removeprefix("bars.urdf:6: ") == report.findings[0].what
     # what it says is what closes it
-    loops = yaml.safe_load(re.search(r"\[\{.*\}\]", line)[0])
+    assert report.proposed == [
+        "loops:  # proposed, nothing closes them yet",
+        "  - {name: foot, type: revolute, predecessor: closing_foot_1, successor: closing_foot_2, "
+        "axis: [0, 0, 1]}  # 300 mm apart at home",
+    ]
+    assert report.next == f"crane add loops {tmp_path / 'bars.urdf'}"
+    loops = yaml.safe_load("\n".join(report.proposed))["loops"]
     text = {
         "name": "bars", "chains": [{"name": "bars", "urdf": "bars.urdf"}], "loops": loops,
         "active": ["hip_l", "hip_r"],

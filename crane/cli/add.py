@@ -1,4 +1,4 @@
-"""Commands that complete a machine: a cylinder between two points."""
+"""Commands that complete a machine: a cylinder between two points, loops left open."""
 
 from typing import Annotated
 
@@ -39,3 +39,11 @@ def cylinder(
             name=name, dead_length=dead_length, out=out, force=force,
         )
     )  # fmt: skip
+
+
+@add.command()
+def loops(machine: MachineName, out: OutFile = None, force: Force = False) -> None:
+    """Close the loops that `crane check` proposes, and write the closed machine."""
+    from crane.formats.adding import add_loops
+
+    print(add_loops(machine, out=out, force=force))

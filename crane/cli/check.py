@@ -48,5 +48,7 @@ def check(
         print(report.summary)
     if report.findings:
         print(report.counts)
+    for line in report.proposed:
+        print(line)
     print(f"next: {report.next}")
     raise typer.Exit(report.status)

@@ -16,6 +16,7 @@ from crane.description import MachineSpec, driven
 from crane.description.findings import Findings, collecting, recoverable
 from crane.description.floating import floated
 from crane.description.sources import find
+from crane.formats.adding.open_loops import Proposal, proposals
 from crane.formats.check.mechanism import check_mechanism
 from crane.formats.check.plausible import implausible
 from crane.formats.machine_file.read import read
@@ -28,6 +29,7 @@ _PLACE = re.compile(
 )
 _MOST = 500  # findings in a report
 _SHOWN = 14  # kinds of findings on a screen
+_LOOPS = 8  # proposals on a screen
 _LINES = 6  # that have a finding of one kind
 
 
@@ -61,12 +63,24 @@ class Report:
         summary: One line on the machine, None where it cannot be loaded.
         full: Whether there was more than is listed.
         next: The command to type next.
+        proposals: Loops that the description seems to leave open.
     """
 
     findings: tuple[Finding, ...]
     summary: str | None
     full: bool
     next: str
+    proposals: tuple[Proposal, ...] = ()
+
+    @property
+    def proposed(self) -> list[str]:
+        """The proposed loops as they are pasted into a machine file."""
+        if not self.proposals:
+            return []
+        told = [f"  {proposal}" for proposal in self.proposals[:_LOOPS]]
+        more = len(self.proposals) - len(told)
+        rest = [f"  # and {more} more, all are written by crane add loops"] * bool(more)
+        return ["loops:  # proposed, nothing closes them yet", *told, *rest]
 
     @property
     def lines(self) -> list[str]:
@@ -163,7 +177,11 @@ def _check(
         summary = _summary(spec, closure)
     ordered = sorted(set(findings), key=lambda x: (x.file, x.line, not x.error, x.what))
     full = found.full or len(ordered) > _MOST
-    return Report(tuple(ordered[:_MOST]), summary, full, _next(name, spec, closure, summary))
+    open_loops: tuple[Proposal, ...] = ()
+    if spec is not None and closure is not None:
+        open_loops = proposals(spec, closure.model, closure.home)
+    what_next = _next(name, spec, closure, summary, bool(open_loops))
+    return Report(tuple(ordered[:_MOST]), summary, full, what_next, open_loops)
 
 
 def _together(alike: list[Finding]) -> str:
@@ -177,12 +195,18 @@ def _together(alike: list[Finding]) -> str:
 
 
 def _next(
-    name: str | Path, spec: MachineSpec | None, closure: Closure | None, summary: str | None
+    name: str | Path,
+    spec: MachineSpec | None,
+    closure: Closure | None,
+    summary: str | None,
+    is_open: bool,
 ) -> str:
     """What to type next."""
     called = shlex.quote(str(name))
     if spec is None or closure is None or summary is None:
         return f"crane check {called} again, once the errors are mended"
+    if is_open:
+        return f"crane add loops {called}"
     if closure.sought is not None:
         return f"crane check {called} --write-home"
     if not has_mass(closure.model):

@@ -42,18 +42,12 @@ def warn_of_open_loops(spec: MachineSpec) -> None:
     if not pairs:
         return
     told = [f"{one} and {two}{_gap(above, one, two)}" for _, one, two in pairs[:_SHOWN]]
-    written = [
-        f"{{name: {name}, type: revolute, predecessor: {one}, successor: {two}}}"
-        for name, one, two in pairs[:_SHOWN]
-    ]
     more = [f"{len(pairs) - _SHOWN} more"] if len(pairs) > _SHOWN else []
-    dots = ["..."] * bool(more)
     place = spec.tree.links[pairs[0][1]].where
     warnings.warn(
         f"{place}: nothing closes what looks like {len(pairs)} "
-        f"loop{'s' * (len(pairs) > 1)}, {', '.join(told + more)}: write loops: "
-        f"[{', '.join(written + dots)}] in a machine file (revolute about z of the frames, or "
-        "another type), or rename the frames",
+        f"loop{'s' * (len(pairs) > 1)}, {', '.join(told + more)}: close them by crane add loops, "
+        "paste what crane check proposes into a machine file, or rename the frames",
         CraneWarning,
         stacklevel=2,
     )

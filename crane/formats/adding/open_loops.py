@@ -21,6 +21,8 @@ from crane.description.tree import Joint, Vector
 from crane.formats.machine_file.open_loops import body_of, named_pairs
 
 _NEAR = 0.05  # share of the machine's size within which two ends meet
+_MEETING = 0.01  # the same where no plane tells that they belong together
+_AWAY = 1e-6  # [m] from the origin of a body from which on a frame is a place of its own
 _PARALLEL = 1e-6  # sine of an angle that counts as none
 _RING = 3  # joints of the tree below which a loop would lock what it closes
 _BARREL = re.compile(r"barrel|tube|housing|cylinder|cyl", re.IGNORECASE)
@@ -126,12 +128,15 @@ class _Search:
 
     def _meeting(self) -> Iterator[Proposal]:
         """Ends of two bodies that meet at home, or by what the slides above them may do."""
-        ends = set(self._ends()) - {self.spec.tip}
         for one, two in combinations(self._frames(), 2):
-            if not ends & {one, two} or self._gap(one, two) > _NEAR * self.size:
+            if self.below.get(one) and self.below.get(two):
                 continue
-            if len(self._ring(one, two)) >= _RING:
-                kind, axis = self._type(one, two)
+            gap = self._gap(one, two)
+            if gap > _NEAR * self.size or len(self._ring(one, two)) < _RING:
+                continue
+            kind, axis = self._type(one, two)
+            beside = gap <= _MEETING * self.size and self._is_beside(one) and self._is_beside(two)
+            if kind != "spherical" or beside:
                 yield self._proposal(two, kind, (one, two), axis, by_name=False)
 
     def _ends(self) -> list[str]:
@@ -139,23 +144,30 @@ class _Search:
         return [link for link in self.spec.tree.links if not self.below.get(link)]
 
     def _frames(self) -> list[str]:
-        """Ends, and frames without mass that are fixed to a body, a pin's say."""
-        return [
-            link.name
-            for link in self.spec.tree.links.values()
-            if link.name not in (self.spec.tip, self.spec.tree.root)
-            and (
-                not self.below.get(link.name)
-                or (link.inertial is None and not self.above[link.name].moves)
-            )
-        ]
+        """Frames without mass, and what slides at an end."""
+        return [link for link in self.spec.tree.links if self._is_frame(link)]
+
+    def _is_frame(self, link: str) -> bool:
+        if link in (self.spec.tip, self.spec.tree.root):
+            return False
+        if self.above[link].moves:
+            return self.above[link].kind == "prismatic" and not self.below.get(link)
+        return self.spec.tree.links[link].inertial is None
+
+    def _is_beside(self, link: str) -> bool:
+        """Whether a frame is not just the origin of its body."""
+        away = self.places[link].translation - self.places[self._body(link)].translation
+        return bool(np.abs(away).max() > _AWAY)
+
+    def _body(self, link: str) -> str:
+        return body_of(self.above, link)
 
     def _is_hung(self, link: str) -> bool:
-        body = body_of(self.above, link)
+        body = self._body(link)
         return body in self.above and self.above[body].kind == "revolute"
 
     def _bodies(self, pair: Sequence[str]) -> frozenset[str]:
-        return frozenset(body_of(self.above, link) for link in pair)
+        return frozenset(self._body(link) for link in pair)
 
     def _ring(self, one: str, two: str) -> list[Joint]:
         """Moving joints of the tree between two links."""
@@ -173,7 +185,7 @@ class _Search:
         way = self.places[two].translation - self.places[one].translation
         gaps = [float(np.linalg.norm(way))]
         for link, sign in ((one, 1.0), (two, -1.0)):
-            joint = self.above.get(body_of(self.above, link))
+            joint = self.above.get(self._body(link))
             if joint is not None and joint.kind == "prismatic":
                 axis = sign * self._axis(joint)
                 reach = joint.limits.upper - joint.limits.lower

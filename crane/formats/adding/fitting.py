@@ -1,0 +1,102 @@
+"""Which part of a joint's range and of its own stroke a cylinder can be used over."""
+
+import warnings
+from collections.abc import Sequence
+
+from crane.common.errors import CraneError, CraneWarning, InputError
+from crane.formats.adding.eyes import Eye
+from crane.formats.adding.span import Span
+from crane.formats.adding.steel import SteelCylinder
+from crane.machine import Machine
+
+_RESOLVED = 1e-4  # of the stroke, to which its reachable part is told
+
+
+def fitted(
+    span: Span, steel: SteelCylinder, eyes: Sequence[Eye], machine: Machine
+) -> tuple[int, range]:
+    """Index of the home posture and range of those reached, told where that is not all.
+
+    Raises:
+        InputError: There are none.
+    """
+    ends = steel.retracted, steel.retracted + steel.stroke
+    lengths = f"{span.length.min():.4g} to {span.length.max():.4g} m"
+    unit = machine.unit(span.joint)
+    values = f"{span.values[0]:.4g} to {span.values[-1]:.4g} {unit}"
+    found = span.driven(*ends)
+    if found is None:
+        fits = (span.length >= ends[0]) & (span.length <= ends[1])
+        idle = "with a lever arm " if fits.any() else ""
+        raise InputError(
+            f"a cylinder of {ends[0]:.4g} to {ends[1]:.4g} m does not fit {idle}between "
+            f"'{eyes[0]}' and '{eyes[1]}', {lengths} apart with {span.joint} at {values}: choose "
+            "another stroke, dead length or eyes"
+        )
+    start, reached = found
+    if len(reached) < len(span.values):
+        a, b = span.values[reached[0]], span.values[reached[-1]]
+        inside = (span.length >= ends[0]) & (span.length <= ends[1])
+        beyond = [k for k in (reached[0] - 1, reached[-1] + 1) if 0 <= k < len(inside)]
+        dead = [f"{span.values[k]:.4g}" for k in beyond if inside[k]]
+        what = f", with a dead centre at {' and '.join(dead)}" if dead else ""
+        warnings.warn(
+            f"'{span.joint}' moves from {values}, and a cylinder of {ends[0]:.4g} to "
+            f"{ends[1]:.4g} m drives it from {a:.4g} to {b:.4g}{what}: its eyes are {lengths} "
+            "apart over all of it, choose stroke, dead length or eyes by that",
+            CraneWarning,
+            stacklevel=4,
+        )
+    return start, reached
+
+
+def warn_of_masses(machine: Machine, steel: SteelCylinder, eyes: Sequence[Eye]) -> None:
+    """Warn of bodies that are lighter than the cylinder between them, as placeholders are."""
+    model, own = machine.model, steel.barrel.mass + steel.piston_rod.mass
+    bodies = {eye.link: model.frames[machine.frame(eye.link)].parentJoint for eye in eyes}
+    light = {
+        link: model.inertias[body].mass
+        for link, body in bodies.items()
+        if body and model.inertias[body].mass < own
+    }
+    if light:
+        told = " and ".join(f"'{link}' {mass:.3g} kg" for link, mass in light.items())
+        warnings.warn(
+            f"the cylinder weighs {own:.4g} kg, and {told}: forces are little more than its own "
+            "weight, give the bodies the masses of the real machine",
+            CraneWarning,
+            stacklevel=4,
+        )
+
+
+def warn_of_strokes(machine: Machine, name: str) -> None:
+    """Warn of strokes that the linkage does not let the cylinder have."""
+    if name not in machine.active:  # it shares the load: others say how far they go
+        return
+    index, home = machine.active.index(name), machine.home[machine.closure.active]
+
+    def closes(stroke: float) -> bool:
+        target = home.copy()
+        target[index] = stroke
+        try:
+            machine.closure.solve(target)
+        except CraneError:
+            return False
+        return True
+
+    lost = []
+    for end in (float(machine.lower[index]), float(machine.upper[index])):
+        good, bad = float(home[index]), end
+        if closes(end):
+            continue
+        while abs(bad - good) > _RESOLVED * machine.upper[index]:
+            middle = (good + bad) / 2
+            good, bad = (middle, bad) if closes(middle) else (good, middle)
+        lost.append(f"{min(good, end):.4g} to {max(good, end):.4g} m")
+    if lost:
+        warnings.warn(
+            f"the linkage does not close at {' and '.join(lost)} of the stroke of '{name}', "
+            "beyond its dead centre: choose another stroke, dead length or eyes",
+            CraneWarning,
+            stacklevel=4,
+        )
