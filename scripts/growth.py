@@ -29,7 +29,12 @@ def draw(results: list[dict], path: Path) -> None:
         _lines(right, results, STARTS, 1.0)
         left.set(ylabel="CPU time [us]", title="A call of forward dynamics")
         right.set(ylabel="CPU time [s]", title="Tracing and compiling")
-        right.plot([100], [10.0], "k_", [100], [0.1], "k_", ms=14)
+        for goal in (10.0, 0.1):
+            right.plot([100], [goal], "_", color=INK, ms=14)
+            right.annotate(
+                f"goal, {goal:g} s", (100, goal), (0, -9), textcoords="offset points", ha="center",
+                color=INK, fontsize=7,
+            )  # fmt: skip
         for axes in (left, right):
             axes.set(xlabel="joints", xscale="log", yscale="log")
             ticks = [4, 10, 20, 30, 60, 100, 200]
@@ -40,15 +45,22 @@ def draw(results: list[dict], path: Path) -> None:
 
 
 def _lines(axes: Axes, results: list[dict], kinds: dict[str, tuple[str, str]], by: float) -> None:
+    first = next(iter(kinds))
     for family, colour in COLOURS.items():
         own = [found for found in results if found["family"] == family and "kept" in found]
         joints = [found["joints"] for found in own]
         for name, (_, style) in kinds.items():
             axes.plot(joints, [by * found[name] for found in own], style, color=colour, ms=4)
+        left = [found for found in own if found["backend"] != "compiled"]
+        points = [found["joints"] for found in left], [by * found[first] for found in left]
+        axes.plot(*points, "o", mfc="white", color=colour, ms=4)
     handles = [Line2D([], [], color=colour, label=family) for family, colour in COLOURS.items()]
     handles += [
         Line2D([], [], color=INK, marker=style[0] if style[0] in "o^" else "",
                ls=style.lstrip("o^"), ms=4, label=label)
         for label, style in kinds.values()
     ]  # fmt: skip
+    if any(found.get("backend") == "pinocchio" for found in results):
+        handles.append(Line2D([], [], color=INK, marker="o", mfc="white", ls="", ms=4,
+                              label="not compiled"))  # fmt: skip
     axes.legend(handles=handles, loc="upper left", fontsize=7)

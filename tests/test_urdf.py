@@ -23,8 +23,8 @@ XML = [
     ),
     case(
         "wrong root",
-        "ground.urdf:1: a URDF starts with <robot>, this file with <sdf>",
-        whole('<sdf version="1.7"/>', GROUND),
+        "ground.urdf:1: a URDF starts with <robot>, this file with <world>",
+        whole("<world/>", GROUND),
     ),
     case(
         "no links",

@@ -4,7 +4,17 @@ from typing import Annotated
 
 import typer
 
-from crane.cli.shared import Active, Floating, Free, MachineName, app, names
+from crane.cli.shared import (
+    Active,
+    Argument,
+    Floating,
+    Free,
+    MachineName,
+    Packages,
+    app,
+    arguments,
+    names,
+)
 
 
 @app.command()
@@ -19,17 +29,19 @@ def check(
     active: Active = None,
     free: Free = None,
     floating: Floating = False,
+    packages: Packages = None,
+    argument: Argument = None,
 ) -> None:
     """Say all that is wrong with a machine; exit status 0, 1 with warnings only, 2 with errors."""
     from crane.formats.check import check as check_machine
 
-    driven = names(active), names(free), floating
-    report = check_machine(file, *driven)
+    driven, found = (names(active), names(free)), (packages or (), arguments(argument))
+    report = check_machine(file, *driven, floating, *found)
     if write_home and not report.errors:
         from crane.formats import write_home as write
 
-        print(f"home written to {write(file, *driven[:2])}")
-        report = check_machine(file, *driven)
+        print(f"home written to {write(file, *driven, *found)}")
+        report = check_machine(file, *driven, floating, *found)
     for line in report.lines:
         print(line)
     if report.summary is not None:

@@ -8,6 +8,7 @@ import typer
 
 from crane.cli.shared import (
     Active,
+    Argument,
     Floating,
     Force,
     Free,
@@ -15,11 +16,14 @@ from crane.cli.shared import (
     NoOpen,
     Out,
     OutFile,
+    Packages,
     app,
+    arguments,
     load,
     progress_bar,
 )
 from crane.common.errors import InputError
+from crane.description.sources import FOLDERS
 
 if TYPE_CHECKING:
     from crane.machine import Machine
@@ -54,18 +58,23 @@ def info(
     active: Active = None,
     free: Free = None,
     floating: Floating = False,
+    packages: Packages = None,
+    argument: Argument = None,
 ) -> None:
     """Show what a machine consists of."""
     if parameters:
+        from crane.common.packages import giving, package_folders
         from crane.description import parameters as parameters_of
         from crane.formats import read
 
-        values = parameters_of(read(machine))
+        with giving(package_folders(packages or ()), arguments(argument)):
+            values = parameters_of(read(machine))
         width = max(map(len, values), default=0)
         for name, value in values.items():
             print(f"{name:{width}}  {value:.6g}")
         return
-    for line in _describe(load(machine, active=active, free=free, floating=floating)):
+    loaded = load(machine, None, None, active, free, floating, packages, argument)
+    for line in _describe(loaded):
         print(line)
 
 
@@ -89,7 +98,7 @@ def view(
     from crane.view.page.build import open_in_browser, report
 
     recording = other = None
-    if _is_run(what):
+    if is_run(what):
         path = Path(what)
         given = None if machine is None else load(machine)
         recording = read_run(path, given)
@@ -142,9 +151,9 @@ def demo(out: Out = Path("demo-output"), force: Force = False) -> None:
     print(f"figures:    {out}/*/{FIGURE}\nanimations: {out}/*/{PAGE} (open them in a browser)")
 
 
-def _is_run(what: str) -> bool:
+def is_run(what: str) -> bool:
     """Whether a run is meant and no machine."""
-    if (Path(what) / "robot.yaml").is_file():  # a machine as in example-parallel-robots
+    if any((Path(what) / name).is_file() for name in FOLDERS):  # a machine in a folder
         return False
     return Path(what).is_dir() or Path(what).suffix.lower() in (".csv", ".npz")
 

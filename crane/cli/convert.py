@@ -7,12 +7,14 @@ import typer
 
 from crane.cli.shared import (
     Active,
+    Argument,
     Change,
     Floating,
     Force,
     Free,
     Lock,
     MachineName,
+    Packages,
     _place,
     app,
     load,
@@ -41,6 +43,8 @@ def convert(
     active: Active = None,
     free: Free = None,
     floating: Floating = False,
+    packages: Packages = None,
+    argument: Argument = None,
     force: Force = False,
 ) -> None:
     """Write a machine as one URDF with loops, as MJCF, or as machine file with sub-chains."""
@@ -56,7 +60,7 @@ def convert(
         check_folder(out, force)
     else:
         check_free(out, force)
-    loaded = load(machine, lock, change, active, free, floating)
+    loaded = load(machine, lock, change, active, free, floating, packages, argument)
     if kind == "machine":
         written = write_machine(loaded, out)
     else:

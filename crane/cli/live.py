@@ -5,7 +5,17 @@ from typing import Annotated
 
 import typer
 
-from crane.cli.shared import Active, Change, Floating, Free, Lock, app, load
+from crane.cli.shared import (
+    Active,
+    Argument,
+    Change,
+    Floating,
+    Free,
+    Lock,
+    Packages,
+    app,
+    load,
+)
 from crane.common.errors import InputError
 
 
@@ -33,18 +43,21 @@ def live(
     active: Active = None,
     free: Free = None,
     floating: Floating = False,
+    packages: Packages = None,
+    argument: Argument = None,
 ) -> None:
     """Move a machine with sliders in a browser, its loops closed at every move."""
+    from crane.cli.commands import is_run
     from crane.cli.runs import machine_of, read_run
     from crane.view.live.playback import Playback
     from crane.view.live.serve import serve
     from crane.view.live.session import Session
 
     recording = None
-    if Path(what).is_dir() or Path(what).suffix.lower() in (".csv", ".npz"):
+    if is_run(what):
         if run is not None:
             raise InputError(f"'{what}' is a run already, leave --run out")
-        if change or lock or active or free or floating:
+        if change or lock or active or free or floating or packages or argument:
             raise InputError(
                 "--set, --lock, --active and --free are for machines, name the run with --run"
             )
@@ -54,7 +67,7 @@ def live(
     elif machine is not None:
         raise InputError(f"--machine is for runs, and '{what}' is none, leave it out")
     else:
-        loaded = load(what, lock, change, active, free, floating)
+        loaded = load(what, lock, change, active, free, floating, packages, argument)
         if run is not None:
             recording = read_run(run, loaded)
     playback = None if recording is None else Playback(loaded, recording)

@@ -7,6 +7,7 @@ import typer
 
 from crane.cli.shared import (
     Active,
+    Argument,
     Change,
     Floating,
     Force,
@@ -14,6 +15,7 @@ from crane.cli.shared import (
     Lock,
     MachineName,
     OutFile,
+    Packages,
     app,
     by_joint,
     load,
@@ -46,6 +48,8 @@ def sketch(
     active: Active = None,
     free: Free = None,
     floating: Floating = False,
+    packages: Packages = None,
+    argument: Argument = None,
     force: Force = False,
 ) -> None:
     """Draw the mechanism of a machine (png, svg or pdf)."""
@@ -53,7 +57,7 @@ def sketch(
     from crane.common.output import file_name
     from crane.view.sketch.draw import sketch as draw
 
-    loaded = load(machine, lock, change, active, free, floating)
+    loaded = load(machine, lock, change, active, free, floating, packages, argument)
     figure = out or Path(file_name(loaded.name) + "_sketch.png")
     check_free(figure, force)
     draw(loaded, figure, posture(loaded, at), plane, com)

@@ -31,7 +31,9 @@ def _place(text: str | Path) -> Path:
 
 MachineName = Annotated[
     str,
-    typer.Argument(metavar="MACHINE", help="A bundled name, a machine file, a URDF or a MJCF."),
+    typer.Argument(
+        metavar="MACHINE", help="A bundled name, a machine file, a URDF, an SDF or a MJCF."
+    ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite what is there.")]
 Out = Annotated[
@@ -66,6 +68,14 @@ Active = Annotated[
 Free = Annotated[
     str | None,
     typer.Option(metavar="JOINTS", help="Coordinates that nothing drives, as swing,sway."),
+]
+Packages = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="FOLDER", help="A folder of packages that files name; may be repeated."),
+]
+Argument = Annotated[
+    list[str] | None,
+    typer.Option("--arg", metavar="NAME:=VALUE", help="An argument of a xacro file."),
 ]
 Floating = Annotated[
     bool, typer.Option("--floating", help="Let the root float: a vehicle, a humanoid.")
@@ -111,13 +121,33 @@ def load(
     active: str | None = None,
     free: str | None = None,
     floating: bool = False,
+    packages: list[Path] | None = None,
+    argument: list[str] | None = None,
 ) -> "Machine":
     """The machine of that name or path with what options say of it."""
     from crane.formats import load as load_machine
 
     changes = by_joint("--set", change, "NAME=VALUE, as in payload.mass=200")
     held = by_joint("--lock", lock)
-    return load_machine(name, changes, held, names(active), names(free), floating)
+    return load_machine(
+        name, changes, held, names(active), names(free), floating, packages or (),
+        arguments(argument),
+    )  # fmt: skip
+
+
+def arguments(words: list[str] | None) -> dict[str, str]:
+    """Values by name, from NAME:=VALUE.
+
+    Raises:
+        InputError: Something else is written.
+    """
+    found = {}
+    for word in words or ():
+        name, separator, value = word.partition(":=")
+        if not separator or not name.strip():
+            raise InputError(f"--arg is '{word}', write NAME:=VALUE")
+        found[name.strip()] = value
+    return found
 
 
 def names(words: str | None) -> list[str] | None:

@@ -7,6 +7,7 @@ import typer
 
 from crane.cli.shared import (
     Active,
+    Argument,
     Change,
     Floating,
     Force,
@@ -14,6 +15,7 @@ from crane.cli.shared import (
     Lock,
     MachineName,
     Out,
+    Packages,
     app,
     load,
     progress_bar,
@@ -53,6 +55,8 @@ def simulate(
     active: Active = None,
     free: Free = None,
     floating: Floating = False,
+    packages: Packages = None,
+    argument: Argument = None,
     force: Force = False,
 ) -> None:
     """Simulate a task, measured inputs, or the motion from the home posture on its own."""
@@ -60,7 +64,7 @@ def simulate(
     from crane.simulation import simulate as run
 
     check_folder(out, force)
-    loaded = load(machine, lock, change, active, free, floating)
+    loaded = load(machine, lock, change, active, free, floating, packages, argument)
     if inputs is not None:
         named = {"--task": task, "--controller": controller}
         given = [option for option, value in named.items() if value is not None]

@@ -7,6 +7,7 @@ import typer
 
 from crane.cli.shared import (
     Active,
+    Argument,
     Change,
     Floating,
     Force,
@@ -14,6 +15,7 @@ from crane.cli.shared import (
     Lock,
     MachineName,
     Out,
+    Packages,
     app,
     load,
     status,
@@ -34,6 +36,8 @@ def workspace(
     active: Active = None,
     free: Free = None,
     floating: Floating = False,
+    packages: Packages = None,
+    argument: Argument = None,
     force: Force = False,
 ) -> None:
     """Map what the tip reaches, which strokes close, and where they are singular."""
@@ -41,7 +45,7 @@ def workspace(
     from crane.motion.workspaces import workspace as explore
 
     check_folder(out, force)
-    loaded = load(machine, lock, change, active, free, floating)
+    loaded = load(machine, lock, change, active, free, floating, packages, argument)
     with status("exploring"):
         space = explore(loaded, samples, frame, seed)
     with status("drawing"):

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from crane.closure.choice import Indices, size, slides, units
 from crane.closure.equations import LoopEquations
@@ -69,6 +70,40 @@ class Residual:
         return np.concatenate(gaps), np.vstack(slopes)
 
 
+def winding(equations: LoopEquations) -> NDArray[np.bool_]:
+    """(nv,) joints that a whole turn leaves where they are: no slides, couplings and flyers."""
+    coordinates = equations.coordinates
+    winds = ~coordinates.slides & ~(equations.factors != 0).any(axis=0)
+    for column in coordinates.floating:
+        winds[column : column + 6] = False
+    return np.asarray(winds)
+
+
+def unwound(
+    q: Array, near: Array, winds: NDArray[np.bool_], lower: Array, upper: Array
+) -> Array:
+    """The same posture with whole turns so that joints are in limits, and near another one.
+
+    Args:
+        q: (nq,).
+        near: (nq,) the other one.
+        winds: (nq,) joints that may wind, see `winding`.
+        lower: (nq,) limits.
+        upper: (nq,) likewise.
+
+    Returns:
+        (nq,), joints within half a turn of the other posture; where limits do not allow that, by
+        whole turns nearer to them, and where they allow none as it was.
+    """
+    turn = 2 * np.pi
+    turned = np.where(winds, near + np.remainder(q - near + np.pi, turn) - np.pi, q)
+    slack = 1e-12
+    turned += np.where(winds & (turned < lower), turn * np.ceil((lower - slack - turned) / turn), 0)
+    turned -= np.where(winds & (turned > upper), turn * np.ceil((turned - upper - slack) / turn), 0)
+    kept = (turned >= lower - slack) & (turned <= upper + slack)
+    return np.where(winds & kept, turned, q)
+
+
 class Search:
     """Closed postures of a machine, from anywhere.
 
@@ -85,8 +120,9 @@ class Search:
         self._unit, self._turns = units(model), ~slides(model)
         self._lower, self._upper = equations.coordinates.lower, equations.coordinates.upper
         self._said, self._more = said, more
-        coupled = (equations.factors != 0).any(axis=0)
-        self._endless = self._turns & ~coupled & np.isinf(self._upper) & np.isinf(self._lower)
+        self._rates = equations.coordinates.rates
+        self._winds = winding(equations)
+        self._endless = self._winds & np.isinf(self._upper) & np.isinf(self._lower)
 
     def postures(self, free: Indices, beyond: Indices, enough: float) -> list[Array]:
         """Closed postures, the nearest to the guess first.
@@ -104,14 +140,28 @@ class Search:
         for count, start in enumerate(self._starts(free)):
             if count >= last:
                 break
-            q, gap = self.descend(start, free, beyond)
-            if gap > enough:
+            q = self._within(start, free, beyond, enough)
+            if q is None:
                 continue
             if not found:
                 last = min(most, count + 1 + self._more)
             if all(self.apart(q, other).max() > _SAME for other in found):
                 found.append(q)
         return sorted(found, key=self._away)
+
+    def _within(
+        self, start: Array, free: Indices, beyond: Indices, enough: float
+    ) -> Array | None:
+        """Along the limits from one start; else across them, where whole turns lead back."""
+        for loose in (beyond, free):
+            q, gap = self.descend(start, free, loose)
+            held = np.setdiff1d(free, beyond)
+            kept = (q >= self._lower - _ZERO) & (q <= self._upper + _ZERO)
+            if gap <= enough and kept[held].all():
+                return q
+            if not np.isfinite([self._lower[held], self._upper[held]]).any():
+                return None
+        return None
 
     def _away(self, q: Array) -> tuple[float, float]:
         apart = self.apart(q, self._guess)
@@ -152,8 +202,7 @@ class Search:
             beyond: Columns of those that may leave their limits.
 
         Returns:
-            The posture, angles of endless joints within half a turn of the guess, and its largest
-            residual.
+            The posture, whole turns as `unwound` has them, and its largest residual.
         """
         lower, upper = self._lower.copy(), self._upper.copy()
         lower[beyond], upper[beyond] = -np.inf, np.inf
@@ -172,21 +221,22 @@ class Search:
                 break
             step = np.zeros(len(q))
             step[able] = self._step(slope[:, able] * self._unit[able], gap) * self._unit[able]
+            step = self._rates(q, step)
             moved = self._line_search(q, step, cost, lambda way: np.clip(way, lower, upper))
             if moved is None:
                 break
             q, gap, slope = moved
             slow += int(gap @ gap > _SLOW * cost)
-        ends = self._endless.copy()
-        ends[np.setdiff1d(np.arange(len(q)), free)] = False
-        off = q - self._guess
-        q[ends] = self._guess[ends] + np.remainder(off[ends] + np.pi, 2 * np.pi) - np.pi
+        winds = self._winds.copy()
+        winds[np.setdiff1d(np.arange(len(q)), free)] = False
+        q = unwound(q, self._guess, winds, self._lower, self._upper)
         return q, float(np.abs(gap).max(initial=0.0))
 
     @staticmethod
     def _step(slope: Array, gap: Array) -> Array:
         gram = slope.T @ slope
-        damping = _DAMPING * min(1.0, float(gap @ gap)) + 1e-14
+        rounding = 1e-14 + 1e-15 * float(gram.diagonal().max(initial=0.0))
+        damping = _DAMPING * min(1.0, float(gap @ gap)) + rounding
         step = np.linalg.solve(gram + damping * np.eye(len(gram)), -slope.T @ gap)
         return np.asarray(step * min(1.0, _STEP / max(np.abs(step).max(initial=0.0), 1e-300)))
 

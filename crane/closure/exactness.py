@@ -195,8 +195,9 @@ class Rounded(Exact):
 
 def least_squares_step(jacobian: Array, phi: Array) -> Array:
     """A damped Gauss-Newton step towards phi = 0, at most 0.3 [m], [rad] in any joint."""
-    damping = 1e-12 + 1e-3 * float(phi @ phi)
     gram = jacobian.T @ jacobian
+    rounding = 1e-15 * float(gram.diagonal().max(initial=0.0))
+    damping = 1e-12 + rounding + 1e-3 * float(phi @ phi)
     step = np.linalg.solve(gram + damping * np.eye(len(gram)), -jacobian.T @ phi)
     largest = float(np.abs(step).max(initial=0.0))
     return np.asarray(step * min(1.0, 0.3 / largest) if largest > 0 else step, dtype=np.float64)

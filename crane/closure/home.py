@@ -7,6 +7,9 @@ Where the loops do not close from the guess, they are closed from anywhere
 2. with active joints free, too, whose home the file does not say, within their limits;
 3. the same two with passive joints beyond their limits.
 
+So are they where home as it closes from the guess is outside of limits, which is kept where there
+is no other, or where the active joints are too few or too many where it closes.
+
 The first of these that closes counts, and of the postures that it finds the one that is nearest to
 the guess, see `Search.postures`.
 """
@@ -65,25 +68,57 @@ def settle(
     Raises:
         MechanismError: There is no home posture, or see `analyse`.
     """
+    outside: Structure | None = None
+    refused: MechanismError
     try:
-        return _analysed(equations, active, passive, guess), None
+        structure = _analysed(equations, active, passive, guess)
+        limited = _beyond(equations, structure.home, passive)
+        if said is None or limited is None:
+            return structure, None
+        outside, reason = structure, f"{limited} closes outside of its limits"
     except HomeError as error:
-        if said is None:
+        refused, reason = error, error.reason
+    except ActiveError as error:  # or it is where the linkage collapses
+        refused, reason = error, "the joints have other freedoms where it closes"
+        if not len(active) or Exact(equations).is_closed(guess):
             raise
-        refused = error
+    if said is None:
+        raise refused
     search = Search(equations, guess, np.array(sorted(said), dtype=np.intp))
-    for found in _found(search, equations, active, passive, said, loose):
-        for q in found[:_TRIED]:
-            try:
-                structure = _analysed(equations, active, passive, q)
-            except ActiveError:
-                raise
-            except MechanismError:
-                continue
-            home = structure.home
+    for found in _found(search, equations, active, passive, said, loose, outside is None):
+        usable = _usable(equations, active, passive, found[:_TRIED])
+        if isinstance(usable, Structure):
+            home = usable.home
             moved = np.flatnonzero(search.apart(home, guess) > CLOSED)
-            return structure, Sought(refused.reason, len(found), moved, search.farthest(home))
+            return usable, Sought(reason, len(found), moved, search.farthest(home))
+        if usable is not None and outside is None:
+            raise refused if isinstance(refused, ActiveError) else usable
+    if outside is not None:
+        return outside, None
     raise refused
+
+
+def _usable(
+    equations: LoopEquations, active: Indices, passive: Indices, found: list[Array]
+) -> Structure | ActiveError | None:
+    """The first of some closed postures that can be home; else why it has other freedoms."""
+    refused: ActiveError | None = None
+    for q in found:
+        try:
+            return _analysed(equations, active, passive, q)
+        except ActiveError as error:
+            refused = refused or error
+        except MechanismError:
+            continue
+    return refused
+
+
+def _beyond(equations: LoopEquations, q: Array, passive: Indices) -> str | None:
+    """A passive joint that is outside of its limits, None where all are within."""
+    coordinates = equations.coordinates
+    out = (q < coordinates.lower - CLOSED) | (q > coordinates.upper + CLOSED)
+    columns = passive[out[passive]]
+    return coordinates.names[int(columns[0])] if len(columns) else None
 
 
 def _analysed(
@@ -121,14 +156,15 @@ def _found(
     passive: Indices,
     said: Collection[int],
     loose: Collection[int],
+    farther: bool,
 ) -> Iterator[list[Array]]:
-    """Closed postures, one list for each of the steps above."""
+    """Closed postures, one list for each of the steps above; the last only where it may go on."""
     held = np.union1d(passive, np.array(list(loose), dtype=np.intp))
     every = np.union1d(held, np.setdiff1d(active, list(said)))
     ways = [held, every] if len(every) > len(held) else [held]
     limited = np.isfinite(equations.coordinates.lower[passive]).any()
     limited |= np.isfinite(equations.coordinates.upper[passive]).any()
     nothing = np.zeros(0, dtype=np.intp)
-    for beyond in (nothing, passive) if limited else (nothing,):
+    for beyond in (nothing, passive) if limited and farther else (nothing,):
         for way in ways:
             yield search.postures(way, beyond, DIGITS)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from crane.closure.anywhere import unwound, winding
 from crane.closure.blocks import Block, block_triangular
 from crane.closure.choice import Choice, proposals, words
 from crane.closure.equations import LoopEquations
@@ -187,8 +188,7 @@ def analyse(
             found,
         )
     home = exact.close(guess, passive)
-    endless = passive[np.isinf(equations.coordinates.upper[passive])]  # pins may have wound up
-    home[endless] = np.remainder(home[endless] + np.pi, 2 * np.pi) - np.pi
+    home = _unwound(equations, home, passive)
     _check_closed(
         equations,
         exact,
@@ -227,6 +227,16 @@ def analyse(
     blocks = block_triangular(incidence)
     assert blocks is not None, "independent equations have a matching"
     return Structure(home, rows, redundant, tuple(blocks), surplus)
+
+
+def _unwound(equations: LoopEquations, home: Array, passive: Indices) -> Array:
+    """Home without the whole turns that pins have wound up: in limits, else half a turn at most."""
+    coordinates = equations.coordinates
+    lower, upper = coordinates.lower, coordinates.upper
+    winds = winding(equations)
+    winds[np.setdiff1d(np.arange(len(home)), passive)] = False
+    near = np.where(np.isinf(lower) | np.isinf(upper), 0.0, home)
+    return unwound(home, near, winds, lower, upper)
 
 
 def _rank(jacobian: Array, tolerance: float = _RANK) -> int:

@@ -7,7 +7,8 @@ from pathlib import Path
 from crane.common.errors import DescriptionError, known
 
 WITH = " with "  # between a machine and the numbers of it that are changed, see `Machine.call`
-SUFFIXES = (".yaml", ".yml", ".urdf", ".xml", ".mjcf")
+FOLDERS = ("robot.yaml", "model.sdf")  # of example-parallel-robots, of Gazebo
+SUFFIXES = (".yaml", ".yml", ".urdf", ".xacro", ".sdf", ".world", ".xml", ".mjcf")
 
 
 def _models() -> Path:
@@ -56,7 +57,8 @@ def find(name: str | Path) -> Path:
 
     Args:
         name: A bundled machine, a robot of example-robot-data, or a path that ends in .yaml,
-            .yml, .urdf, .xml or .mjcf, or of a folder with a robot.yaml.
+            .yml, .urdf, .xacro, .sdf, .world, .xml or .mjcf, or of a folder with a robot.yaml or a
+            model.sdf.
 
     Raises:
         DescriptionError: There is none.
@@ -72,8 +74,9 @@ def find(name: str | Path) -> Path:
         raise DescriptionError(
             f"{path}: cannot be read ({error.strerror}), check the path"
         ) from None
-    if is_folder and (path / "robot.yaml").is_file():  # as in example-parallel-robots
-        return (path / "robot.yaml").resolve()
+    inside = [path / name for name in FOLDERS if is_folder and (path / name).is_file()]
+    if inside:
+        return inside[0].resolve()
     if path.suffix.lower() in SUFFIXES:
         if is_file:
             return path.resolve()
@@ -86,7 +89,8 @@ def find(name: str | Path) -> Path:
         return robots[text]
     if is_file or is_folder:
         raise DescriptionError(
-            f"{path}: not a machine, give a machine file (.yaml), a URDF (.urdf) or a MJCF (.xml)"
+            f"{path}: not a machine, give a machine file (.yaml), a URDF (.urdf, .xacro), an "
+            "SDF (.sdf) or a MJCF (.xml)"
         )
     hint = known([*machines, *robots], text)
     if hint.startswith("known"):

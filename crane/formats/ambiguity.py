@@ -11,7 +11,7 @@ from crane.closure.choice import slides
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
 from crane.description import MachineSpec
-from crane.formats.urdf.read import is_urdf
+from crane.formats.opening import is_robot, is_sdf
 
 _LISTED, _WRITTEN = 4, 6  # loops and coordinates in a line
 _QUICK, _THOROUGH = 6, 100  # starts of the search in one block: milliseconds, up to a second
@@ -30,8 +30,8 @@ def warn_of_assemblies(
     """
     if not len(closure.passive):
         return
-    xml = spec.path.suffix.lower() in (".xml", ".mjcf")
-    drawn = xml and not is_urdf(spec.path)  # MJCF has a value of every joint
+    # MJCF and SDF have a value of every joint
+    drawn = not _in_yaml(spec) and (is_sdf(spec.path) or not is_robot(spec.path))
     names = closure.equations.coordinates.names
     named = [i for i, name in enumerate(names) if drawn or name in spec.home]
     most = _THOROUGH if thorough else _QUICK
@@ -72,17 +72,24 @@ def _told(spec: MachineSpec, closure: Closure, other: Assembly) -> str:
 
 def _where(spec: MachineSpec) -> str:
     """Where a file says how its machine is at home."""
-    suffix = spec.path.suffix.lower()
-    if suffix == ".urdf":
-        return 'in <group_state name="home">'
-    if suffix in (".xml", ".mjcf"):
-        return "in the key 'home'"
-    return "under 'home:'"
+    if _in_yaml(spec):
+        return "under 'home:'"
+    if is_sdf(spec.path):
+        return "in <initial_position> of axes"
+    return 'in <group_state name="home">' if is_robot(spec.path) else "in the key 'home'"
+
+
+def _in_yaml(spec: MachineSpec) -> bool:
+    return spec.path.suffix.lower() in (".yaml", ".yml")
 
 
 def _values(spec: MachineSpec, names: Sequence[str], values: Array) -> str:
     """Coordinates as a file has them."""
-    pattern = '<joint name="{}" value="{:.4g}"/>' if spec.path.suffix == ".urdf" else "{}: {:.4g}"
+    pattern = (
+        '<joint name="{}" value="{:.4g}"/>'
+        if spec.path.suffix in (".urdf", ".xacro")
+        else "{}: {:.4g}"
+    )
     return ", ".join(
         pattern.format(name, value) for name, value in zip(names, values, strict=True)
     )

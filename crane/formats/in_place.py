@@ -15,7 +15,7 @@ from crane.common.errors import CraneError, CraneWarning, OutputError
 from crane.common.output import check_file, replacing
 from crane.description.sources import bundled, examples
 from crane.formats.loading import load
-from crane.formats.urdf.read import is_urdf
+from crane.formats.opening import is_robot, is_sdf
 from crane.machine import Machine
 
 Edit = tuple[int, int, str]  # from, to, what stands there then
@@ -26,7 +26,11 @@ _VALUE = re.compile(r"""(?<=\s)value\s*=\s*(?:"[^"]*"|'[^']*')""")
 
 
 def write_home(
-    name: str | Path, active: Sequence[str] | None = None, free: Sequence[str] | None = None
+    name: str | Path,
+    active: Sequence[str] | None = None,
+    free: Sequence[str] | None = None,
+    packages: Sequence[str | Path] = (),
+    arguments: Mapping[str, object] | None = None,
 ) -> Path:
     """Write the closed home posture of a machine into its file, all joints in full digits.
 
@@ -38,6 +42,8 @@ def write_home(
         name: As for `load`.
         active: As for `load`.
         free: As for `load`.
+        packages: As for `load`.
+        arguments: As for `load`.
 
     Returns:
         The file.
@@ -48,7 +54,7 @@ def write_home(
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
-        machine = load(name, active=active, free=free)
+        machine = load(name, active=active, free=free, packages=packages, arguments=arguments)
         path = machine.path.resolve()
         _check_place(machine, path)
         try:
@@ -77,15 +83,22 @@ def _check_place(machine: Machine, path: Path) -> None:
     packaged = {place.resolve() for place in (*bundled().values(), *examples().values())}
     if path in packaged:
         raise OutputError(f"{path}: belongs to a package, {elsewhere}")
-    if path.suffix.lower() in (".xml", ".mjcf") and not is_urdf(path):
-        raise OutputError(f"{path}: is a MJCF, {elsewhere}")
+    if path.suffix.lower() not in (".yaml", ".yml") and (is_sdf(path) or not is_robot(path)):
+        kind = "an SDF" if is_sdf(path) else "a MJCF"
+        raise OutputError(f"{path}: is {kind}, {elsewhere}")
     check_file(path)
 
 
 def _check(path: Path, before: Machine) -> None:
     """Load the file that was written, and compare."""
     try:
-        machine = load(path, active=before.chosen.get("active"), free=before.chosen.get("free"))
+        machine = load(
+            path,
+            active=before.chosen.get("active"),
+            free=before.chosen.get("free"),
+            packages=before.packages,
+            arguments=before.arguments,
+        )
     except CraneError as error:
         raise OutputError(f"{path}: home cannot be written into it ({error})") from None
     same = machine.joints == before.joints and machine.closure.sought is None

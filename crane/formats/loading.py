@@ -2,11 +2,13 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
 from crane.common.counted import few_warnings
 from crane.common.errors import DescriptionError, InputError
+from crane.common.packages import giving, package_folders, values_by_name
 from crane.description import changed, driven, locked
 from crane.description.floating import floated
 from crane.description.sources import WITH, find
@@ -26,12 +28,15 @@ def load(
     active: Sequence[str] | None = None,
     free: Sequence[str] | None = None,
     floating: bool = False,
+    packages: Sequence[str | Path] = (),
+    arguments: Mapping[str, object] | None = None,
 ) -> Machine:
     """Load a machine, perhaps with some of its numbers changed, or joints locked.
 
     Args:
         name: A bundled machine's name, a robot of example-robot-data by its file's name, or the
-            path of a machine file (.yaml) or URDF (.urdf, with `<loop>` elements if it has loops).
+            path of a machine file (.yaml), URDF (.urdf, .xacro, with `<loop>` elements if it has
+            loops), SDF (.sdf, .world) or MJCF (.xml).
         changes: New values by the names of `crane.description.parameters`, such as
             {"link3_G.x": 0.1, "link7.mass": 0.25, "payload.mass": 0.1}; SI units.
         lock: Coordinates [m], [rad] of joints to be fixed, by name.
@@ -41,6 +46,9 @@ def load(
             leave open is free anyway, with a warning.
         floating: Whether the root floats instead of standing on the ground: a vehicle, a humanoid.
             Its six freedoms, base_x to base_rz, are free, see `crane.description.floating`.
+        packages: Folders of the packages that files name by `package://`, `model://` and
+            `$(find ...)`, or folders in which these are, see `crane.common.packages`.
+        arguments: Values of the arguments of a xacro file; `model` of an SDF with several models.
 
     Returns:
         The machine, its home posture closed.
@@ -50,8 +58,10 @@ def load(
         MechanismError: The parts do not make a machine that can be driven.
         InputError: A change of a parameter that is not there, or to what cannot be.
     """
-    with few_warnings():
-        return _load(name, changes, lock, active, free, floating)
+    folders, values = package_folders(packages), values_by_name(arguments)
+    with few_warnings(), giving(folders, values, floating) as said:
+        machine = _load(name, changes, lock, active, free, floating)
+        return replace(machine, packages=said.packages, arguments=MappingProxyType(said.arguments))
 
 
 def _load(
@@ -102,6 +112,8 @@ def _load(
             {key: tuple(names) for key, names in said.items() if names is not None}
         ),
         floats=floating,
+        packages=(),
+        arguments=MappingProxyType({}),
         changes=MappingProxyType({name: float(value) for name, value in (changes or {}).items()}),
         free=free_joints(spec, closure.active_names),
         motors=motors(spec, closure.active_names),
@@ -142,9 +154,11 @@ def recalled(call: str) -> Machine:
             for kind in ("active", "free")
         )
         floating = given.pop("floating", False) is True
+        packages = [str(folder) for folder in given.pop("packages", [])]
+        arguments = {key: str(value) for key, value in given.pop("arguments", {}).items()}
     except (ValueError, TypeError, AttributeError, RecursionError):
         given = {"": None}
     if given:
         example = '{"changes": {"payload.mass": 200}, "lock": {"slew": 0}}'
         raise InputError(f"'{call}' names no machine, write NAME{WITH}{example}")
-    return load(name, changes, lock, active, free, floating)
+    return load(name, changes, lock, active, free, floating, packages, arguments)

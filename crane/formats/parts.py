@@ -13,6 +13,7 @@ from lxml import etree
 from crane.common.errors import CraneWarning
 from crane.description import Coupling
 from crane.description.tree import NO_LIMIT, Joint, Limits, Link, Tree
+from crane.formats.opening import robots
 from crane.formats.visuals.meshes import mesh_file
 from crane.machine import Machine
 
@@ -95,16 +96,10 @@ def draw(robot: etree._Element, machine: Machine, chains: Iterable[str] | None =
     """Copy what a machine's URDFs draw to the links of the same names."""
     links = {link.get("name"): link for link in robot.iterfind("link")}
     materials: dict[str, etree._Element] = {}
-    for chain in machine.chains:
-        if chain.urdf.suffix.lower() != ".urdf" or (chains and chain.name not in chains):
-            continue
-        source = etree.parse(
-            str(chain.urdf),
-            etree.XMLParser(resolve_entities=False, no_network=True, remove_comments=True),
-        ).getroot()
-        for material in source.iterfind("material"):
+    for xml in robots(machine, chains):
+        for material in xml.root.iterfind("material"):
             materials.setdefault(material.get("name", ""), copy.deepcopy(material))
-        _copy_shapes(source, links, chain.urdf.parent)
+        _copy_shapes(xml.root, links, xml.file.parent)
     for material in reversed(materials.values()):
         robot.insert(0, material)
 

@@ -1,7 +1,7 @@
 """Strict reading of XML: nothing is expanded or fetched, every error has its line."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -13,7 +13,31 @@ from crane.description.spec import unit_vector
 from crane.description.tree import Placement, Vector
 
 _X = (1.0, 0.0, 0.0)
+_LINES = 1 << 16
+_LONG = 60  # characters of a value in an error
 _SEVERAL = {"link", "joint", "loop", "visual", "collision"}  # elements that there may be more of
+
+
+class Places:
+    """Where elements were written that come from several files.
+
+    Args:
+        file: Name of the file for all that has no place of its own.
+
+    Attributes:
+        listed: Files and lines.
+    """
+
+    def __init__(self, file: str):
+        self.listed = [file]
+        self._numbers = {file: 0}
+
+    def put(self, element: etree._Element, place: str) -> None:
+        """Say where an element was written."""
+        number = self._numbers.setdefault(place, len(self.listed))
+        if number == len(self.listed):
+            self.listed.append(place)
+        element.sourceline = number if number < _LINES else 0  # all that the parser holds
 
 
 class XmlFile:
@@ -26,6 +50,8 @@ class XmlFile:
         file: The file.
         root: Its root element, without comments.
         nameless: Kinds of elements of which one has no name of its own.
+        places: Where elements were written, if they come from several files: `sourceline` of an
+            element is a number in this list then.
 
     Raises:
         DescriptionError: The file cannot be read, is not XML, or has a document type.
@@ -34,6 +60,7 @@ class XmlFile:
     def __init__(self, file: Path):
         self.file = file
         self.nameless: set[str] = set()
+        self.places: Sequence[str] = ()
         try:
             data = file.read_bytes()
         except OSError as error:
@@ -64,8 +91,18 @@ class XmlFile:
                 f"{file.name}:{error.lineno or 1}: not XML, {text}, mend it"
             ) from None
 
+    @classmethod
+    def made(cls, file: Path, root: etree._Element, places: Sequence[str]) -> "XmlFile":
+        """What a file stands for: a root element made of it, and where each part was written."""
+        xml = cls.__new__(cls)
+        xml.file, xml.root, xml.nameless, xml.places = file, root, set(), places
+        return xml
+
     def where(self, element: etree._Element) -> str:
         """File and line of an element."""
+        if self.places:
+            number = element.sourceline or 0
+            return self.places[number if number < len(self.places) else 0]
         return f"{self.file.name}:{element.sourceline}"
 
     def fail(self, element: etree._Element, what: str) -> DescriptionError:
@@ -191,7 +228,23 @@ class XmlFile:
             if default is None:
                 raise self.fail(element, f'{what} has no {name}, add {name}="..."')
             return default
-        given = f'{name}="{text if len(text) < 60 else text[:60] + "..."}" of {what}'
+        short = text if len(text) < _LONG else text[:_LONG] + "..."
+        return self.parsed(element, text, f'{name}="{short}" of {what}', length)
+
+    def parsed(
+        self, element: etree._Element, text: str, given: str, length: int
+    ) -> tuple[float, ...]:
+        """Finite numbers in a text.
+
+        Args:
+            element: Where it stands.
+            text: The text.
+            given: What it describes, for errors.
+            length: How many numbers there have to be.
+
+        Raises:
+            DescriptionError: There are others.
+        """
         words = text.split()
         try:
             values = tuple(float(word) for word in words)

@@ -86,6 +86,8 @@ class Machine:
         locks: Where joints are held that its files let move, by name [m], [rad].
         chosen: Active and free joints that are not those of its file, under "active" and "free".
         floats: Whether its root was made to float, which its file lets stand on the ground.
+        packages: Folders in which its files' packages were sought.
+        arguments: Values of its file's arguments.
     """
 
     name: str
@@ -112,6 +114,8 @@ class Machine:
     locks: Mapping[str, float]
     chosen: Mapping[str, tuple[str, ...]]
     floats: bool
+    packages: tuple[str, ...]
+    arguments: Mapping[str, str]
 
     def __repr__(self) -> str:
         """Name, joints, loops and what drives it."""
@@ -178,7 +182,10 @@ class Machine:
 
         Such as 'patu655 with {"changes": {"payload.mass": 200.0}, "lock": {"slew": 0.0}}'.
         """
-        given = {"changes": dict(self.changes), "lock": dict(self.locks), "floating": self.floats}
+        given = {
+            "changes": dict(self.changes), "lock": dict(self.locks), "floating": self.floats,
+            "packages": self.packages, "arguments": dict(self.arguments),
+        }  # fmt: skip
         given = {name: what for name, what in (given | dict(self.chosen)).items() if what}
         return f"{self.reference}{WITH}{json.dumps(given)}" if given else self.reference
 

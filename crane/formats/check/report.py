@@ -3,7 +3,7 @@
 import re
 import shlex
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from crane.closure import Closure
 from crane.common.counted import kind
 from crane.common.errors import CraneWarning
 from crane.common.output import file_name
+from crane.common.packages import giving, package_folders, values_by_name
 from crane.description import MachineSpec, driven
 from crane.description.findings import Findings, collecting, recoverable
 from crane.description.floating import floated
@@ -21,7 +22,10 @@ from crane.formats.machine_file.read import read
 from crane.machine.masses import has_mass
 
 # "four_bar.yaml:12: what", or a file that has no line to point at
-_PLACE = re.compile(r"(?P<file>.+?)(?::(?P<line>\d+)|(?<=\.yaml|\.urdf)|(?<=\.xml|\.yml)): ")
+_PLACE = re.compile(
+    r"(?P<file>.+?)(?::(?P<line>\d+)|(?<=\.yaml|\.urdf)|(?<=\.xml|\.yml|\.sdf)|"
+    r"(?<=\.xacro|\.world)): "
+)
 _MOST = 500  # findings in a report
 _SHOWN = 14  # kinds of findings on a screen
 _LINES = 6  # that have a finding of one kind
@@ -108,6 +112,8 @@ def check(
     active: Sequence[str] | None = None,
     free: Sequence[str] | None = None,
     floating: bool = False,
+    packages: Sequence[str | Path] = (),
+    arguments: Mapping[str, object] | None = None,
 ) -> Report:
     """Read a machine as far as possible, and say all that is wrong or unusual about it.
 
@@ -118,11 +124,20 @@ def check(
         active: As for `load`.
         free: As for `load`.
         floating: As for `load`.
+        packages: As for `load`.
+        arguments: As for `load`.
 
     Raises:
         DescriptionError: There is no such file.
         InputError: A joint is unknown.
     """
+    with giving(package_folders(packages), values_by_name(arguments), floating):
+        return _check(name, active, free, floating)
+
+
+def _check(
+    name: str | Path, active: Sequence[str] | None, free: Sequence[str] | None, floating: bool
+) -> Report:
     path = find(name)
     spec: MachineSpec | None = None
     closure: Closure | None = None

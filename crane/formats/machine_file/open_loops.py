@@ -31,13 +31,13 @@ def warn_of_open_loops(spec: MachineSpec) -> None:
     """Warn of pairs of frames that are named like the two ends of a loop that nothing closes."""
     above = {joint.child: joint for joint in spec.tree.joints.values()}
     closed = {
-        frozenset(_body(above, end) for end in (loop.predecessor, loop.successor))
+        frozenset(body_of(above, end) for end in (loop.predecessor, loop.successor))
         for loop in spec.loops
     }
     pairs = [
-        (name, one, two) for name, one, two in _pairs(spec.tree)
-        if _body(above, one) != _body(above, two)
-        and frozenset({_body(above, one), _body(above, two)}) not in closed
+        (name, one, two) for name, one, two in named_pairs(spec.tree)
+        if body_of(above, one) != body_of(above, two)
+        and frozenset({body_of(above, one), body_of(above, two)}) not in closed
     ]  # fmt: skip
     if not pairs:
         return
@@ -59,7 +59,7 @@ def warn_of_open_loops(spec: MachineSpec) -> None:
     )
 
 
-def _pairs(tree: Tree) -> list[tuple[str, str, str]]:
+def named_pairs(tree: Tree) -> list[tuple[str, str, str]]:
     """A name for each loop, and its two links, which have the names themselves or their joints."""
     named = {name: name for name in tree.links}
     for name, joint in tree.joints.items():
@@ -75,7 +75,7 @@ def _pairs(tree: Tree) -> list[tuple[str, str, str]]:
     ]
 
 
-def _body(above: Mapping[str, Joint], link: str) -> str:
+def body_of(above: Mapping[str, Joint], link: str) -> str:
     """The link that moves with a link, nearest to the root."""
     seen = {link}
     while link in above and not above[link].moves:

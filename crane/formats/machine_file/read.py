@@ -12,6 +12,7 @@ from crane.description.spec import (
     Chain,
     Coupling,
     Drive,
+    ForceElement,
     Friction,
     Load,
     LoopSpec,
@@ -35,8 +36,9 @@ from crane.formats.machine_file.posture import read_home
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tasks import read_tasks
 from crane.formats.machine_file.tree_builder import TreeBuilder
+from crane.formats.opening import is_robot
 from crane.formats.parallel_robots import is_parallel_robot, read_parallel_robot
-from crane.formats.urdf.read import Urdf, is_urdf, read_urdf
+from crane.formats.urdf.read import Urdf, read_urdf
 
 Part = TypeVar("Part")
 
@@ -60,10 +62,9 @@ def read(name: str | Path) -> MachineSpec:
 
 
 def _read(path: Path) -> MachineSpec:
-    suffix = path.suffix.lower()
-    if suffix == ".urdf" or (suffix in (".xml", ".mjcf") and is_urdf(path)):
+    if is_robot(path):
         return _read_single(path)
-    if suffix in (".xml", ".mjcf"):
+    if path.suffix.lower() in (".xml", ".mjcf"):
         from crane.formats.mjcf.read import read_mjcf  # Pinocchio is in it
 
         return read_mjcf(path)
@@ -95,6 +96,7 @@ def _read_single(path: Path) -> MachineSpec:
         active=active,
         home=urdf.home,
         friction=urdf.friction,
+        forces=urdf.springs,
         tip=tree.only_leaf() if urdf.tip is None else urdf.tip,
         couplings=urdf.couplings,
         where=where,
@@ -104,7 +106,7 @@ def _read_single(path: Path) -> MachineSpec:
 def _read_machine(path: Path) -> MachineSpec:
     top = Section.read(path, _KEYS)
     name, source = top.text("name"), top.text("source", "")
-    chains, tree, friction, couplings = _chains(top, path)
+    chains, tree, friction, couplings, springs = _chains(top, path)
     loops = _loops(top, tree)
     couplings += _couplings(top, tree)
     active: tuple[str, ...] = Anything()
@@ -121,7 +123,7 @@ def _read_machine(path: Path) -> MachineSpec:
     where |= {f"home {joint}": place for joint, place in home_lines.items()}
     rotors = _part(read_rotors, {}, top, tree)
     friction |= _part(read_friction, {}, top, tree)
-    forces = _part(read_forces, (), top, tree)
+    forces = springs + _part(read_forces, (), top, tree)
     gas_springs = _part(read_gas_springs, (), top, tree)
     end_stops = _part(read_end_stops, (), top, tree)
     tip = _tip(top, tree)
@@ -178,11 +180,15 @@ def _tip(top: Section, tree: TreeBuilder) -> str | None:
 
 def _chains(
     top: Section, path: Path
-) -> tuple[tuple[Chain, ...], TreeBuilder, dict[str, Friction], tuple[Coupling, ...]]:
+) -> tuple[
+    tuple[Chain, ...], TreeBuilder, dict[str, Friction], tuple[Coupling, ...],
+    tuple[ForceElement, ...],
+]:  # fmt: skip
     chains: list[Chain] = []
     tree = TreeBuilder()
     friction: dict[str, Friction] = {}
     couplings: tuple[Coupling, ...] = ()
+    springs: tuple[ForceElement, ...] = ()
     for item in top.sections("chains", "chain", "name", "urdf", "parent"):
         tree.complete &= top.complete
         so_far = tree.complete
@@ -194,13 +200,14 @@ def _chains(
             chains.append(chain)
             friction |= urdf.friction
             couplings += urdf.couplings
+            springs += urdf.springs
     tree.complete &= top.complete
     if not chains and tree.complete:
         flag(top.fail("chains", "there are no chains, add one under 'chains:'"))
         tree.complete = False
     if not tree.joints and tree.complete:
         flag(top.fail("chains", "no joint of these chains moves, add one"))
-    return tuple(chains), tree, friction, couplings
+    return tuple(chains), tree, friction, couplings, springs
 
 
 def _chain(item: Section, before: list[Chain], all_read: bool, path: Path) -> tuple[Chain, Urdf]:

@@ -9,8 +9,9 @@ from lxml import etree
 
 from crane.common.errors import known
 from crane.description.findings import FollowUpError, flag, recoverable, remember_file
-from crane.description.spec import Coupling, Friction, LoopSpec
+from crane.description.spec import Coupling, ForceElement, Friction, LoopSpec
 from crane.description.tree import Joint, Link, Tree
+from crane.formats.opening import opened
 from crane.formats.series import SEVERAL
 from crane.formats.urdf.couplings import read_coupling
 from crane.formats.urdf.elements import (
@@ -83,6 +84,7 @@ class Urdf:
         home_lines: File and line of each.
         tip: Link of the end effector "tip".
         complete: Whether all elements have names of their own, if not only some are here.
+        springs: Of a format that has some.
     """
 
     file: Path
@@ -97,6 +99,7 @@ class Urdf:
     home_lines: Mapping[str, str] = field(default_factory=dict)
     tip: str | None = None
     complete: bool = True
+    springs: tuple[ForceElement, ...] = ()
 
     @property
     def moving(self) -> tuple[str, ...]:
@@ -104,13 +107,8 @@ class Urdf:
         return tuple(joint.name for joint in self.tree.moving)
 
 
-def is_urdf(file: Path) -> bool:
-    """Whether an XML file holds a robot and no MuJoCo model."""
-    return bool(XmlFile(file).root.tag == "robot")
-
-
 def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf:
-    """Read and check one URDF.
+    """Read and check one URDF, or what stands for one, see `crane.formats.opening`.
 
     Args:
         file: The file.
@@ -119,7 +117,8 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
     Raises:
         DescriptionError: With file, line, and what is wrong.
     """
-    xml = XmlFile(file)
+    source = opened(file)
+    xml = source.xml
     remember_file(xml)
     if xml.root.tag != "robot":
         raise xml.fail(xml.root, f"a URDF starts with <robot>, this file with <{xml.root.tag}>")
@@ -174,6 +173,7 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
         home_lines,
         read_tip(xml, links),
         complete=not xml.nameless,
+        springs=source.springs,
     )
 
 
@@ -267,7 +267,7 @@ def _named(xml: XmlFile, kind: str) -> dict[str, etree._Element]:
             flag(xml.fail(element, f'a {kind} has no name, add name="..."'))
         elif name in found:
             xml.nameless.add(kind)
-            first = found[name].sourceline
+            first = xml.where(found[name]).rpartition(":")[2]
             problem = f"{kind} '{name}' is there twice (first in line {first}), rename one"
             flag(xml.fail(element, problem))
         else:

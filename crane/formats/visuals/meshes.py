@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from crane.common.packages import find_file
 from crane.common.samples import Array
 from crane.formats.visuals import mesh_process
 
@@ -36,27 +37,14 @@ class Part:
 
 
 def mesh_file(name: str, folder: Path) -> Path | None:
-    """The file that a mesh's name stands for, None if there is none.
-
-    A name is a path from the URDF's folder or from one above it. Of `package://PACKAGE/PATH` it is
-    PATH, and where that is not there PACKAGE/PATH, as packages that lie side by side have it; of
-    other `SCHEME://PATH` it is PATH. `package://FILE`, which names no package, is FILE.
+    """The file that a mesh's name stands for, None if there is none, see `find_file`.
 
     Args:
         name: As `<mesh filename>` has it.
         folder: Of the URDF.
     """
-    scheme, separated, rest = name.partition("://")
-    path = Path(rest if separated else name)
-    ends = [path]
-    if separated and scheme == "package":
-        parts = [part for part in path.parts if part != "/"]
-        ends = [Path(*parts[1:]), Path(*parts)] if len(parts) > 1 else [Path(*parts)]
-    places = [above / end for end in ends for above in (folder, *folder.absolute().parents)]
-    try:
-        return next((place for place in places if place.is_file()), None)
-    except OSError:  # a name that cannot be a file's
-        return None
+    found = find_file(name, folder)
+    return found if found is not None and found.is_file() else None
 
 
 def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[Part, ...] | str]:

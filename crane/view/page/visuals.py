@@ -7,8 +7,8 @@ import pinocchio as pin
 
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
+from crane.formats.opening import robots
 from crane.formats.visuals.visuals import PLAIN, Box, Cylinder, Sphere, Visual, read_drawn
-from crane.formats.xml import XmlFile
 from crane.machine import Machine
 
 
@@ -22,10 +22,7 @@ def read_visuals(machine: Machine) -> list[Visual]:
     missing: list[str] = []
     problems: list[str] = []
     box = Box((0.15 * _reach(machine),) * 3)
-    for chain in machine.chains:
-        xml = XmlFile(chain.urdf)
-        if xml.root.tag != "robot":  # MJCF, whose shapes are not drawn
-            continue
+    for xml in robots(machine):
         drawn = read_drawn(xml, instead=box)
         visuals += drawn.shapes["visual"]
         missing += drawn.missing

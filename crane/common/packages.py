@@ -1,0 +1,229 @@
+"""Where files are that other files name: paths, and places in packages of ROS and Gazebo.
+
+`package://PACKAGE/PATH`, `$(find PACKAGE)` and `model://MODEL/PATH` name a folder that only the
+writer's system knew. It is sought, in this order, in the folders that the user gives, in those
+above the file that names it and beside its own package, and where ROS and Gazebo look. A package
+is a folder whose package.xml (of a model: model.config) has its name, or, without such a file,
+that is called so.
+"""
+
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+from crane.common.errors import InputError
+
+_MANIFESTS = ("package.xml", "model.config")
+_NAME = re.compile(rb"<name[^>]*>\s*([^<]*?)\s*</name>")
+_DEPTH, _MOST = 4, 2000  # levels below a given folder, and folders looked into
+# Variables with folders of packages, and what is between them and the packages.
+_VARIABLES = {
+    "ROS_PACKAGE_PATH": "", "AMENT_PREFIX_PATH": "share", "CMAKE_PREFIX_PATH": "share",
+    "GZ_SIM_RESOURCE_PATH": "", "IGN_GAZEBO_RESOURCE_PATH": "", "GAZEBO_MODEL_PATH": "",
+    "SDF_PATH": "",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a user says beside the name of a file.
+
+    Attributes:
+        packages: Folders of packages, or in which there are some.
+        arguments: Values by name of the file's arguments.
+        floating: Whether the root is to float.
+        found: Packages that were sought while it holds, by name and by who asked.
+    """
+
+    packages: tuple[str, ...] = ()
+    arguments: Mapping[str, str] = field(default_factory=dict)
+    floating: bool = False
+    found: dict[tuple[str, Path], Path | None] = field(default_factory=dict, repr=False)
+
+
+_given: ContextVar[Given | None] = ContextVar("given", default=None)
+
+
+def given() -> Given:
+    """What holds for the files that are read now."""
+    return _given.get() or Given()
+
+
+@contextmanager
+def giving(
+    packages: Sequence[str] = (),
+    arguments: Mapping[str, object] | None = None,
+    floating: bool = False,
+) -> Iterator[Given]:
+    """Read files with packages in these folders and with values of arguments.
+
+    Args:
+        packages: Folders.
+        arguments: Values by name; numbers and truth values are written as XML has them.
+        floating: Whether the root is to float.
+    """
+    values = {str(name): _text(value) for name, value in (arguments or {}).items()}
+    now = Given(tuple(packages), values, floating)
+    token = _given.set(now)
+    try:
+        yield now
+    finally:
+        _given.reset(token)
+
+
+def _text(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def package_folders(given: object) -> list[str]:
+    """Folders of packages, as a caller gives them.
+
+    Raises:
+        InputError: They are no list, or not there.
+    """
+    if isinstance(given, str | Path) or not isinstance(given, Sequence):
+        raise InputError(f"packages is {given!r}, give a list of folders such as ['src']")
+    folders = [Path(str(folder)).resolve() for folder in given]
+    for folder in folders:
+        if not folder.is_dir():
+            raise InputError(f"packages: {folder} is no folder, check the path")
+    return [str(folder) for folder in folders]
+
+
+def values_by_name(given: object) -> Mapping[str, object]:
+    """Values of arguments, as a caller gives them.
+
+    Raises:
+        InputError: They are not given by name.
+    """
+    if not isinstance(given, Mapping | None):
+        raise InputError(
+            f"arguments is {given!r}, give values by name such as {{'name': 'value'}}"
+        )
+    return given or {}
+
+
+def find_file(name: str, folder: Path) -> Path | None:
+    """The file or folder that a name stands for, None if there is none.
+
+    A name is a path from the folder of the file that has it, or from one above. `package://NAME/`
+    and `model://NAME/` begin in a package, see `find_package`; where that is not known, the rest
+    is a path, and so is that of other `SCHEME://PATH`. `package://FILE`, which names no package,
+    is FILE.
+
+    Args:
+        name: As a file has it.
+        folder: Of that file.
+    """
+    scheme, separated, rest = name.partition("://")
+    parts = [part for part in Path(rest if separated else name).parts if part != "/"]
+    in_package = bool(separated) and scheme in ("package", "model") and bool(parts)
+    try:
+        if in_package and (package := find_package(parts[0], folder)) is not None:
+            inside = package.joinpath(*parts[1:])
+            if inside.exists():
+                return inside
+        return _near(Path(rest if separated else name), parts, folder, in_package)
+    except (OSError, ValueError):  # a name that cannot be a file's
+        return None
+
+
+def _near(path: Path, parts: list[str], folder: Path, in_package: bool) -> Path | None:
+    """A path from a folder or one above it; in a package perhaps without the package's name."""
+    ends = [path]
+    if in_package:
+        ends = [Path(*parts[1:]), Path(*parts)] if len(parts) > 1 else [Path(*parts)]
+    places = (above / end for end in ends for above in (folder, *folder.absolute().parents))
+    return next((place for place in places if place.is_file()), None)
+
+
+def find_package(name: str, folder: Path) -> Path | None:
+    """The folder of a package, None where it is not found.
+
+    Args:
+        name: Of the package.
+        folder: Of the file that names it.
+    """
+    asked, now = (name, folder.absolute()), given()
+    if asked not in now.found:
+        now.found[asked] = _sought(name, folder.absolute(), now.packages)
+    return now.found[asked]
+
+
+def _sought(name: str, folder: Path, packages: Sequence[str]) -> Path | None:
+    for folder_given in packages:
+        if (found := _below(name, Path(folder_given))) is not None:
+            return found
+    for above in (folder, *folder.parents):
+        for place in (above, above / name):
+            if _is_package(place, name):
+                return place
+    own = next((above for above in (folder, *folder.parents) if _name_of(above)), None)
+    for top in () if own is None else (own, own.parent):
+        if (found := _below(name, top, 2)) is not None:
+            return found
+    for variable, between in _VARIABLES.items():
+        for prefix in filter(None, os.environ.get(variable, "").split(os.pathsep)):
+            if (found := _below(name, Path(prefix) / between, 2)) is not None:
+                return found
+    return None
+
+
+def _is_package(folder: Path, name: str) -> bool:
+    """Whether a folder is the package of a name."""
+    said = _name_of(folder)
+    return said == name or (folder.name == name and folder.is_dir() and not said)
+
+
+def _below(name: str, top: Path, depth: int = _DEPTH) -> Path | None:
+    """The package of a name in a folder, the nearest to it."""
+    level = [top]
+    seen = 0
+    for _ in range(depth + 1):
+        for folder in level:
+            if _is_package(folder, name):
+                return folder
+        deeper: list[Path] = []
+        for folder in level:
+            if seen > _MOST:
+                break
+            inside = _folders(str(folder))
+            seen += len(inside)
+            deeper += map(Path, inside)
+        level = deeper
+    return None
+
+
+def _folders(folder: str) -> list[str]:
+    try:
+        with os.scandir(folder) as inside:
+            return sorted(x.path for x in inside if x.is_dir() and not x.name.startswith("."))
+    except OSError:
+        return []
+
+
+def _name_of(folder: Path) -> str:
+    """The name in a folder's package.xml or model.config, empty without one."""
+    for manifest in _MANIFESTS:
+        file = folder / manifest
+        try:
+            changed = file.stat().st_mtime_ns
+        except (OSError, ValueError):
+            continue
+        if said := _name_in(str(file), changed):
+            return said if manifest == _MANIFESTS[0] else folder.name
+    return ""
+
+
+@lru_cache(maxsize=4096)
+def _name_in(file: str, _: int) -> str:
+    try:
+        found = _NAME.search(Path(file).read_bytes()[:100_000])
+    except OSError:
+        return ""
+    return found[1].decode("utf-8", "replace") if found else ""

@@ -1,0 +1,1 @@
+"""SDF of Gazebo and Drake, translated into URDF with loops."""

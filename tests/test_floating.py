@@ -1,0 +1,152 @@
+"""Machines whose root floats: both backends, Pinocchio's open tree, closed forms of motion."""
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import crane
+
+DATA = Path(__file__).parent / "data"
+QUANTITIES = {
+    "inverse": 3, "forward": 3, "mass_matrix": 1, "bias": 2, "gravity": 1, "energy": 2,
+    "regressor": 3,
+}  # fmt: skip
+
+
+def box(name, mass, at="0 0 0"):
+    return (
+        f'<link name="{name}"><inertial><origin xyz="{at}"/><mass value="{mass}"/>'
+        '<inertia ixx="0.02" ixy="0.001" ixz="0.002" iyy="0.05" iyz="-0.001" izz="0.06"/>'
+        "</inertial></link>"
+    )
+
+
+def hinge(name, parent, child, at, rpy="0 0 0", kind="continuous"):
+    return (
+        f'<joint name="{name}" type="{kind}"><origin xyz="{at}" rpy="{rpy}"/>'
+        f'<parent link="{parent}"/><child link="{child}"/><axis xyz="0 0 1"/></joint>'
+    )
+
+
+ARM = (
+    '<robot name="arm">' + box("hull", 8.0, "0.02 -0.01 0.05") + box("upper", 2.0, "0.2 0 0")
+    + box("lower", 1.0, "0.1 0.02 0") + hinge("one", "hull", "upper", "0.1 0.2 0.3", "0.3 0.2 0.1")
+    + hinge("two", "upper", "lower", "0.4 0 0", "1.2 0 0") + "</robot>"
+)  # fmt: skip
+
+
+@pytest.fixture
+def arm(tmp_path):
+    (tmp_path / "arm.urdf").write_text(ARM)
+    return crane.load(tmp_path / "arm.urdf", floating=True)
+
+
+def walker():
+    pytest.importorskip("mujoco")
+    return crane.load(DATA / "mjcf" / "walker.xml")
+
+
+def states(machine, count, seed=0):
+    """Active coordinates whose base has any attitude, velocities and forces."""
+    random = np.random.default_rng(seed)
+    n = len(machine.active)
+    for _ in range(count):
+        q_a = machine.home[machine.closure.active] + random.uniform(-0.2, 0.2, n)
+        turn = random.normal(size=3)
+        turn *= random.uniform(0, np.pi) / np.linalg.norm(turn)
+        for part, value in zip(("rx", "ry", "rz"), turn, strict=True):
+            (name,) = (joint for joint in machine.active if joint.endswith(f"_{part}"))
+            q_a[machine.active.index(name)] = value
+        yield q_a, *random.normal(size=(2, n))
+
+
+@pytest.mark.parametrize("which", ["arm", "walker"])
+@pytest.mark.parametrize("quantity", QUANTITIES)
+def test_machine_code_agrees_with_pinocchio(which, quantity, arm):
+    machine = arm if which == "arm" else walker()
+    fast, tree = crane.Dynamics(machine), crane.Dynamics(machine, backend="pinocchio")
+    assert fast.backend == "compiled"
+    for state in states(machine, 5):
+        arguments = state[: QUANTITIES[quantity]]
+        found = np.asarray(getattr(fast, quantity)(*arguments))
+        wanted = np.asarray(getattr(tree, quantity)(*arguments))
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-12 * np.abs(wanted).max())
+
+
+def test_an_open_tree_is_pinocchios(arm):
+    """Accelerations of `pin.aba`, wrenches of `pin.rnea`: same coordinates, same axes."""
+    dynamics, data = crane.Dynamics(arm), arm.model.createData()
+    for q, v, x in states(arm, 10, seed=1):
+        at = arm.coordinates.configuration(arm.closure.solve(q))
+        wanted = pin.aba(arm.model, data, at, v, x)
+        np.testing.assert_allclose(dynamics.forward(q, v, x), wanted, atol=1e-11)
+        wanted = pin.rnea(arm.model, data, at, v, x)
+        np.testing.assert_allclose(dynamics.inverse(q, v, x), wanted, atol=1e-11)
+
+
+def test_the_tip_moves_as_its_jacobian_says(arm):
+    kinematics = crane.Kinematics(arm, "lower")
+    for q, v, _ in states(arm, 3, seed=2):
+        h = 1e-6
+        ends = []
+        for sign in (1, -1):
+            at = pin.integrate(arm.model, arm.coordinates.configuration(q), sign * h * v)
+            ends.append(kinematics.position(arm.coordinates.coordinates(at)))
+        slope = (ends[0] - ends[1]) / (2 * h)
+        np.testing.assert_allclose(kinematics.jacobian(q) @ v, slope, atol=1e-8)
+
+
+@pytest.mark.parametrize("which", ["arm", "walker"])
+def test_steps_of_machine_code_are_those_of_python(which, arm, monkeypatch):
+    machine = arm if which == "arm" else walker()
+    q, v, _ = next(states(machine, 1, seed=3))
+    start = {"initial": (q, 2 * v), "duration": 0.2, "step": 1e-3}
+    one = crane.simulate(machine, **start)
+    two = crane.simulate(machine, **start, backend="pinocchio")
+    np.testing.assert_allclose(one.q, two.q, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(one.v, two.v, rtol=0, atol=1e-8 * np.abs(two.v).max())
+
+
+def test_momentum_and_energy_in_free_flight(arm):
+    """Somersaults through every attitude: no singularity, whatever the pitch."""
+    upright = np.array([0, 0, 0, 0, np.pi / 2, 0, 0, 0])  # where Cardan angles are not defined
+    start = upright, np.array([0.3, 0.2, 4.0, 0.1, 9.0, 0.1, 0.3, -0.4])
+    recording = crane.simulate(arm, initial=start, duration=2.0, step=5e-4)
+    turns = recording.q[:, 3:6]
+    assert np.linalg.norm(turns, axis=1).max() <= np.pi + 1e-12
+    energy = recording.channels["kinetic"] + recording.channels["potential"]
+    assert np.ptp(energy) < 1e-7 * recording.channels["kinetic"].max()
+    model, data = arm.model, arm.model.createData()
+    pitches, spins, places = [], [], []
+    for q, v in zip(recording.q, recording.v, strict=True):
+        at = arm.coordinates.configuration(q)
+        momentum = pin.computeCentroidalMomentum(model, data, at, v)
+        spins.append(momentum.angular.copy())
+        places.append(data.com[0].copy())
+        pitches.append(np.arcsin(-data.oMi[1].rotation[2, 0]))
+    assert np.ptp(pitches) > 2.5
+    assert np.ptp(spins, axis=0).max() < 1e-7 * np.abs(spins).max()
+    t, places = recording.time, np.array(places)
+    speed = (places[-1] - places[0]) / t[-1] + [0, 0, 9.81 * t[-1] / 2]
+    fall = places[0] + np.outer(t, speed) - np.outer(t**2, [0, 0, 9.81 / 2])
+    np.testing.assert_allclose(places, fall, atol=1e-8)
+
+
+def test_a_spin_about_one_axis_goes_round_and_round(tmp_path):
+    """Closed form: R = exp(w t) about an axis of inertia, for ten turns."""
+    (tmp_path / "top.urdf").write_text(
+        '<robot name="top"><link name="ground"/><link name="top"><inertial><mass value="1"/>'
+        '<inertia ixx="1" ixy="0" ixz="0" iyy="2" iyz="0" izz="3"/></inertial></link>'
+        '<joint name="fly" type="floating"><parent link="ground"/><child link="top"/></joint>'
+        "</robot>"
+    )
+    top = crane.load(tmp_path / "top.urdf")
+    recording = crane.simulate(
+        top, initial=(np.zeros(6), [0, 0, 0, 0, 0, 20 * np.pi]), duration=1.0
+    )
+    angle = recording.q[:, 5]
+    assert np.abs(angle).max() <= np.pi + 1e-12
+    wanted = 20 * np.pi * recording.time
+    np.testing.assert_allclose(np.exp(1j * angle), np.exp(1j * wanted), atol=1e-9)
