@@ -1,8 +1,8 @@
 """A program that is kept between runs: what it gives, and whether it had to be built.
 
-As a program of its own it prints both: `python kept.py [die N] [late]`, where `die N` kills it when
-it has written its N-th file but not put it in place, and `late` lets it have loaded the package
-long after its files changed.
+As a program of its own it checks the one and prints the other: `python kept.py [die N] [late]`,
+where `die N` kills it when it has written its N-th file but not put it in place, and `late` lets
+it have loaded the package long after its files changed.
 """
 
 import os
