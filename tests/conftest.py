@@ -1,6 +1,7 @@
 """Machines that several modules test with, and how property tests run."""
 
 import os
+import time
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: two processes, two cores
@@ -9,6 +10,8 @@ import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
 import crane  # noqa: E402
+from crane.codegen import package  # noqa: E402
+from crane.codegen.llvm import objects  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 
@@ -35,6 +38,18 @@ def stewart():
 @pytest.fixture(scope="session")
 def five_bar():
     return crane.load(DATA / "five_bar.urdf")
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder of its own for programs, in a process that has just loaded the package."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(crane, "LOADED", time.time() + 60.0)
+    package._digest.cache_clear()
+    if tmp_path not in objects.folder().parents:
+        pytest.skip("folders of the user are elsewhere here")
+    yield objects.folder()
+    package._digest.cache_clear()
 
 
 @pytest.fixture

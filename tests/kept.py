@@ -1,0 +1,83 @@
+"""A program that is kept between runs: what it gives, and whether it had to be built.
+
+As a program of its own it checks the one and prints the other: `python kept.py [die N] [late]`,
+where `die N` kills it when it has written its N-th file but not put it in place, and `late` lets
+it have loaded the package long after its files changed.
+"""
+
+import os
+import signal
+import sys
+
+import numpy as np
+
+import crane
+from crane.codegen import Program, Tape
+
+LONG = 300  # operations of the toy, more or less
+
+
+def toy(factor=3.0, built=None):
+    """A compiled program, found by its factor."""
+
+    def build(program):
+        if built is not None:
+            built.append(factor)
+        tape = Tape()
+        x, y = tape.loads(0, 0, 2)
+        total = factor * x
+        for _ in range(LONG // 2):
+            total = y + total * 0.5
+        program.add("formula", 1, {"value": [total], "given": [x, y]})
+        with program.routine("each", counts=("count",), arrays=("x", "out")) as r:
+            with r.loop(r.count) as i:
+                r.call("formula", r.x.row(i, 2), r.out.row(i, 3))
+            r.give(r.count)
+
+    return Program.kept(("toy", factor), build)
+
+
+def value(program):
+    """What it makes of 2 and 5 twice, if it is what it should be."""
+    layout = program.outputs("formula")
+    x, out = np.array([[2.0, 5.0], [2.0, 5.0]]), np.empty((2, layout.size))
+    assert program.call("each", 2, x, out) == 2
+    assert (layout.view(out).given == x).all() and out[0, 0] == out[1, 0]
+    return float(out[0, 0])
+
+
+def wanted(factor=3.0):
+    """The same in Python."""
+    total = factor * 2.0
+    for _ in range(LONG // 2):
+        total = 5.0 + total * 0.5
+    return total
+
+
+def die_before(count):
+    """Be killed instead of putting the count-th file in its place."""
+    replace, left = os.replace, [count]
+
+    def deadly(*paths):
+        left[0] -= 1
+        if not left[0]:
+            os.kill(os.getpid(), signal.SIGKILL)
+        replace(*paths)
+
+    os.replace = deadly
+
+
+def main(arguments):
+    """See the module's text."""
+    if "die" in arguments:
+        die_before(int(arguments[arguments.index("die") + 1]))
+    if "late" in arguments:
+        crane.LOADED += 3600.0
+    built = []
+    got = value(toy(built=built))
+    assert abs(got - wanted()) < 1e-12 * wanted(), got
+    print("built" if built else "found")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,324 @@
+"""Programs that later runs find by what they depend on, whatever befell the files."""
+
+import os
+import shutil
+import subprocess
+import sys
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import kept
+import llvmlite.binding as llvm
+import numpy as np
+import pytest
+
+import crane
+from crane.closure.traced import Bodies
+from crane.codegen import TooLongError, package, program
+from crane.codegen.kept import place_of
+from crane.codegen.llvm import engine, objects
+from crane.dynamics.traced import Sweep
+
+PACKAGE = Path(crane.__file__).parent
+
+
+@contextmanager
+def another_processor():
+    """One whose code happens to run here too."""
+
+    class NoFeatures:
+        def flatten(self):
+            return ""
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(llvm, "get_host_cpu_name", lambda: "generic")
+        patch.setattr(llvm, "get_host_cpu_features", NoFeatures)
+        engine.settings.cache_clear()
+        yield
+    engine.settings.cache_clear()
+
+
+def ask(factor=3.0):
+    """Whether the program had to be built; its numbers are right either way."""
+    built = []
+    got = kept.value(kept.toy(factor, built))
+    assert got == pytest.approx(kept.wanted(factor), rel=1e-12)
+    return bool(built)
+
+
+def files(place, kind="*"):
+    return sorted(file for file in place.glob(f"*.{kind}") if not file.name.startswith("."))
+
+
+def child(place, *arguments, **more):
+    """The same in another process."""
+    environment = os.environ | {"XDG_CACHE_HOME": str(place.parent.parent)}
+    environment |= {"PYTHONPATH": str(more.get("package", PACKAGE).parent)}
+    return subprocess.Popen(
+        [sys.executable, kept.__file__, *map(str, arguments)],
+        env=environment | more.get("env", {}),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def answer(process):
+    out, error = process.communicate(timeout=300)
+    assert process.returncode == 0 and not error, error
+    return out.strip()
+
+
+def test_a_later_program_is_found(place):
+    assert ask() and not ask()
+    assert ask(4.0) and not ask(4.0) and not ask()
+    assert len(files(place, "note")) == len(files(place, "code")) == 2
+
+
+def test_what_is_found_is_called_as_what_was_built(place):
+    one, two = kept.toy(), kept.toy()
+    assert two.outputs("formula") == one.outputs("formula") and two.address("each")
+    assert two.longest == one.longest > kept.LONG
+    with pytest.raises(TypeError, match="'each' takes 3 arguments, not 2"):
+        two.call("each", 1, np.zeros(2))
+    with pytest.raises(KeyError):
+        two.call("nothing", 1)
+
+
+def test_other_processes_find_it(place):
+    """Whatever order their sets of words have."""
+    assert answer(child(place, "late")) == "built"
+    for seed in "12":
+        assert answer(child(place, "late", env={"PYTHONHASHSEED": seed})) == "found"
+    assert not ask()
+
+
+def test_a_formula_that_is_too_long_is_known_to_be(place, monkeypatch):
+    monkeypatch.setattr(program, "MOST", 100)
+    built = []
+    for _ in range(2):
+        with pytest.raises(TooLongError):
+            kept.toy(built=built)
+    assert len(built) == 1
+    monkeypatch.setattr(program, "MOST", 10_000)
+    assert ask() and not ask()
+    monkeypatch.setattr(program, "MOST", 100)
+    with pytest.raises(TooLongError):
+        ask()
+
+
+def test_places_are_apart_where_programs_are(place):
+    @dataclass(frozen=True)
+    class Pair:
+        one: object
+        two: object
+
+    told = [
+        1, 1.0, True, "1", b"1", (1,), ((1,),), (1, 2), ((1, 2),), (1, (2,)), 0.0, -0.0, "",
+        np.array([1]), np.array([1.0]), np.array([[1.0]]), np.array([1, 0]), np.array([[1], [0]]),
+        np.int32(1), np.zeros(0), np.zeros((0, 1)), np.array([-0.0]), np.array([0.0]),
+        Pair(1, 2), Pair(2, 1), Pair(1, (2,)), ("a", "b"), ("a, b",), ("a'", "b"), ("a", "'b"),
+    ]  # fmt: skip
+    places = [place_of(("toy", x)) for x in told]
+    assert None not in places and len({*places}) == len(places)
+    assert places == [place_of(("toy", x)) for x in told]
+    assert place_of(None) is None
+
+
+@pytest.mark.parametrize(
+    "value", [object(), len, lambda: 0, [1], {1}, {1: 2}, Path(), int, np.array([object()])]
+)
+def test_what_says_nothing_lasting_is_refused(place, value):
+    with pytest.raises(TypeError, match="what a program depends on"):
+        place_of(("toy", (1, value)))
+
+
+DAMAGES = {
+    "empty": lambda data: b"",
+    "half of the digest": lambda data: data[:16],
+    "digest alone": lambda data: data[:32],
+    "cut": lambda data: data[:-1],
+    "longer": lambda data: data + b"\0",
+    "zeros": lambda data: bytes(len(data)),
+    "bit of the digest": lambda data: flipped(data, 7),
+    "bit of the beginning": lambda data: flipped(data, 33),
+    "bit of the middle": lambda data: flipped(data, len(data) // 2),
+    "bit of the end": lambda data: flipped(data, len(data) - 1),
+}
+
+
+def flipped(data, at):
+    changed = bytearray(data)
+    changed[at] ^= 1
+    return bytes(changed)
+
+
+@pytest.mark.parametrize("kind", ["note", "code"])
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_files_are_made_anew(place, kind, damage):
+    assert ask()
+    whole = {file: file.read_bytes() for file in files(place)}
+    (file,) = files(place, kind)
+    file.write_bytes(DAMAGES[damage](whole[file]))
+    assert ask() and not ask()
+    assert {file: file.read_bytes() for file in files(place)} == whole
+
+
+@pytest.mark.parametrize("kind", ["note", "code"])
+def test_missing_files_are_made_anew(place, kind):
+    assert ask()
+    (file,) = files(place, kind)
+    file.unlink()
+    assert ask() and not ask()
+
+
+def test_files_of_another_name_are_not_taken(place):
+    """What was written whole, but for another program, is no less wrong."""
+    assert ask()
+    one = {file.suffix: file for file in files(place)}
+    assert ask(4.0)
+    for file in files(place):
+        if file not in one.values():
+            shutil.copy(file, one[file.suffix])
+    assert ask() and not ask()
+    assert not ask(4.0)
+
+
+def test_another_processor_has_its_own_files(place):
+    assert ask()
+    own = {file: file.read_bytes() for file in files(place)}
+    with another_processor():
+        assert ask() and not ask()
+    others = {file.suffix: file.read_bytes() for file in files(place) if file not in own}
+    assert len(others) == 2 and not ask()
+    for file in own:  # under the names of ours
+        file.write_bytes(others[file.suffix])
+    assert ask() and not ask()
+    assert {file: file.read_bytes() for file in own} == own
+
+
+def test_what_the_user_may_not_write_is_not_kept(place):
+    place.parent.mkdir(parents=True)
+    place.write_text("a file")
+    assert ask() and ask()
+    assert place.read_text() == "a file"
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owner here")
+def test_a_folder_that_others_may_write_is_not_read(place):
+    assert ask()
+    place.chmod(0o777)
+    assert ask()
+    place.chmod(0o700)
+    assert not ask()
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="nobody is root here")
+def test_a_folder_that_may_only_be_read_serves(place):
+    """Also where it is full, or lies on something that cannot be written."""
+    assert ask()
+    place.chmod(0o500)
+
+    def refused(*_, **__):
+        raise PermissionError(13, "not allowed")
+
+    with pytest.MonkeyPatch.context() as patch:  # root may all the same
+        patch.setattr(os, "utime", refused)
+        patch.setattr(os, "replace", refused)
+        assert not ask() and ask(4.0) and ask(4.0)
+    place.chmod(0o700)
+    assert len(files(place)) == 2 and not list(place.glob(".*"))
+
+
+def test_the_folder_is_bounded(place, monkeypatch):
+    ask()
+    one = sum(file.stat().st_size for file in place.iterdir())
+    killed = place / ".left.1.part"
+    killed.write_bytes(bytes(one))
+    (place / "folder").mkdir()
+    monkeypatch.setattr(objects, "MOST", 4 * one)
+    for factor in range(4, 12):
+        for file in place.iterdir():  # a while later
+            os.utime(file, (file.stat().st_mtime - 10,) * 2)
+        assert ask(float(factor)) and not ask(float(factor))
+        assert not ask()  # used each time
+        assert sum(file.stat().st_size for file in place.iterdir() if file.is_file()) <= 4 * one
+    assert not killed.exists() and ask(4.0)
+
+
+def test_processes_that_compile_at_once(place):
+    """Each is right, and what they leave is whole."""
+    at_once = [child(place, "late") for _ in range(4)]
+    assert set(map(answer, at_once)) <= {"built", "found"}
+    assert len(files(place)) == 2 and len(list(place.iterdir())) == 2
+    assert answer(child(place, "late")) == "found"
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_killed_process_leaves_nothing_that_harms(place, count):
+    process = child(place, "late", "die", count)
+    process.communicate(timeout=300)
+    assert process.returncode < 0
+    assert len(files(place)) == count - 1 and len(list(place.glob(".*"))) == 1
+    assert answer(child(place, "late")) == "built"
+    assert answer(child(place, "late")) == "found"
+
+
+def test_a_changed_package_finds_nothing(place, tmp_path):
+    """Every change counts, also one that leaves length and time of a file as they were."""
+    copy = tmp_path / "again" / "crane"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "models"))
+
+    def run(*arguments):
+        return answer(child(place, *arguments, package=copy, env={"PYTHONDONTWRITEBYTECODE": "1"}))
+
+    assert run() == "built"  # just changed: who knows what was loaded
+    assert not files(place, "note")
+    assert run("late") == "built" and run("late") == "found"
+    file = copy / "dynamics" / "traced.py"
+    text, times = file.read_text(), file.stat()
+    changed = text.replace("Dynamics", "dynamics", 1)
+    assert len(changed) == len(text) and changed != text
+    file.write_text(changed)
+    os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert run("late") == "built" and run("late") == "found"
+    file.write_text(text)
+    assert run("late") == "found"
+    (copy / "codegen" / "new.py").write_text("")
+    assert run("late") == "built"
+
+
+def test_a_package_that_changes_meanwhile_keeps_nothing(place, monkeypatch):
+    class Changing(list):
+        """As if all files became newer than what was loaded while a program is built."""
+
+        def append(self, _):
+            monkeypatch.setattr(crane, "LOADED", 0.0)
+
+    kept.toy(built=Changing())
+    assert not files(place, "note")
+
+
+def another(*_):
+    return 0.0
+
+
+@pytest.mark.parametrize(
+    "owner, name, value",
+    [
+        (Sweep, "_law", another),
+        (Sweep, "mass", property(another)),
+        (Bodies, "frame", staticmethod(another)),
+        (Sweep, "kinetic", cached_property(another)),
+        (engine, "_target", lambda: None),
+        (crane.closure.compiled, "Loops", type("Loops", (), {})),
+    ],
+)
+def test_a_patched_package_finds_nothing(place, owner, name, value):
+    assert ask() and not ask()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(owner, name, value)
+        assert package.package_digest() is None
+    assert not ask()

@@ -1,0 +1,378 @@
+"""What programs are found by says all that their formulas depend on."""
+
+import copy
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import warnings
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_compiled import dressed
+
+import crane
+from crane.closure import compiled as loops
+from crane.closure.exactness import Surplus
+from crane.closure.traced import folded
+from crane.codegen import Program
+from crane.codegen.kept import place_of
+from crane.codegen.llvm.text import text_of
+from crane.dynamics import compiled as quantities
+from crane.motion.kinematics import _FastFrame, _FastPoint
+
+DATA = Path(__file__).parent / "data"
+MACHINES = ("slider_crank.yaml", "five_bar.urdf", "stewart.urdf")
+# what formulas may read of a machine: `FastClosure._key` has it, or follows from what it has
+READ = {
+    "equations": {
+        "axis1", "axis2", "is_translation", "loop_of_row", "sign", "factors", "offsets", "loops",
+        "coordinates",
+    },
+    "coordinates": {"parents"},
+    "loop": {"type"},
+    "structure": {"rows", "redundant", "blocks", "surplus"},
+    "surplus": {"allowed"},
+    "geometry": {
+        "parents", "revolute", "flyers", "turns", "numbers", "frame_bodies", "trunk", "flying",
+        "massless",
+    },
+}  # fmt: skip
+
+
+class Spy:
+    """Something of a machine that tells what is read of it."""
+
+    def __init__(self, inner, kind, seen):
+        self.__dict__.update(_inner=inner, _kind=kind, _seen=seen)
+
+    def __getattr__(self, name):
+        if not name.startswith("__"):
+            self._seen.add((self._kind, name))
+        found = getattr(self._inner, name)
+        if (self._kind, name) == ("equations", "loops"):
+            return tuple(Spy(loop, "loop", self._seen) for loop in found)
+        return Spy(found, name, self._seen) if name in READ else found
+
+
+def load(name, **more):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", crane.CraneWarning)
+        return crane.load(DATA / name if (DATA / name).exists() else name, **more)
+
+
+def text(build):
+    """The formulas that a program is built of."""
+    program = Program()
+    build(program)
+    return text_of(program.functions.values())
+
+
+def formulas(machine, fast):
+    """All kinds of formulas that come from a machine: name and what builds them."""
+    dynamics = crane.Dynamics(machine)
+    n = len(machine.active)
+    yield "loops", lambda program: fast._build(program, fast._signs(fast._home))
+    for name in quantities.QUANTITIES:
+        rest = dynamics.numbers, n, dynamics.carriers, dynamics.plan
+        yield name, lambda p, name=name, rest=rest: quantities._build(p, name, fast, *rest)
+    if machine.tip:
+        for kind in (_FastPoint, _FastFrame):
+            frame = kind(machine, machine.frame(machine.tip))
+            frame._closure = fast
+            yield kind.__name__, frame._build
+
+
+@pytest.mark.parametrize("name", [*MACHINES, "mini_forwarder"])
+def test_formulas_read_nothing_else(name):
+    machine, seen = load(name), set()
+    fast = copy.copy(machine.closure.fast)
+    fast._equations = Spy(fast._equations, "equations", seen)
+    fast._structure = Spy(fast._structure, "structure", seen)
+    fast.geometry = Spy(fast.geometry, "geometry", seen)
+    for _, build in formulas(machine, fast):
+        text(build)
+    assert not {(kind, name) for kind, name in seen if name not in READ[kind]}
+
+
+def keys(fast, equations=None, structure=None, geometry=None, signs=None, **own):
+    """The key of the loops with some of what it is made of changed."""
+    other = copy.copy(fast)
+    other._equations, other._structure, other.geometry = (
+        copy.copy(x) for x in (fast._equations, fast._structure, fast.geometry)
+    )
+    for part, changes in (
+        (other._equations, equations), (other._structure, structure), (other.geometry, geometry),
+    ):  # fmt: skip
+        for attribute, value in (changes or {}).items():
+            object.__setattr__(part, attribute, value)
+    for attribute, value in own.items():
+        setattr(other, attribute, value)
+    return other._key(fast._signs(fast._home) if signs is None else signs)
+
+
+def alone(part, owner, *names):
+    """Changes of some attributes, one at a time."""
+    return [{part: {name: changed(getattr(owner, name))}} for name in names]
+
+
+def changed(value):
+    """Another value of the same kind."""
+    if isinstance(value, tuple):
+        return (*value[:-1], changed(value[-1]))
+    array = np.array(value)
+    array.flat[-1] = not array.flat[-1] if array.dtype == bool else array.flat[-1] + 1
+    return array if isinstance(value, np.ndarray) else array.item()
+
+
+def test_whatever_changes_of_a_machine_changes_the_key(place, tmp_path):
+    fast = load("stewart.urdf").closure.fast
+    coupled = load_coupled(tmp_path).closure.fast
+    equations, structure, geometry = fast._equations, fast._structure, fast.geometry
+    (rows, columns), *blocks = structure.blocks
+    loop = dataclasses.replace(equations.loops[0], type="fixed")
+    different = [
+        *alone("equations", equations, "axis1", "axis2", "is_translation", "loop_of_row", "sign"),
+        *alone("geometry", geometry, "parents", "revolute", "turns", "frame_bodies"),
+        {"equations": {"loops": (loop, *equations.loops[1:])}},
+        {"structure": {"rows": structure.rows[::-1]}},
+        {"structure": {"redundant": np.append(structure.redundant, 0)}},
+        {"structure": {"blocks": ((rows[::-1], columns), *blocks)}},
+        {"structure": {"blocks": ((rows, columns[::-1]), *blocks)}},
+        {"structure": {"blocks": (*structure.blocks, (rows, columns))}},
+        {"structure": {"surplus": Surplus(2.0 * structure.surplus.allowed)}},
+        {"geometry": {"flyers": (1,)}},
+        {"_active": fast._active[::-1]},
+        {"_passive": fast._passive[::-1]},
+        {"signs": -fast._signs(fast._home)},
+    ]
+    for index in (0, 9, -1):
+        for value in (0.0, 1.0, -1.0, -0.0, 0.5):
+            numbers = with_entry(geometry.numbers, index, value)
+            if folded(numbers) != folded(geometry.numbers):
+                different.append({"geometry": {"numbers": numbers}})
+    places = [place_of(keys(fast)), *(place_of(keys(fast, **change)) for change in different)]
+    for name in ("factors", "offsets"):
+        values = changed(getattr(coupled._equations, name))
+        places.append(place_of(keys(coupled, equations={name: values})))
+    places.append(place_of(keys(coupled)))
+    same = [different[i - 1] for i in range(1, len(places)) if places[i] in places[:i]]
+    assert None not in places and not same and len(places) > 25
+    assert place_of(keys(fast)) == places[0]
+
+
+def load_coupled(folder):
+    """A five-bar one of whose cranks follows the other."""
+    text = (DATA / "five_bar.urdf").read_text()
+    text = text.replace(
+        '<joint name="b" type="continuous" independent="true">',
+        '<joint name="b" type="continuous"><mimic joint="a" multiplier="1.5" offset="0.2"/>',
+    )
+    path = folder / "coupled.urdf"
+    path.write_text(text)
+    return load(path, active=["a"])
+
+
+def with_entry(values, index, value):
+    out = values.copy()
+    out[index] = value
+    return out
+
+
+SPECIAL = (0.0, -0.0, 1.0, -1.0, 2.0, 0.3, -0.7, np.nan, np.inf, 1e300)
+
+
+@pytest.mark.parametrize("name", ["loops", "inverse with friction", "energy", "regressor"])
+def test_numbers_that_are_not_told_change_no_formula(name, dressed_crank):
+    """Where numbers say the same to the key, the formulas are the same to the letter."""
+    fast, dynamics = dressed_crank.closure.fast, crane.Dynamics(dressed_crank)
+    base = fast.geometry.numbers if name == "loops" else dynamics.numbers
+    random, texts = np.random.default_rng(3), {}
+    for _ in range(60):
+        some = random.integers(len(base), size=random.integers(1, 4))
+        for values in (base, with_entry(base, some, random.choice(SPECIAL, len(some)))):
+            texts.setdefault(folded(values), set()).add(text_with(name, fast, dynamics, values))
+    for some in random.integers(len(base), size=20):  # and with numbers that are no special ones
+        values = with_entry(base, some, base[some] * 1.25)
+        texts.setdefault(folded(values), set()).add(text_with(name, fast, dynamics, values))
+    assert len(texts) > 30 and all(len(same) == 1 for same in texts.values())
+
+
+def text_with(name, fast, dynamics, values):
+    """The formulas where a machine has other numbers."""
+    other = copy.copy(fast)
+    if name == "loops":
+        other.geometry = dataclasses.replace(fast.geometry, numbers=values)
+        try:
+            return text(lambda program: other._build(program, fast._signs(fast._home)))
+        except ZeroDivisionError:  # no machine
+            return "singular"
+    rest = values, len(dynamics.machine.active), dynamics.carriers, dynamics.plan
+    return text(lambda program: quantities._build(program, name, fast, *rest))
+
+
+@pytest.fixture(scope="module")
+def dressed_crank():
+    return dressed(load("slider_crank.yaml"))
+
+
+def variants(folder):
+    """Machines that share as much as machines can that differ."""
+    crank = load("slider_crank.yaml")
+    flat = load("mini_forwarder")
+    for number, (old, new) in enumerate(
+        (
+            ("", ""), ("type: revolute", "type: spherical"), ("active: [theta]", "active: [phi]"),
+            ("active: [theta]", "active: [s]"), ("phi: -0.5, s: 0.37", "phi: -2.6, s: -0.3"),
+            ("rod_middle", "rod_eye"),
+        )
+    ):  # fmt: skip
+        text = (DATA / "slider_crank.yaml").read_text().replace("urdf: ", f"urdf: {DATA}/")
+        path = folder / f"{number}.yaml"
+        path.write_text(text.replace(old, new) if old else text)
+        yield load(path)
+    yield from (dressed(crank, 3), dressed(crank, 4))
+    yield crank.with_payload(crane.Payload(crank.tip, 2.0))
+    urdf = (DATA / "five_bar.urdf").read_text()
+    for old, new in (
+        ("", ""), ('xyz="0.4 0 0" rpy', 'xyz="0.4 0.1 0" rpy'),
+        ('mass value="0.4"', 'mass value="1"'),
+        ('<axis xyz="0 0 1"/>\n  </joint>\n  <joint name="b"',
+         '<axis xyz="0 0 -1"/>\n  </joint>\n  <joint name="b"'),
+        ("0 0 -0.4", "0 0 1.6"),
+    ):  # fmt: skip
+        assert old in urdf
+        path = folder / "five_bar.urdf"
+        path.write_text(urdf.replace(old, new) if old else urdf)
+        yield load(path)
+    path.write_text(urdf)
+    yield from (load(path, active=names) for names in (["b", "a"], ["a", "c"], ["c", "d"]))
+    yield load_coupled(folder)
+    yield load("stewart.urdf")
+    yield flat
+    yield flat.with_payload(crane.Payload(flat.tip, 0.3))
+
+
+def results(machine):
+    """Some of all that machine code computes, and the same without."""
+    out, again, rng = [], [], np.random.default_rng(5)
+    home = machine.home[machine.closure.active]
+    n = len(home)
+    q_a = home + np.linspace(-5e-4, 5e-4, 4)[:, None]
+    v_a, x = rng.normal(size=(2, 4, n))
+    for formulation in ("exact", "decoupled"):
+        one, two = (
+            crane.Dynamics(machine, formulation, backend) for backend in ("compiled", "pinocchio")
+        )
+        assert one.backend == "compiled"
+        for name in quantities.QUANTITIES if formulation == "exact" else ("inverse", "forward"):
+            q = machine.closure.solve(q_a)
+            out.append(one.at(name, q, v_a, x))
+            again.append(two.at(name, q, v_a, x).reshape(out[-1].shape))
+    q = machine.closure.solve(q_a)
+    out.append(machine.closure.gamma(q))
+    again.append(np.array([machine.closure.motion(row, np.zeros(n))[0] for row in q]))
+    if machine.tip is not None:
+        tip = crane.Kinematics(machine)
+        out += [tip.position(q_a), tip.jacobian(q_a), tip.bias(q_a, v_a)]
+        again += [
+            np.array([function(*row) for row in zip(*given, strict=True)])
+            for function, *given in (
+                (tip.position, q_a), (tip.jacobian, q_a), (tip.bias, q_a, v_a),
+            )
+        ]  # fmt: skip
+    return out, again
+
+
+def counted(kept, built, depends, build):
+    """`Program.kept`, and what it depends on if it has to be built."""
+
+    def told(program):
+        built.append(depends)
+        build(program)
+
+    return kept(depends, told)
+
+
+@pytest.mark.slow
+def test_machines_that_differ_are_right_from_one_folder(place, tmp_path, monkeypatch):
+    """Each finds only what is its own, whatever was kept before it, the second time all of it."""
+    built, first = [], []
+    # something of the standard library, so that the package does not look patched
+    monkeypatch.setattr(Program, "kept", partial(counted, Program.kept, built))
+    for number, machine in enumerate(variants(tmp_path)):
+        found, wanted = results(machine)
+        for one, two in zip(found, wanted, strict=True):
+            size = np.abs(two).max(initial=1e-12)
+            assert np.abs(one - two).max(initial=0.0) <= 1e-9 * size, (number, machine)
+        first.append(found)
+    assert len(built) > 100
+    built.clear()
+    loops._SHARED.clear()
+    for machine, found in zip(variants(tmp_path), first, strict=True):
+        assert all(map(np.array_equal, results(machine)[0], found))
+    assert not built
+
+
+EVERYTHING = """
+import json, sys, warnings
+import numpy as np
+import crane
+from crane.codegen.kept import Note
+from crane.codegen.llvm import objects
+warnings.simplefilter("ignore")
+crane.LOADED += 3600.0
+import test_kept_keys
+notes, write = {}, Note.write
+for name in sys.argv[1:]:
+    machine = test_kept_keys.load(name)
+    for formulation in ("exact", "decoupled"):
+        dynamics = crane.Dynamics(machine, formulation)
+        for quantity in ("inverse with friction", "forward", "observation", "regressor"):
+            dynamics.backend_of(quantity)
+    if machine.tip:
+        tip = crane.Kinematics(machine)
+        tip._fast, tip._points
+    crane.simulate(machine, duration=0.002)
+    for name, task in machine.tasks.items():
+        if task.space == "joystick":
+            controllers = [crane.joystick(machine, name)]
+        else:
+            reference = crane.task_trajectory(machine, name)
+            controllers = [crane.ComputedTorque(machine, reference)]
+            usual = crane.control.usual(machine)
+            controllers.append(crane.control.controller(usual, machine, reference))
+        for controller in controllers:
+            crane.simulate(machine, controller, duration=0.002)
+for file in sorted(objects.folder().glob("*.note")):
+    note = Note.read(file.name)
+    notes[file.name] = [note.code, note.longest, repr(note.functions)]
+print(json.dumps(notes))
+"""
+
+
+@pytest.mark.slow
+def test_what_is_kept_is_what_would_be_traced_now(tmp_path):
+    """Processes of their own, in other orders, one machine each: equal notes under equal names."""
+    names = ["mini_forwarder", "patu655", "kr300", *MACHINES]
+
+    def notes(folder, seed, *machines):
+        here = Path(__file__).parent
+        paths = os.pathsep.join(map(str, (here, Path(crane.__file__).parents[1])))
+        environment = os.environ | {"PYTHONPATH": paths, "PYTHONHASHSEED": str(seed)}
+        environment["XDG_CACHE_HOME"] = str(tmp_path / folder)
+        command = [sys.executable, "-c", EVERYTHING, *machines]
+        run = subprocess.run(command, env=environment, capture_output=True, text=True)
+        assert not run.returncode, run.stderr
+        return json.loads(run.stdout)
+
+    together = notes("all", 1, *names)
+    assert len(together) > 50
+    alone = [notes(name, 2, name) for name in names]
+    for some in alone:
+        assert some.items() <= together.items()
+    assert set().union(*alone) == set(together)
+    assert notes("all", 3, *reversed(names)) == together  # nothing new, nothing changed
