@@ -169,7 +169,7 @@ def test_a_crane_on_its_valves_in_free_fall_keeps_its_momentum(tmp_path):
     machine = crane.load(tmp_path / "models" / "patu655.yaml", floating=True)
     assert machine.free == machine.active[4:]
     run = crane.simulate(machine, crane.joystick(machine, "stir"), duration=1.0)
-    assert np.ptp(run.q[:, machine.active.index("X_lift")]) > 1e-3  # the levers do something
+    assert np.ptp(run.q[:, machine.active.index("X_lift")]) > 1e-4  # the levers do something
     model, data = machine.model, machine.model.createData()
     weight = 9.81 * sum(inertia.mass for inertia in model.inertias)
     for i in range(0, len(run.time), 200):

@@ -11,7 +11,12 @@ from crane.closure.choice import slides
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
 from crane.description import MachineSpec
+<<<<<<< HEAD
 from crane.formats.opening import is_robot, is_sdf
+=======
+from crane.formats.urdf.read import is_urdf
+from crane.machine import Machine
+>>>>>>> home
 
 _LISTED, _WRITTEN = 4, 6  # loops and coordinates in a line
 _QUICK, _THOROUGH = 6, 100  # starts of the search in one block: milliseconds, up to a second
@@ -42,6 +47,16 @@ def warn_of_assemblies(
         found = found[:1]
     for other in found:
         warnings.warn(_told(spec, closure, other) + more, CraneWarning, stacklevel=3)
+
+
+def near_assemblies(machine: Machine) -> list[Array]:
+    """Other postures (nq,) that its file does not rule out, as `crane check` tells them."""
+    closure = machine.closure
+    if not len(closure.passive):
+        return []
+    drawn = machine.path.suffix.lower() in (".xml", ".mjcf") and not is_urdf(machine.path)
+    said = np.arange(closure.model.nv) if drawn else closure.said
+    return [other.q for other in ambiguities(closure, closure.guess, said, _THOROUGH)]
 
 
 def _told(spec: MachineSpec, closure: Closure, other: Assembly) -> str:
