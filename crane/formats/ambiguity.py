@@ -11,12 +11,8 @@ from crane.closure.choice import slides
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
 from crane.description import MachineSpec
-<<<<<<< HEAD
 from crane.formats.opening import is_robot, is_sdf
-=======
-from crane.formats.urdf.read import is_urdf
 from crane.machine import Machine
->>>>>>> home
 
 _LISTED, _WRITTEN = 4, 6  # loops and coordinates in a line
 _QUICK, _THOROUGH = 6, 100  # starts of the search in one block: milliseconds, up to a second
