@@ -157,8 +157,9 @@ def proposals(
 
     Actuators come first where their condition is below 100: joints that slide, and those whose
     effort is limited; pins that only hold parts together usually have no limits. Those whose names
-    say that nothing drives them are left out if the others are enough. Second comes the best-conditioned choice of any joints, or what is best without the joint of the first that
-    the others need least.
+    say that nothing drives them are left out if the others are enough. Second comes the
+    best-conditioned choice of any joints, or what is best without the joint of the first that the
+    others need least.
 
     Args:
         model: The spanning tree.
