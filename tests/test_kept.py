@@ -301,6 +301,14 @@ def test_a_package_that_changes_meanwhile_keeps_nothing(place, monkeypatch):
     assert not files(place, "note")
 
 
+def test_a_package_that_changed_before_it_was_read_finds_nothing(place, monkeypatch):
+    """What its files say is kept, but it is not what was loaded."""
+    assert ask() and not ask()
+    monkeypatch.setattr(crane, "LOADED", 0.0)
+    package._digest.cache_clear()
+    assert ask() and ask()
+
+
 def another(*_):
     return 0.0
 
