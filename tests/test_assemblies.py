@@ -224,9 +224,7 @@ def test_the_sketch_shows_all_that_are_near(tmp_path):
     for index in (1, 2):
         assert f'id="assembly {index}"' in drawn and f"other assembly {index}" in drawn
     values = bucket.assemblies(0.25)[0]
-    home = lines(
-        ", ".join(f"{x}: {v:.3f}" for x, v in zip(bucket.PASSIVE, values, strict=True))
-    )
+    home = lines(", ".join(f"{x}: {v:.3f}" for x, v in zip(bucket.PASSIVE, values, strict=True)))
     path = bucket.write(tmp_path, 0.25, home=home)
     done = typed("sketch", path, "--out", tmp_path / "one.svg")
     assert "dashed" not in done.stdout
