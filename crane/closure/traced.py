@@ -198,6 +198,12 @@ class Bodies:
         along = 2 if i not in self.geometry.flying else (i - max(j for j in flyers if j <= i)) % 3
         return [row[along] for row in self.rotation[i]]
 
+    def axes(self, i: int) -> tuple[Vector, Vector]:
+        """How origin and directions of body i move per unit of its joint: linear, angular."""
+        along: Vector = self.axis(i)
+        still: Vector = [0.0] * 3
+        return (still, along) if self.geometry.revolute[i] else (along, still)
+
     def _flown(self, i: int) -> tuple[list[Vector], Vector]:
         """Rotation and origin of a free-flyer, from its place and rotation vector."""
         turn, place = self._constants.place(i - 1)

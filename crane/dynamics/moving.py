@@ -37,11 +37,6 @@ class Moving:
     rotors: Vector
     forces: Vector
 
-    def axis(self, i: int) -> Pair:
-        """How the origin and the directions of a body move per unit of its joint's motion."""
-        along = self.posture.axis(i)
-        return (NONE[0], along) if self.posture.geometry.revolute[i] else (along, NONE[0])
-
     def force(self, i: int) -> Number:
         """What is left along a joint for more than the reference."""
         return self.forces[i] - self.rotors[i] * self.reference[i]
@@ -61,7 +56,7 @@ class Moving:
 
     def moved(self, i: int, carrier: Pair, rate: Number) -> Pair:
         """What a body accelerates more, from what its parent does."""
-        return plus(shifted(carrier, self.posture.arms[i]), by(rate, self.axis(i)))
+        return plus(shifted(carrier, self.posture.arms[i]), by(rate, self.posture.axes(i)))
 
 
 def hang(hung: Hung, body: int, inertia: Inertia, bias: Pair) -> None:

@@ -67,7 +67,7 @@ class Multiplied:
 
     def _give_way(self, i: int, inside: Hung) -> None:
         """A joint, and what it hands to the body that carries it."""
-        moving, axis = self._moving, self._moving.axis(i)
+        moving, axis = self._moving, self._moving.posture.axes(i)
         parent, arm = moving.posture.geometry.parents[i], moving.posture.arms[i]
         inertia, wrench = moving.all_on(i, NONE[0], inside)
         column = inertia.of(axis)

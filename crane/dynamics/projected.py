@@ -57,7 +57,7 @@ class Projected:
         for i, factors in self._gamma.items():
             parent = moving.posture.geometry.parents[i]
             arms[i] = add(arms[parent], moving.posture.arms[i])
-            axis = shifted(moving.axis(i), scale(-1.0, arms[i]))
+            axis = shifted(moving.posture.axes(i), scale(-1.0, arms[i]))
             ways[i] = [
                 plus(way, by(x, axis)) for way, x in zip(ways[parent], factors, strict=True)
             ]

@@ -31,9 +31,8 @@ from crane.dynamics.projected import Projected
 from crane.machine import Machine
 
 Plan = tuple[tuple[Cluster, bool], ...]
-# independent coordinates of a machine up to which solving with M_A takes fewer operations, and of
-# a cluster up to which `Projected` does
-_FEW, _TIED = 5, 6
+_FEW = 4  # independent coordinates of a machine up to which its bodies' columns give M_A soonest
+_TIED = 6  # those of a cluster up to which `Projected` takes fewer operations
 _LIGHT = 1e-6  # of a joint's inertia: what others do not move of it
 
 
@@ -42,7 +41,7 @@ def planned(machine: Machine) -> Plan:
 
     Returns:
         The clusters, each behind the one that carries it, and whether by the forces of its loops
-        (`Multiplied`); none where solving with M_A takes fewer operations.
+        (`Multiplied`); none of a machine of few freedoms.
     """
     if len(machine.active) <= _FEW:
         return ()

@@ -21,6 +21,7 @@ from crane.codegen.scalar import (
     times,
 )  # fmt: skip
 from crane.common.samples import Array
+from crane.dynamics.composite import Composite
 from crane.dynamics.inertia import Pair
 from crane.dynamics.joint_forces import JointForces
 from crane.dynamics.moving import Moving
@@ -28,6 +29,7 @@ from crane.dynamics.recursion import Plan, accelerations
 from crane.machine import Machine
 
 BODY, JOINT = 10, 19  # numbers per body and per joint
+_SOLVED = 7  # freedoms up to which solving with M_A takes fewer operations than recursion
 _UPPER = np.triu_indices(3)
 
 
@@ -148,6 +150,10 @@ class Sweep:
     @cached_property
     def mass(self) -> list[Vector]:
         """M_A = sum J_b^T I_b J_b + sum gamma_i^T I_r,i gamma_i."""
+        if self._plan:
+            clusters = [cluster for cluster, _ in self._plan]
+            masses, rotors = self._masses, self._rotors
+            return Composite(self._posture, self._loops, masses, rotors, clusters).mass
         out: list[Vector] = [[0.0] * self._n for _ in range(self._n)]
         for i in range(1, self._size):
             mass, _, tensor = self._bodies[i - 1]
@@ -333,7 +339,7 @@ class Sweep:
 
     def forward(self, tau: Sequence[Number], friction: bool) -> Vector:
         """M_A^-1 (tau - bias + passive [- friction])."""
-        if self._plan:
+        if self._plan and self._n > _SOLVED:
             return self._recursive(tau, friction)
         right = add(tau, self._projected(self._forces(friction)))
         return Positive(self.mass).solve(subtract(right, self.inertial_bias))
