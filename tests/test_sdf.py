@@ -252,7 +252,7 @@ def test_models_within_models(tmp_path):
     )
     (hand / "hand.sdf").write_text(
         f'<sdf version="1.9"><model name="hand"><link name="palm">{MASS}</link><frame name="grip">'
-        "<pose>0 0.2 0 0 0 0</pose></frame></model></sdf>"
+        "<pose>0.15 0.2 -0.1 0 0 0</pose></frame></model></sdf>"
     )
     include = (
         "<include><uri>model://my_hand</uri><name>left</name><pose relative_to='b'>0 0 1 0 0 0"
@@ -260,7 +260,7 @@ def test_models_within_models(tmp_path):
     )
     path = written(tmp_path, arm(TWO + hinge("w", "b", "left"), more=include))
     (tmp_path / "flat").mkdir()
-    palm = f"<link name='palm'><pose>0 -0.2 2 0 0 0</pose>{MASS}</link>"
+    palm = f"<link name='palm'><pose>-0.15 -0.2 2.1 0 0 0</pose>{MASS}</link>"
     flat = written(tmp_path / "flat", arm(TWO + hinge("w", "b", "palm"), more=palm))
     rng = np.random.default_rng(0)
     assert_same(load(path, packages=[tmp_path / "models"]), load(flat), rng)
@@ -288,7 +288,8 @@ def test_a_world_with_one_machine(tmp_path):
 def test_what_is_drawn(tmp_path):
     visual = (
         "<visual name='v'><pose relative_to='b'>0 0 1 0 0 0</pose><geometry><box>"
-        "<size>1 2 3</size></box></geometry><material><diffuse>1 0 0 1</diffuse></material></visual>"
+        "<size>1 2 3</size></box></geometry><material><diffuse>1 0 0 1</diffuse></material>"
+        "</visual>"
     )
     text = arm(TWO).replace(MASS, MASS + visual, 1)
     machine = load(written(tmp_path, text))
