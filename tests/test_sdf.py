@@ -293,8 +293,8 @@ def test_what_is_drawn(tmp_path):
     )
     text = arm(TWO).replace(MASS, MASS + visual, 1)
     machine = load(written(tmp_path, text))
-    (xml,) = robots(machine)
-    (drawn,) = xml.root.iter("visual")
+    with robots(machine) as (xml,):
+        (drawn,) = xml.root.iter("visual")
     assert drawn.find("origin").get("xyz").split() == ["0.0", "0.0", "2.0"]
     crane.write_urdf_plus(machine, tmp_path / "out.urdf")
     assert 'size="1 2 3"' in (tmp_path / "out.urdf").read_text()
