@@ -212,6 +212,19 @@ def test_stands_on_the_ground_or_floats(tmp_path):
     assert total == pytest.approx(3.0)
 
 
+def test_parts_apart(tmp_path):
+    """Those that nothing ties to a grounded one fall freely; if all float, each does."""
+    path = written(tmp_path, arm(hinge("p", "world", "a"), links=("a", "b")))
+    machine, told = warnings_of(path)
+    assert machine.free == tuple(f"b_free_{x}" for x in ("x", "y", "z", "rx", "ry", "rz"))
+    assert told == [
+        "arm.sdf: otherwise than in SDF: links that no joint ties to the others float (b)"
+    ]
+    path = written(tmp_path, arm(hinge("p", "a", "b"), links=("a", "b", "c")))
+    assert load(path).joints == ("p",)
+    assert len(load(path, floating=True).joints) == 13
+
+
 def test_a_link_without_mass_weighs_what_sdf_says(tmp_path):
     text = arm(TWO).replace(MASS, "", 1).replace('name="b"><pose>', 'name="b" ><pose>')
     machine, told = warnings_of(written(tmp_path, text))

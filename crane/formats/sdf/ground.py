@@ -37,25 +37,26 @@ class Ground:
         self._top, self._links, self._at, self._notes = top, links, at, notes
 
     def welds(self, edges: list[Edge]) -> list[Edge]:
-        """What ties parts to the world that no joint ties to it.
+        """Joints of the parts that no joint ties to the world.
 
-        Where none is, all stand on the ground as they are drawn, or the first floats with the
-        root; where some are, the file lets the others float.
+        Where none is tied to it, all stand on the ground as they are drawn, or float if that was
+        asked for; where some are, the file lets the others float.
         """
         groups = Groups()
         for edge in edges:
             groups.join(edge.parent, edge.child)
         grounded = any(WORLD in (edge.parent, edge.child) for edge in edges)
-        welds: list[Edge] = []
-        for link in self._roots(edges):
-            if groups.join(WORLD, link):
-                stands = not grounded and not (welds and given().floating)
-                kind = "fixed" if stands else "floating"
-                name = self._free_name(f"{link}_{'world' if stands else 'free'}", edges)
-                place, item = self._at[link], self._links[link][1]
-                welds.append(Edge(name, kind, WORLD, link, place, item))
-        self._tell_of_welds(welds)
+        loose = [link for link in self._roots(edges) if groups.join(WORLD, link)]
+        # a single one is made to float as those of other formats are
+        stands = not grounded and not (given().floating and len(loose) > 1)
+        welds = [self._weld(link, stands, edges) for link in loose]
+        self._tell(welds, stands)
         return welds
+
+    def _weld(self, link: str, stands: bool, edges: list[Edge]) -> Edge:
+        name = self._free_name(f"{link}_{'world' if stands else 'free'}", edges)
+        kind = "fixed" if stands else "floating"
+        return Edge(name, kind, WORLD, link, self._at[link], self._links[link][1])
 
     def _roots(self, edges: list[Edge]) -> list[str]:
         """All links, those first that a part may stand on: no joint's child, canonical ones."""
@@ -64,20 +65,20 @@ class Ground:
         children = {edge.child for edge in edges}
         return sorted(self._links, key=lambda link: (link in children, link != chosen))
 
-    def _tell_of_welds(self, welds: list[Edge]) -> None:
-        standing = [weld for weld in welds if weld.kind == "fixed"]
-        floating = [weld.child for weld in welds if weld.kind != "fixed"]
-        if floating:
-            self._notes.differ("links that no joint ties to the others float", *floating)
-        if standing and not given().floating:
-            names = ", ".join(f"'{weld.child}'" for weld in standing[:_LISTED])
-            warnings.warn(
-                f"{standing[0].item.where}: nothing joins '{self._top.name}' to the world, it is "
-                f"taken as standing on the ground by link {names}: --floating (floating=True) "
-                "lets it float",
-                CraneWarning,
-                stacklevel=3,
-            )
+    def _tell(self, welds: list[Edge], stand: bool) -> None:
+        if not welds or given().floating:
+            return
+        links = [weld.child for weld in welds]
+        if not stand:
+            self._notes.differ("links that no joint ties to the others float", *links)
+            return
+        names = ", ".join(f"'{link}'" for link in links[:_LISTED])
+        warnings.warn(
+            f"{welds[0].item.where}: nothing joins '{self._top.name}' to the world, it is taken "
+            f"as standing on the ground by link {names}: --floating (floating=True) lets it float",
+            CraneWarning,
+            stacklevel=3,
+        )
 
     def _free_name(self, name: str, edges: list[Edge]) -> str:
         taken = {edge.name for edge in edges}
