@@ -212,6 +212,19 @@ def test_stands_on_the_ground_or_floats(tmp_path):
     assert total == pytest.approx(3.0)
 
 
+def test_parts_apart(tmp_path):
+    """Those that nothing ties to a grounded one fall freely; if all float, each does."""
+    path = written(tmp_path, arm(hinge("p", "world", "a"), links=("a", "b")))
+    machine, told = warnings_of(path)
+    assert machine.free == tuple(f"b_free_{x}" for x in ("x", "y", "z", "rx", "ry", "rz"))
+    assert told == [
+        "arm.sdf: otherwise than in SDF: links that no joint ties to the others float (b)"
+    ]
+    path = written(tmp_path, arm(hinge("p", "a", "b"), links=("a", "b", "c")))
+    assert load(path).joints == ("p",)
+    assert len(load(path, floating=True).joints) == 13
+
+
 def test_a_link_without_mass_weighs_what_sdf_says(tmp_path):
     text = arm(TWO).replace(MASS, "", 1).replace('name="b"><pose>', 'name="b" ><pose>')
     machine, told = warnings_of(written(tmp_path, text))
@@ -252,7 +265,7 @@ def test_models_within_models(tmp_path):
     )
     (hand / "hand.sdf").write_text(
         f'<sdf version="1.9"><model name="hand"><link name="palm">{MASS}</link><frame name="grip">'
-        "<pose>0 0.2 0 0 0 0</pose></frame></model></sdf>"
+        "<pose>0.15 0.2 -0.1 0 0 0</pose></frame></model></sdf>"
     )
     include = (
         "<include><uri>model://my_hand</uri><name>left</name><pose relative_to='b'>0 0 1 0 0 0"
@@ -260,7 +273,7 @@ def test_models_within_models(tmp_path):
     )
     path = written(tmp_path, arm(TWO + hinge("w", "b", "left"), more=include))
     (tmp_path / "flat").mkdir()
-    palm = f"<link name='palm'><pose>0 -0.2 2 0 0 0</pose>{MASS}</link>"
+    palm = f"<link name='palm'><pose>-0.15 -0.2 2.1 0 0 0</pose>{MASS}</link>"
     flat = written(tmp_path / "flat", arm(TWO + hinge("w", "b", "palm"), more=palm))
     rng = np.random.default_rng(0)
     assert_same(load(path, packages=[tmp_path / "models"]), load(flat), rng)
@@ -288,12 +301,13 @@ def test_a_world_with_one_machine(tmp_path):
 def test_what_is_drawn(tmp_path):
     visual = (
         "<visual name='v'><pose relative_to='b'>0 0 1 0 0 0</pose><geometry><box>"
-        "<size>1 2 3</size></box></geometry><material><diffuse>1 0 0 1</diffuse></material></visual>"
+        "<size>1 2 3</size></box></geometry><material><diffuse>1 0 0 1</diffuse></material>"
+        "</visual>"
     )
     text = arm(TWO).replace(MASS, MASS + visual, 1)
     machine = load(written(tmp_path, text))
-    (xml,) = robots(machine)
-    (drawn,) = xml.root.iter("visual")
+    with robots(machine) as (xml,):
+        (drawn,) = xml.root.iter("visual")
     assert drawn.find("origin").get("xyz").split() == ["0.0", "0.0", "2.0"]
     crane.write_urdf_plus(machine, tmp_path / "out.urdf")
     assert 'size="1 2 3"' in (tmp_path / "out.urdf").read_text()

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,8 +59,9 @@ def is_sdf(file: Path) -> bool:
     return suffix in _SDF or (suffix == ".xml" and XmlFile(file).root.tag == "sdf")
 
 
-def robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterator[XmlFile]:
-    """The robots that a machine was made of, as they are drawn; of MJCF there are none.
+@contextmanager
+def robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterator[list[XmlFile]]:
+    """The robots that a machine was made of, while its packages are known; of MJCF there are none.
 
     Args:
         machine: The machine.
@@ -67,9 +69,11 @@ def robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterator[Xm
     """
     wanted = None if chains is None else set(chains)
     with giving(machine.packages, machine.arguments):
-        for chain in machine.chains:
-            if is_robot(chain.urdf) and (not wanted or chain.name in wanted):
-                with warnings.catch_warnings():  # which were told when it was loaded
-                    warnings.simplefilter("ignore", CraneWarning)
-                    xml = opened(chain.urdf).xml
-                yield xml
+        with warnings.catch_warnings():  # which were told when it was loaded
+            warnings.simplefilter("ignore", CraneWarning)
+            found = [
+                opened(chain.urdf).xml
+                for chain in machine.chains
+                if is_robot(chain.urdf) and (not wanted or chain.name in wanted)
+            ]
+        yield found

@@ -96,10 +96,11 @@ def draw(robot: etree._Element, machine: Machine, chains: Iterable[str] | None =
     """Copy what a machine's URDFs draw to the links of the same names."""
     links = {link.get("name"): link for link in robot.iterfind("link")}
     materials: dict[str, etree._Element] = {}
-    for xml in robots(machine, chains):
-        for material in xml.root.iterfind("material"):
-            materials.setdefault(material.get("name", ""), copy.deepcopy(material))
-        _copy_shapes(xml.root, links, xml.file.parent)
+    with robots(machine, chains) as sources:
+        for xml in sources:
+            for material in xml.root.iterfind("material"):
+                materials.setdefault(material.get("name", ""), copy.deepcopy(material))
+            _copy_shapes(xml.root, links, xml.file.parent)
     for material in reversed(materials.values()):
         robot.insert(0, material)
 

@@ -53,7 +53,9 @@ def wrong_axis(
         labels = [*(names[i] for i in ring), f"loop {loop.name}"]
         for odd, normal in _odd_ones(axes, turns):
             column = ring[odd] if odd < len(ring) else None
-            frame = _frame_of(model, data, loop if column is None else column)
+            if column is not None and not model.existJointName(names[column]):
+                continue  # of a body that floats, which has no axes
+            frame = _frame_of(model, data, loop if column is None else names[column])
             turned = _turned(frame.T @ axes[odd][0], frame.T @ normal, turns[odd])
             changed, some = spec, list(loops)
             if column is None:
@@ -69,14 +71,15 @@ def wrong_axis(
     return None
 
 
-def _frame_of(model: pin.Model, data: pin.Data, of: LoopSpec | int) -> Array:
-    """Axes (3, 3) of the frame that the axis of a loop is written in, or of a joint's column."""
+def _frame_of(model: pin.Model, data: pin.Data, of: LoopSpec | str) -> Array:
+    """Axes (3, 3) of the frame that the axis of a loop is written in, or of a joint's."""
     if isinstance(of, LoopSpec):
         link = model.frames[frame_id(model, of.predecessor)]
         frame: Array = data.oMi[link.parentJoint].rotation @ link.placement.rotation
     else:
-        above = data.oMi[model.parents[of + 1]].rotation
-        frame = above @ model.jointPlacements[of + 1].rotation
+        joint = model.getJointId(of)
+        above = data.oMi[model.parents[joint]].rotation
+        frame = above @ model.jointPlacements[joint].rotation
     return frame
 
 

@@ -114,7 +114,9 @@ class Reader:
         scope = Scope(Item(self.xml, top, "the world"), "", None, version)
         self._fill(scope, scope.item, 0)
         if not scope.models:
-            raise self.xml.fail(root, "no <model> in this file that is there, add one")
+            raise self.xml.fail(
+                root, "there is no <model> in this file, or none that is found: add one"
+            )
         return scope
 
     def _fill(self, scope: Scope, item: Item, depth: int) -> None:

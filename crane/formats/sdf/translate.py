@@ -7,22 +7,25 @@ coordinate stays what it is in SDF.
 """
 
 import dataclasses
-import math
-import warnings
 
-import numpy as np
 import pinocchio as pin
 from lxml import etree
 
-from crane.common.errors import CraneWarning, DescriptionError, known
+from crane.common.errors import DescriptionError, known
 from crane.common.packages import given
-from crane.description.rigid import placement
 from crane.description.spec import ForceElement
-from crane.description.tree import NO_LIMIT
 from crane.formats.sdf.bodies import add_inertial, warn_of_no_inertial
+from crane.formats.sdf.elements import (
+    add_axis,
+    add_dynamics,
+    add_limit,
+    add_origin,
+    is_limited,
+)
 from crane.formats.sdf.frames import Frames, canonical
 from crane.formats.sdf.gears import followers_of, with_gears
 from crane.formats.sdf.graph import Groups, downwards, spanning
+from crane.formats.sdf.ground import Ground
 from crane.formats.sdf.joints import WORLD, Axis, Edge, Follower, Joints
 from crane.formats.sdf.left_out import LeftOut
 from crane.formats.sdf.scope import Reader, Scope
@@ -95,7 +98,7 @@ class _Translation:
         groups = _rigid(joints.edges)
         edges, gears = with_gears([_stiff(edge, self._notes) for edge in joints.edges],
                                   joints.gears, groups)  # fmt: skip
-        edges += self._welds(edges)
+        edges += Ground(self._top, self._links, self._at, self._notes).welds(edges)
         for edge in edges:
             if edge.between:
                 self._at[edge.child] = edge.place
@@ -127,55 +130,6 @@ class _Translation:
         inside = self._frames.of(scope, link, link.base)
         self._at[full] = self._frames.in_top(scope, self._top) * inside
 
-    def _welds(self, edges: list[Edge]) -> list[Edge]:
-        """What ties parts to the world that no joint ties to it.
-
-        Where none is, all stand on the ground as they are drawn, or the first floats with the
-        root; where some are, the file lets the others float.
-        """
-        groups = Groups()
-        for edge in edges:
-            groups.join(edge.parent, edge.child)
-        grounded = any(WORLD in (edge.parent, edge.child) for edge in edges)
-        welds: list[Edge] = []
-        for link in self._roots(edges):
-            if groups.join(WORLD, link):
-                stands = not grounded and not (welds and given().floating)
-                kind = "fixed" if stands else "floating"
-                name = self._free_name(f"{link}_{'world' if stands else 'free'}", edges)
-                place, item = self._at[link], self._links[link][1]
-                welds.append(Edge(name, kind, WORLD, link, place, item))
-        self._tell_of_welds(welds)
-        return welds
-
-    def _roots(self, edges: list[Edge]) -> list[str]:
-        """All links, those first that a part may stand on: no joint's child, canonical ones."""
-        first = canonical(self._top, self._top.item)
-        chosen = "" if first is None else f"{first[0].prefix}{first[1]}"
-        children = {edge.child for edge in edges}
-        return sorted(self._links, key=lambda link: (link in children, link != chosen))
-
-    def _tell_of_welds(self, welds: list[Edge]) -> None:
-        standing = [weld for weld in welds if weld.kind == "fixed"]
-        floating = [weld.child for weld in welds if weld.kind != "fixed"]
-        if floating:
-            self._notes.differ("links that no joint ties to the others float", *floating)
-        if standing and not given().floating:
-            names = ", ".join(f"'{weld.child}'" for weld in standing[:4])
-            warnings.warn(
-                f"{standing[0].item.where}: nothing joins '{self._top.name}' to the world, it is "
-                f"taken as standing on the ground by link {names}: --floating (floating=True) "
-                "lets it float",
-                CraneWarning,
-                stacklevel=3,
-            )
-
-    def _free_name(self, name: str, edges: list[Edge]) -> str:
-        taken = {edge.name for edge in edges}
-        while name in taken:
-            name += "_"
-        return name
-
     # --- what is written ---------------------------------------------------------------------
 
     def _add_links(self, edges: list[Edge]) -> None:
@@ -201,16 +155,16 @@ class _Translation:
         link = self._moved(edge, ends[1])
         kind = {"ball": "spherical"}.get(edge.kind, edge.kind)
         axis = edge.axis
-        if axis is not None and edge.kind == "revolute" and not _limited(axis):
+        if axis is not None and edge.kind == "revolute" and not is_limited(axis):
             kind = "continuous"
         joint = etree.SubElement(self._robot, "joint", name=edge.name, type=kind)
-        _origin(joint, self._at[ends[0]].actInv(edge.place))
+        add_origin(joint, self._at[ends[0]].actInv(edge.place))
         etree.SubElement(joint, "parent", link=self._names.get(ends[0], ends[0]))
         etree.SubElement(joint, "child", link=link)
         if axis is not None:
-            _axis(joint, axis.direction if forward else -axis.direction)
-            _limit(joint, axis)
-            _dynamics(joint, axis)
+            add_axis(joint, axis.direction if forward else -axis.direction)
+            add_limit(joint, axis)
+            add_dynamics(joint, axis)
             self._note_forces(edge.name, axis)
             if driven is not None:
                 joint.set("independent", str(edge.name in driven).lower())
@@ -224,7 +178,7 @@ class _Translation:
         name = self._free_link(f"{edge.name}_frame")
         self._put(etree.SubElement(self._robot, "link", name=name), edge.item)
         fixed = etree.SubElement(self._robot, "joint", name=f"{name}_fixed", type="fixed")
-        _origin(fixed, offset)
+        add_origin(fixed, offset)
         etree.SubElement(fixed, "parent", link=name)
         etree.SubElement(fixed, "child", link=self._names.get(link, link))
         self._put(fixed, edge.item)
@@ -282,10 +236,10 @@ class _Translation:
             loop = etree.SubElement(self._robot, "loop", name=edge.name, type=kind)
             for tag, link in (("predecessor", edge.parent), ("successor", edge.child)):
                 end = etree.SubElement(loop, tag, link=self._names.get(link, link))
-                _origin(end, self._at[link].actInv(edge.place))
+                add_origin(end, self._at[link].actInv(edge.place))
             if edge.axis is not None:
-                _axis(loop, edge.axis.direction)
-                if _limited(edge.axis):
+                add_axis(loop, edge.axis.direction)
+                if is_limited(edge.axis):
                     self._notes.lose("limits of joints that close loops", edge.name)
                 if edge.axis.damping or edge.axis.friction or edge.axis.stiffness:
                     self._notes.lose("friction and springs of joints that close loops", edge.name)
@@ -331,36 +285,3 @@ def _driven(edges: list[Edge], followers: list[Follower]) -> set[str] | None:
     driven = {name for name, axis in single.items() if axis.effort and name not in following}
     passive = {name for name, axis in single.items() if not axis.effort}
     return driven if driven and passive else None
-
-
-def _limited(axis: Axis) -> bool:
-    return math.isfinite(axis.lower) or math.isfinite(axis.upper)
-
-
-def _origin(element: etree._Element, place: pin.SE3) -> None:
-    xyz, rpy = placement(place)
-    etree.SubElement(element, "origin", xyz=_text(xyz), rpy=_text(rpy))
-
-
-def _axis(element: etree._Element, direction: np.ndarray) -> None:
-    etree.SubElement(element, "axis", xyz=_text(direction))
-
-
-def _limit(joint: etree._Element, axis: Axis) -> None:
-    values = {"effort": axis.effort, "velocity": axis.velocity}
-    if joint.get("type") != "continuous":
-        values |= {"lower": axis.lower, "upper": axis.upper}
-    elif all(map(math.isinf, values.values())):
-        return
-    ends = {key: repr(min(max(x, -NO_LIMIT), NO_LIMIT)) for key, x in values.items()}
-    etree.SubElement(joint, "limit", ends)
-
-
-def _dynamics(joint: etree._Element, axis: Axis) -> None:
-    if axis.damping or axis.friction:
-        values = {"damping": repr(axis.damping), "friction": repr(axis.friction)}
-        etree.SubElement(joint, "dynamics", values)
-
-
-def _text(values: tuple[float, ...] | np.ndarray) -> str:
-    return " ".join(repr(float(value) + 0.0) for value in values)

@@ -22,11 +22,12 @@ def read_visuals(machine: Machine) -> list[Visual]:
     missing: list[str] = []
     problems: list[str] = []
     box = Box((0.15 * _reach(machine),) * 3)
-    for xml in robots(machine):
-        drawn = read_drawn(xml, instead=box)
-        visuals += drawn.shapes["visual"]
-        missing += drawn.missing
-        problems += drawn.problems
+    with robots(machine) as sources:
+        for xml in sources:
+            drawn = read_drawn(xml, instead=box)
+            visuals += drawn.shapes["visual"]
+            missing += drawn.missing
+            problems += drawn.problems
     if missing:
         _warn(
             f"{machine.name}: {len(missing)} mesh files are not there and are drawn as boxes "
