@@ -73,7 +73,7 @@ class Task:
         return q if gap <= DIGITS * 1e-4 else None
 
     def by_scipy(self, start: np.ndarray | None = None) -> np.ndarray | None:
-        """scipy's trust region method on the passive joints, within limits."""
+        """Scipy's trust region method on the passive joints, within limits."""
         q = (self.start if start is None else start).copy()
 
         def evaluate(passive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -59,6 +59,7 @@ class Mechanism:
         return self.body(name, parent, point, turned[:, freedoms - 1])
 
     def loop(self, one, two, point, axis=Y, kind="revolute"):
+        """A joint that closes a loop between two bodies."""
         self.loops.append((one, two, np.asarray(point, dtype=float), np.asarray(axis), kind))
 
     def urdf(self, home=None):
@@ -139,16 +140,19 @@ def _dyad(m, one, at, two, foot, name):
 
 
 def four_bar(m):
+    """Four bars."""
     _four_bar(m)
 
 
 def six_bar(m):
+    """Watt's or Stephenson's, as it is drawn."""
     eye = _four_bar(m)
     (foot,) = _spread(m.random, (1.8, 0.1))
     _dyad(m, "coupler", eye, GROUND, foot, "a")
 
 
 def eight_bar(m):
+    """Another dyad on top."""
     eye = _four_bar(m)
     one, two = _spread(m.random, (1.8, 0.1), (2.8, 0.2))
     knee = _dyad(m, "coupler", eye, GROUND, one, "a")
@@ -191,7 +195,10 @@ def _points(random, *centres):
 
 
 def rssr(m):
-    one, two, crank, rocker = _points(m.random, (0.4, 0, 0.3), (1.2, 0.3, 0.9), (0, 0, 0), (1, 0.4, 0))
+    """Two cranks about any axes, and a rod between balls, one of them a cross."""
+    one, two, crank, rocker = _points(
+        m.random, (0.4, 0, 0.3), (1.2, 0.3, 0.9), (0, 0, 0), (1, 0.4, 0)
+    )
     axes = m.random.normal(size=(2, 3))
     axes /= np.linalg.norm(axes, axis=1)[:, None]
     m.body("crank", GROUND, crank, axes[0], driven=True)
@@ -201,7 +208,10 @@ def rssr(m):
 
 
 def rsur(m):
-    one, two, crank, rocker = _points(m.random, (0.4, 0, 0.3), (1.2, 0.3, 0.9), (0, 0, 0), (1, 0.4, 0))
+    """Likewise with the cross in the loop."""
+    one, two, crank, rocker = _points(
+        m.random, (0.4, 0, 0.3), (1.2, 0.3, 0.9), (0, 0, 0), (1, 0.4, 0)
+    )
     turned = pin.Quaternion(m.random.normal(size=4)).normalized().toRotationMatrix()
     axes = m.random.normal(size=(2, 3))
     axes /= np.linalg.norm(axes, axis=1)[:, None]
@@ -213,7 +223,10 @@ def rsur(m):
 
 
 def bennett(m):
-    """a / sin(alpha) = b / sin(beta), tan(p/2) tan(q/2) = sin((beta+alpha)/2)/sin((beta-alpha)/2)."""
+    """Four pins, a / sin(alpha) = b / sin(beta); its turns p and q follow from each other.
+
+    tan(p/2) tan(q/2) = sin((beta + alpha)/2) / sin((beta - alpha)/2).
+    """
     alpha, beta = m.random.uniform(0.3, 0.8), m.random.uniform(1.0, 1.4)
     a, b = np.sin(alpha), np.sin(beta)
     first = m.random.uniform(0.6, 2.4)
@@ -238,7 +251,9 @@ def stewart(m):
     """Six legs of a cross, a slide and a ball; the first carries the platform."""
     around = np.arange(6) * np.pi / 3
     feet = np.column_stack([np.cos(around), np.sin(around), 0 * around])
-    eyes = np.column_stack([0.6 * np.cos(around + 0.5), 0.6 * np.sin(around + 0.5), 0 * around + 1])
+    eyes = np.column_stack(
+        [0.6 * np.cos(around + 0.5), 0.6 * np.sin(around + 0.5), 0 * around + 1]
+    )
     feet, eyes = (x + m.random.uniform(-0.15, 0.15, (6, 3)) for x in (feet, eyes))
     for i, (foot, eye) in enumerate(zip(feet, eyes, strict=True)):
         m.ball(f"leg{i}_", GROUND, foot, 2)

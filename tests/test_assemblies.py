@@ -206,8 +206,8 @@ def test_a_home_far_from_what_the_file_says_is_told(tmp_path):
         assert len(far) == (off > 0.5)
         if far:
             assert re.search(
-                r"bucket\.yaml:8: home was sought, because from what the file says of it \w+ closes "
-                r"far off; the driven joints held, .* that was found has \w+ 0\.9\d* rad off: look "
+                r"bucket\.yaml:8: home was sought, because from what the file says of it \w+ "
+                r"closes far off; the driven joints held, .* that was found has \w+ 0\.9\d* rad off: look "
                 r"at it with crane sketch, and keep it with crane check --write-home",
                 far[0],
             )
@@ -224,9 +224,7 @@ def test_the_sketch_shows_all_that_are_near(tmp_path):
     for index in (1, 2):
         assert f'id="assembly {index}"' in drawn and f"other assembly {index}" in drawn
     values = bucket.assemblies(0.25)[0]
-    home = lines(
-        ", ".join(f"{x}: {v:.3f}" for x, v in zip(bucket.PASSIVE, values, strict=True))
-    )
+    home = lines(", ".join(f"{x}: {v:.3f}" for x, v in zip(bucket.PASSIVE, values, strict=True)))
     path = bucket.write(tmp_path, 0.25, home=home)
     done = typed("sketch", path, "--out", tmp_path / "one.svg")
     assert "dashed" not in done.stdout

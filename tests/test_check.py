@@ -819,7 +819,8 @@ def test_findings_of_one_kind_are_one_line_on_one_screen(tmp_path):
     parts = ['<robot name="many"><link name="l0"/>']
     for i in range(30):
         parts.append(
-            f'<link name="l{i + 1}"><visual><geometry><mesh filename="{i}.stl"/></geometry></visual>'
+            f'<link name="l{i + 1}"><visual><geometry><mesh filename="{i}.stl"/></geometry>'
+            "</visual>"
             '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
             f'</inertial></link>\n<joint name="j{i}" type="revolute"><parent link="l{i}"/>'
             f'<child link="l{i + 1}"/><limit effort="1" velocity="1"/></joint>'

@@ -122,9 +122,9 @@ def watched(what: str) -> Iterator[None]:
         return
     line = _Line(errors)
     watch = _Watch(what, line)
-    sys.stderr = _Stream(errors, line)  # type: ignore[assignment]
+    sys.stderr = _Stream(errors, line)
     if out is not None:
-        sys.stdout = _Stream(out, line)  # type: ignore[assignment]
+        sys.stdout = _Stream(out, line)
     watch.start()
     try:
         yield

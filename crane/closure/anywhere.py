@@ -79,9 +79,7 @@ def winding(equations: LoopEquations) -> NDArray[np.bool_]:
     return np.asarray(winds)
 
 
-def unwound(
-    q: Array, near: Array, winds: NDArray[np.bool_], lower: Array, upper: Array
-) -> Array:
+def unwound(q: Array, near: Array, winds: NDArray[np.bool_], lower: Array, upper: Array) -> Array:
     """The same posture with whole turns so that joints are in limits, and near another one.
 
     Args:
@@ -98,8 +96,12 @@ def unwound(
     turn = 2 * np.pi
     turned = np.where(winds, near + np.remainder(q - near + np.pi, turn) - np.pi, q)
     slack = 1e-12
-    turned += np.where(winds & (turned < lower), turn * np.ceil((lower - slack - turned) / turn), 0)
-    turned -= np.where(winds & (turned > upper), turn * np.ceil((turned - upper - slack) / turn), 0)
+    turned += np.where(
+        winds & (turned < lower), turn * np.ceil((lower - slack - turned) / turn), 0
+    )
+    turned -= np.where(
+        winds & (turned > upper), turn * np.ceil((turned - upper - slack) / turn), 0
+    )
     kept = (turned >= lower - slack) & (turned <= upper + slack)
     return np.where(winds & kept, turned, q)
 
@@ -153,9 +155,7 @@ class Search:
                 found.append(q)
         return sorted(found, key=self.away)
 
-    def _within(
-        self, start: Array, free: Indices, beyond: Indices, enough: float
-    ) -> Array | None:
+    def _within(self, start: Array, free: Indices, beyond: Indices, enough: float) -> Array | None:
         """Along the limits from one start; else across them, where whole turns lead back."""
         for loose in (beyond, free):
             q, gap = self.descend(start, free, loose)
@@ -178,7 +178,7 @@ class Search:
         )
 
     def off_said(self, q: Array) -> tuple[int, float]:
-        """The joint that is farthest from what is said, and by how much [rad], [machine's size]."""
+        """The joint farthest from what is said, and by how much [rad], [machine's size]."""
         if not len(self._said):
             return 0, 0.0
         apart = self.apart(q, self.guess)[self._said]

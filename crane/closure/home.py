@@ -8,8 +8,8 @@ Where the loops do not close from the guess, they are closed from anywhere
 3. the same two with passive joints beyond their limits.
 
 So are they where the active joints are too few or too many where it closes, and where home as it
-closes from the guess is outside of limits or more than 0.5 rad (or of the machine's size) from what
-the file says. Then home is kept where none that is found is nearer, and told in any case.
+closes from the guess is outside of limits or more than 0.5 rad (or half of the machine's size)
+from what the file says. Then home is kept where none that is found is nearer; far off, it is told.
 
 The first of these that closes counts, and of the postures that it finds the one that is nearest to
 the guess, see `Search.postures`.
@@ -97,7 +97,8 @@ def settle(
             raise refused if isinstance(refused, ActiveError) else usable
     if first is None:
         raise refused
-    return first, _sought(search, reason, 1, first.home)
+    far = search.off_said(first.home)[1] > _FAR
+    return first, _sought(search, reason, 1, first.home) if far else None
 
 
 def _doubt(search: Search, equations: LoopEquations, passive: Indices, home: Array) -> str:
