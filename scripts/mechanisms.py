@@ -59,6 +59,7 @@ class Mechanism:
         return self.body(name, parent, point, turned[:, freedoms - 1])
 
     def loop(self, one, two, point, axis=Y, kind="revolute"):
+        """A joint that closes a loop between two bodies."""
         self.loops.append((one, two, np.asarray(point, dtype=float), np.asarray(axis), kind))
 
     def urdf(self, home=None):
@@ -139,16 +140,19 @@ def _dyad(m, one, at, two, foot, name):
 
 
 def four_bar(m):
+    """Four bars."""
     _four_bar(m)
 
 
 def six_bar(m):
+    """Watt's or Stephenson's, as it is drawn."""
     eye = _four_bar(m)
     (foot,) = _spread(m.random, (1.8, 0.1))
     _dyad(m, "coupler", eye, GROUND, foot, "a")
 
 
 def eight_bar(m):
+    """Another dyad on top."""
     eye = _four_bar(m)
     one, two = _spread(m.random, (1.8, 0.1), (2.8, 0.2))
     knee = _dyad(m, "coupler", eye, GROUND, one, "a")
@@ -191,6 +195,7 @@ def _points(random, *centres):
 
 
 def rssr(m):
+    """Two cranks about any axes, and a rod between balls, one of them a cross."""
     one, two, crank, rocker = _points(
         m.random, (0.4, 0, 0.3), (1.2, 0.3, 0.9), (0, 0, 0), (1, 0.4, 0)
     )
@@ -203,6 +208,7 @@ def rssr(m):
 
 
 def rsur(m):
+    """Likewise with the cross in the loop."""
     one, two, crank, rocker = _points(
         m.random, (0.4, 0, 0.3), (1.2, 0.3, 0.9), (0, 0, 0), (1, 0.4, 0)
     )
@@ -217,7 +223,10 @@ def rsur(m):
 
 
 def bennett(m):
-    """A / sin(alpha) = b / sin(beta), tan(p/2) tan(q/2) = sin((beta+alpha)/2)/sin((beta-alpha)/2)."""
+    """Four pins, a / sin(alpha) = b / sin(beta); its turns p and q follow from each other.
+
+    tan(p/2) tan(q/2) = sin((beta + alpha)/2) / sin((beta - alpha)/2).
+    """
     alpha, beta = m.random.uniform(0.3, 0.8), m.random.uniform(1.0, 1.4)
     a, b = np.sin(alpha), np.sin(beta)
     first = m.random.uniform(0.6, 2.4)

@@ -206,9 +206,9 @@ def test_a_home_far_from_what_the_file_says_is_told(tmp_path):
         assert len(far) == (off > 0.5)
         if far:
             assert re.search(
-                r"bucket\.yaml:8: home was sought, because from what the file says of it \w+ closes "
-                r"far off; the driven joints held, .* that was found has \w+ 0\.9\d* rad off: look "
-                r"at it with crane sketch, and keep it with crane check --write-home",
+                r"bucket\.yaml:8: home was sought, because from what the file says of it \w+ "
+                r"closes far off; the driven joints held, .* that was found has \w+ 0\.9\d* rad "
+                r"off: look at it with crane sketch, and keep it with crane check --write-home",
                 far[0],
             )
 

@@ -15,7 +15,11 @@ from crane.formats import loading
 waiting._AFTER, waiting._EVERY = float(sys.argv.pop()), 0.05
 
 @app.command()
-def wait(seconds: float, bar: bool = False):
+def wait(seconds: float, bar: bool = False, served: bool = False):
+    if served:
+        with waiting.shown():
+            time.sleep(seconds)
+        return
     if bar:
         with progress_bar("counting"):
             time.sleep(seconds)
@@ -78,6 +82,11 @@ def test_what_is_quick_says_nothing():
 def test_a_bar_stands_alone():
     told = on_terminal("0.8", "--bar")
     assert "crane wait:" not in told.split("compiling the machine", 1)[1]
+
+
+def test_what_waits_for_the_user_says_nothing():
+    told = on_terminal("0.8", "--served", after="0.6")
+    assert left(told) == [""] and told.count("crane wait:") == 0
 
 
 def test_pipes_hear_nothing():

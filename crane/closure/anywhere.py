@@ -178,7 +178,7 @@ class Search:
         )
 
     def off_said(self, q: Array) -> tuple[int, float]:
-        """The joint that is farthest from what is said, and by how much [rad], [machine's size]."""
+        """The joint farthest from what is said, and by how much [rad], [machine's size]."""
         if not len(self._said):
             return 0, 0.0
         apart = self.apart(q, self.guess)[self._said]

@@ -8,8 +8,9 @@ Where the loops do not close from the guess, they are closed from anywhere
 3. the same two with passive joints beyond their limits.
 
 So are they where the active joints are too few or too many where it closes, and where home as it
-closes from the guess is outside of limits or more than 0.5 rad (or of the machine's size) from what
-the file says. Then home is kept where none that is found is nearer, and told in any case.
+closes from the guess is outside of limits or more than 0.5 rad (or half of the machine's size)
+from what the file says. Then home is kept where none that is found is nearer; far off, that is
+told where there are others.
 
 The first of these that closes counts, and of the postures that it finds the one that is nearest to
 the guess, see `Search.postures`.
@@ -28,6 +29,7 @@ from crane.common.errors import MechanismError
 from crane.common.samples import Array
 
 _TRIED = 4  # of the postures that are found
+_SAME = 1e-3  # difference of postures that is none [rad], or share of the machine's size
 _FAR = 0.5  # [rad], or share of the machine's size: a home that is farther off is doubted
 
 
@@ -87,17 +89,22 @@ def settle(
             return first, None
     elif said is None:
         raise refused
+    others = 0
     for found in _found(search, equations, active, passive, said, loose, first is None):
         if first is not None:
+            others += sum(search.apart(q, first.home).max() > _SAME for q in found)
             found = _nearer(search, equations, passive, found, first.home)
         usable = _usable(equations, active, passive, found[:_TRIED])
         if isinstance(usable, Structure):
-            return usable, _sought(search, reason, len(found), usable.home)
+            count = len(found) if first is None else others + 1
+            return usable, _sought(search, reason, count, usable.home)
         if usable is not None and first is None:
             raise refused if isinstance(refused, ActiveError) else usable
     if first is None:
         raise refused
-    return first, _sought(search, reason, 1, first.home)
+    if not others or search.off_said(first.home)[1] <= _FAR:
+        return first, None
+    return first, _sought(search, reason, others + 1, first.home)
 
 
 def _doubt(search: Search, equations: LoopEquations, passive: Indices, home: Array) -> str:

@@ -230,7 +230,7 @@ def analyse(
 
 
 def _unwound(equations: LoopEquations, home: Array, passive: Indices) -> Array:
-    """Home without the whole turns that pins have wound up: in limits, else half a turn at most."""
+    """Home without the whole turns that pins have wound up: in limits, or half a turn."""
     coordinates = equations.coordinates
     lower, upper = coordinates.lower, coordinates.upper
     winds = winding(equations)

@@ -122,7 +122,7 @@ def _legend(machine: Machine, com: bool) -> list[tuple[Line2D, ...]]:
 
 def _ghost_line(index: int, points: Array | None = None) -> Line2D:
     """A dashed line in the look of another assembly, without points that of the legend."""
-    x, y = ([], []) if points is None else (points[:, 0], points[:, 1])
+    x, y = np.zeros((2, 0)) if points is None else points.T
     label = f"other assembly {index + 1}"
     style = _DASHES[index % len(_DASHES)]
     return Line2D(x, y, color=GHOST, linewidth=1.1, linestyle=style, label=label, zorder=2.2)
