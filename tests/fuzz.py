@@ -85,7 +85,7 @@ FOUR_BAR_SDF = """<sdf version="1.9">
           <spring_reference>0.2</spring_reference></dynamics></axis></joint>
     <joint name="c" type="revolute"><parent>world</parent><child>right::rocker</child>
       <axis><xyz>0 1 0</xyz></axis></joint>
-    <joint name="d" type="revolute"><pose relative_to="right::rocker">0 0 0.2 0 0 0</pose>
+    <joint name="d" type="revolute"><pose relative_to="rod">0.5 0 0 0 0 0</pose>
       <parent>rod</parent><child>right::rocker</child>
       <axis><xyz>0 1 0</xyz></axis></joint>
     <joint name="f" type="revolute"><parent>world</parent><child>right::top</child>
@@ -228,7 +228,11 @@ def said_xml(data, known=None):
             if key == "polycoef":
                 value += (0.0,) * (5 - len(value))
             said.append((here, key, value))
-        said.append((here, "text", words(element.text)))
+        if not len(element):  # others have none that means anything
+            text = words(element.text)
+            if element.tag == "xyz" and (length := np.hypot.reduce(text)):
+                text = tuple(np.round(np.array(text) / length, 15).tolist())
+            said.append((here, "text", text))
         for child in element:
             walk(child, here)
         said.append((here, "end", ()))

@@ -212,7 +212,8 @@ def sdf(rng, count, joints, folder):
     kinds = {"floating": ("ball", "universal", "screw", "prismatic", "gearbox")}
     places = [f"0.{i + 1} {rng.choice((0.1, 0))} 0 0 0 0" for i in range(count)]
     lines = [
-        f'<link name="l{i}"><pose>{place}</pose><inertial><mass>{i % 3 + 1}</mass></inertial></link>'
+        f'<link name="l{i}"><pose>{place}</pose><inertial><mass>{i % 3 + 1}</mass></inertial>'
+        "</link>"
         for i, place in enumerate(places)
     ]
     for i, (parent, child, kind, mimic) in enumerate(joints):

@@ -8,6 +8,7 @@ import bucket
 import numpy as np
 import pytest
 from broken import DATA, LOOPED, copy_machine, swap
+from typed import typed
 from work import at_most
 
 import crane
@@ -191,3 +192,48 @@ def home_of(path):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         return crane.load(path).home
+
+
+def test_a_home_far_from_what_the_file_says_is_told(tmp_path):
+    """The nearest assembly is taken, and that it is 1 rad off is a line, with the other one."""
+    _, rocker, link, pin = bucket.assemblies(0.25, bucket.ZERO)[0]
+    for off in (0.2, 0.9):
+        said = f"  rocker: {rocker + off:.3f}\n  link: {link - off:.3f}\n  bucket: {pin:.3f}\n"
+        path = bucket.write(tmp_path, 0.25, home=said)
+        which, told = assembly(path, 0.25)
+        assert which == 0
+        far = [line for line in told if "home was sought" in line]
+        assert len(far) == (off > 0.5)
+        if far:
+            assert re.search(
+                r"bucket\.yaml:8: home was sought, because from what the file says of it \w+ closes "
+                r"far off; the driven joints held, .* that was found has \w+ 0\.9\d* rad off: look "
+                r"at it with crane sketch, and keep it with crane check --write-home",
+                far[0],
+            )
+
+
+def test_the_sketch_shows_all_that_are_near(tmp_path):
+    path = bucket.write(tmp_path, 0.25)
+    done = typed("sketch", path, "--out", tmp_path / "all.svg")
+    assert done.stdout.startswith(
+        "dashed: 2 other assemblies that the file does not rule out; crane check tells how to "
+        "choose\n"
+    )
+    drawn = (tmp_path / "all.svg").read_text()
+    for index in (1, 2):
+        assert f'id="assembly {index}"' in drawn and f"other assembly {index}" in drawn
+    values = bucket.assemblies(0.25)[0]
+    home = lines(", ".join(f"{x}: {v:.3f}" for x, v in zip(bucket.PASSIVE, values, strict=True)))
+    path = bucket.write(tmp_path, 0.25, home=home)
+    done = typed("sketch", path, "--out", tmp_path / "one.svg")
+    assert "dashed" not in done.stdout
+    assert "assembly" not in (tmp_path / "one.svg").read_text()
+
+
+def test_machines_without_masses_are_told_of_other_assemblies(tmp_path):
+    path = bucket.write(tmp_path, 0.25)
+    urdf = tmp_path / "bucket_linkage.urdf"
+    urdf.write_text(re.sub(r"<inertial>.*?</inertial>", "", urdf.read_text()))
+    told = [finding.what for finding in check(path).findings]
+    assert sum("can be assembled another way" in what for what in told) == 2

@@ -14,7 +14,10 @@ from crane.common.errors import CraneError, CraneWarning, MechanismError, known
 from crane.description import LOOP_TYPES, Friction, bundled, examples, inertia_problem
 from crane.description.sources import find
 
-NO_MACHINE = "not a machine, give a machine file (.yaml), a URDF (.urdf, .xacro), an SDF (.sdf) or a MJCF (.xml)"
+NO_MACHINE = (
+    "not a machine, give a machine file (.yaml), a URDF (.urdf, .xacro), an SDF (.sdf) or a MJCF "
+    "(.xml)"
+)
 
 
 @pytest.fixture

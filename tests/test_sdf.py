@@ -114,8 +114,8 @@ def arm(joints, version="1.9", more="", links=("a", "b"), name="arm"):
 
 def hinge(name, parent, child, axis="0 1 0", inside="", kind="revolute", beside=""):
     return (
-        f'<joint name="{name}" type="{kind}"><parent>{parent}</parent><child>{child}</child>{beside}'
-        f"<axis><xyz>{axis}</xyz>{inside}</axis></joint>\n"
+        f'<joint name="{name}" type="{kind}"><parent>{parent}</parent><child>{child}</child>'
+        f"{beside}<axis><xyz>{axis}</xyz>{inside}</axis></joint>\n"
     )
 
 
@@ -217,8 +217,8 @@ def test_a_link_without_mass_weighs_what_sdf_says(tmp_path):
     machine, told = warnings_of(written(tmp_path, text))
     assert machine.tree.mass == 2.5
     assert told == [
-        "arm.sdf:2: link 'a' has no <inertial>, which SDF takes as 1 kg and 1 kg m2: write what it "
-        "has"
+        "arm.sdf:2: link 'a' has no <inertial>, which SDF takes as 1 kg and 1 kg m2: write what "
+        "it has"
     ]
 
 
@@ -287,8 +287,8 @@ def test_a_world_with_one_machine(tmp_path):
 
 def test_what_is_drawn(tmp_path):
     visual = (
-        "<visual name='v'><pose relative_to='b'>0 0 1 0 0 0</pose><geometry><box><size>1 2 3</size>"
-        "</box></geometry><material><diffuse>1 0 0 1</diffuse></material></visual>"
+        "<visual name='v'><pose relative_to='b'>0 0 1 0 0 0</pose><geometry><box>"
+        "<size>1 2 3</size></box></geometry><material><diffuse>1 0 0 1</diffuse></material></visual>"
     )
     text = arm(TWO).replace(MASS, MASS + visual, 1)
     machine = load(written(tmp_path, text))
@@ -370,6 +370,12 @@ def test_slips_are_told(tmp_path):
         "<dynamics>",
         "arm.sdf:3: unknown <lowr> in <limit> of joint 'p', it is left out, did you mean <lower>?",
     ]
+
+
+def test_links_without_gravity_are_told(tmp_path):
+    text = arm(TWO).replace(MASS, MASS + "<gravity>0</gravity>", 1)
+    _, told = warnings_of(written(tmp_path, text))
+    assert told == ["arm.sdf: otherwise than in SDF: links without gravity have their weight (a)"]
 
 
 def test_plugins_and_sensors_are_told_once(tmp_path):

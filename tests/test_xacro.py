@@ -144,7 +144,8 @@ REFUSED = {
     ),
     "a joint": (
         ('<parent link="base"/>', '<parent link="bose"/>'),
-        "arm.urdf.xacro:6: joint 'upper_joint' has the unknown parent 'bose', did you mean 'base'?",
+        "arm.urdf.xacro:6: joint 'upper_joint' has the unknown parent 'bose', did you mean "
+        "'base'?",
     ),
     "a name": (
         ("sizes['upper']", "size"),

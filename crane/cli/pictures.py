@@ -55,12 +55,17 @@ def sketch(
     """Draw the mechanism of a machine (png, svg or pdf)."""
     from crane.cli.runs import check_free
     from crane.common.output import file_name
+    from crane.formats.ambiguity import near_assemblies
     from crane.view.sketch.draw import sketch as draw
 
     loaded = load(machine, lock, change, active, free, floating, packages, argument)
     figure = out or Path(file_name(loaded.name) + "_sketch.png")
     check_free(figure, force)
-    draw(loaded, figure, posture(loaded, at), plane, com)
+    others = [] if at else near_assemblies(loaded)
+    draw(loaded, figure, posture(loaded, at), plane, com, others)
+    if others:
+        many = f"{len(others)} other assemblies" if len(others) > 1 else "the other assembly"
+        print(f"dashed: {many} that the file does not rule out; crane check tells how to choose")
     print(f"written to {figure}")
 
 

@@ -98,6 +98,7 @@ class _Search:
         self.home, self.blocks = closure.home, closure.structure.blocks
         self._unit = units(self.model)
         self._turns = ~slides(self.model)
+        self._massless = not any(inertia.mass > 0 for inertia in list(self.model.inertias)[1:])
 
     def difference(self, one: Array, two: Array) -> Array:
         """(nq,) how far apart two postures are, in units of 1 rad or the machine's size."""
@@ -298,7 +299,7 @@ class _Search:
             places.append([
                 place.homogeneous
                 for place, inertia in zip(data.oMi, self.model.inertias, strict=True)
-                if inertia.mass > 0
+                if inertia.mass > 0 or self._massless
             ])  # fmt: skip
         one, two = (np.array(place) for place in places)
         return bool(np.abs(one - two).max(initial=0.0) < _SAME)

@@ -11,6 +11,7 @@ least singular value of J_P once the rows of J D are made orthonormal. It does n
 equations are written, nor on units: see `scales`.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -25,6 +26,7 @@ from crane.common.samples import Array
 Indices = NDArray[np.intp]
 
 DEAD = 1e-5  # sigma_min of a choice that drives nothing at home, see `crane.closure.structure`
+_IDLE = re.compile("passive|free", re.IGNORECASE)  # names of joints that nothing drives
 _FAIR = 100.0  # condition up to which actuators are proposed before better joints
 _SWAPS = 200
 
@@ -154,9 +156,10 @@ def proposals(
     """Choices of active joints for a machine at a posture, at most two.
 
     Actuators come first where their condition is below 100: joints that slide, and those whose
-    effort is limited; pins that only hold parts together usually have no limits. Second comes
-    the best-conditioned choice of any joints, or what is best without the joint of the first that
-    the others need least.
+    effort is limited; pins that only hold parts together usually have no limits. Those whose names
+    say that nothing drives them are left out if the others are enough. Second comes the
+    best-conditioned choice of any joints, or what is best without the joint of the first that the
+    others need least.
 
     Args:
         model: The spanning tree.
@@ -186,7 +189,8 @@ def proposals(
     best = valued(choose(basis, free, kept)) or valued(choose(basis, columns, kept))
     if best is None:
         return []
-    driven = valued(choose(basis, actuators, kept))
+    meant = [i for i in actuators if not _IDLE.search(names[i])]
+    driven = valued(choose(basis, meant, kept)) or valued(choose(basis, actuators, kept))
     first = driven if driven is not None and driven.condition < _FAIR else best
     out = [first]
     if first.joints != best.joints:

@@ -49,6 +49,8 @@ class Closure:
 
     Attributes:
         home: (nq,) the closed home posture.
+        guess: (nq,) what it was closed from.
+        said: Columns for which it is the file that says so.
         active: Columns of the active joints.
         passive: Columns of the passive joints.
         structure: Independent equations and the order in which they solve.
@@ -56,6 +58,8 @@ class Closure:
     """
 
     home: Array
+    guess: Array
+    said: NDArray[np.intp]
     structure: Structure
     sought: Sought | None
 
@@ -81,6 +85,8 @@ class Closure:
         def columns(names: Collection[str]) -> list[int]:
             return [coordinates.column(name) for name in names]
 
+        self.guess = guess
+        self.said = np.array(sorted(columns(said or ())), dtype=np.intp)
         self.structure, self.sought = settle(
             self.equations,
             self.active,

@@ -171,7 +171,8 @@ def _sought(name: str, folder: Path, packages: Sequence[str]) -> Path | None:
         for prefix in filter(None, os.environ.get(variable, "").split(os.pathsep)):
             if (found := _below(name, Path(prefix) / between, 2)) is not None:
                 return found
-    return None
+    called = (x for above in (folder, *folder.parents) for x in (above, above / name))
+    return next((x for x in called if x.name == name and x.is_dir()), None)
 
 
 def _is_package(folder: Path, name: str) -> bool:

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from crane.common.errors import CraneWarning
 from crane.common.samples import Array
 from crane.description import MachineSpec
 from crane.formats.opening import is_robot, is_sdf
+from crane.machine import Machine
 
 _LISTED, _WRITTEN = 4, 6  # loops and coordinates in a line
 _QUICK, _THOROUGH = 6, 100  # starts of the search in one block: milliseconds, up to a second
@@ -30,8 +32,7 @@ def warn_of_assemblies(
     """
     if not len(closure.passive):
         return
-    # MJCF and SDF have a value of every joint
-    drawn = not _in_yaml(spec) and (is_sdf(spec.path) or not is_robot(spec.path))
+    drawn = _says_all(spec.path)
     names = closure.equations.coordinates.names
     named = [i for i, name in enumerate(names) if drawn or name in spec.home]
     most = _THOROUGH if thorough else _QUICK
@@ -42,6 +43,15 @@ def warn_of_assemblies(
         found = found[:1]
     for other in found:
         warnings.warn(_told(spec, closure, other) + more, CraneWarning, stacklevel=3)
+
+
+def near_assemblies(machine: Machine) -> list[Array]:
+    """Other postures (nq,) that its file does not rule out, as `crane check` tells them."""
+    closure = machine.closure
+    if not len(closure.passive):
+        return []
+    said = np.arange(closure.model.nv) if _says_all(machine.path) else closure.said
+    return [other.q for other in ambiguities(closure, closure.guess, said, _THOROUGH)]
 
 
 def _told(spec: MachineSpec, closure: Closure, other: Assembly) -> str:
@@ -72,15 +82,20 @@ def _told(spec: MachineSpec, closure: Closure, other: Assembly) -> str:
 
 def _where(spec: MachineSpec) -> str:
     """Where a file says how its machine is at home."""
-    if _in_yaml(spec):
+    if _in_yaml(spec.path):
         return "under 'home:'"
     if is_sdf(spec.path):
         return "in <initial_position> of axes"
     return 'in <group_state name="home">' if is_robot(spec.path) else "in the key 'home'"
 
 
-def _in_yaml(spec: MachineSpec) -> bool:
-    return spec.path.suffix.lower() in (".yaml", ".yml")
+def _says_all(path: Path) -> bool:
+    """Whether files of this kind have a value of every joint: MJCF and SDF."""
+    return not _in_yaml(path) and (is_sdf(path) or not is_robot(path))
+
+
+def _in_yaml(path: Path) -> bool:
+    return path.suffix.lower() in (".yaml", ".yml")
 
 
 def _values(spec: MachineSpec, names: Sequence[str], values: Array) -> str:

@@ -140,7 +140,7 @@ def _moved(closure: Closure, names: Sequence[str]) -> Closure:
         other = Closure(closure.model, equations.loops, names, closure.home, equations.couplings)
     except MechanismError:
         return closure
-    other.sought = closure.sought
+    other.sought, other.guess, other.said = closure.sought, closure.guess, closure.said
     return other
 
 

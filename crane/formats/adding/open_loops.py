@@ -23,6 +23,7 @@ from crane.formats.machine_file.open_loops import body_of, named_pairs
 _NEAR = 0.05  # share of the machine's size within which two ends meet
 _MEETING = 0.01  # the same where no plane tells that they belong together
 _AWAY = 1e-6  # [m] from the origin of a body from which on a frame is a place of its own
+_DUMMY = 1e-6  # [kg] that CAD exporters give frames
 _PARALLEL = 1e-6  # sine of an angle that counts as none
 _RING = 3  # joints of the tree below which a loop would lock what it closes
 _BARREL = re.compile(r"barrel|tube|housing|cylinder|cyl", re.IGNORECASE)
@@ -152,7 +153,8 @@ class _Search:
             return False
         if self.above[link].moves:
             return self.above[link].kind == "prismatic" and not self.below.get(link)
-        return self.spec.tree.links[link].inertial is None
+        inertial = self.spec.tree.links[link].inertial
+        return inertial is None or inertial.mass <= _DUMMY
 
     def _is_beside(self, link: str) -> bool:
         """Whether a frame is not just the origin of its body."""

@@ -53,8 +53,8 @@ def _angle(
         return edge.name, float(np.sign(cosine)) * (1.0 if forward else -1.0)
     raise gear.item.xml.fail(
         gear.item.element,
-        f"{gear.item.what}: no joint turns '{_named(link)}' against '{_named(gear.reference)}' about the gear's "
-        "axis, name another gearbox_reference_body",
+        f"{gear.item.what}: no joint turns '{_named(link)}' against '{_named(gear.reference)}' "
+        "about the gear's axis, name another gearbox_reference_body",
     )
 
 

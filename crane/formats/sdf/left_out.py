@@ -12,7 +12,6 @@ from crane.formats.sdf.values import Item
 from crane.formats.xml import XmlFile
 
 _SHOWN = 4  # names in a line
-_GRAVITY = (0.0, 0.0, -9.8)
 
 # What is read, and what simulators and viewers have.
 _READ: Mapping[str, set[str]] = {
@@ -65,6 +64,9 @@ class LeftOut:
         for element in item.element.iter(*_TOLD):
             if _is_own(element, item.element):
                 self.lose(_TOLD[element.tag], element.get("name", ""))
+        for name, link in scope.links.items():
+            if link.text("gravity").lower() in ("0", "false"):
+                self.differ("links without gravity have their weight", f"{scope.prefix}{name}")
         for part in (*scope.links.values(), *scope.joints.values()):
             self._check(part)
 

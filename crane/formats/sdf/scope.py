@@ -279,7 +279,7 @@ def lookup(scope: Scope, name: str, asker: Item) -> tuple[Scope, str]:
         first, rest = "::".join(parts[:cut]), "::".join(parts[cut:])
         if first in scope.models:
             return lookup(scope.models[first], rest, asker)
-    if len(parts) > 1 and parts[0] == scope.name:  # as some write it
+    if len(parts) > 1 and parts[0] == scope.name and not scope.prefix:  # as some write it
         return lookup(scope, "::".join(parts[1:]), asker)
     raise asker.xml.fail(
         asker.element,

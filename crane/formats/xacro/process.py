@@ -135,10 +135,12 @@ def _lend_packages(folder: Path, packages: list[str], missing: list[str], xacro:
     def absolute(name: str) -> str:
         if "://" not in name:
             return str(before(name))
+        package = name.partition("://")[2].partition("/")[0]
         with giving(packages):
             found = find_file(name, folder)
+            if found is None and find_package(package, folder) is None:
+                missing.append(package)
         if found is None:
-            missing.append(name.partition("://")[2].partition("/")[0])
             raise LookupError(f"there is no '{name}'")
         return str(found)
 

@@ -27,7 +27,8 @@ CHAINS = (
     "#1f5fa8", "#d0661c", "#2f8050", "#8a4a9c", "#b03a48", "#2b8c9c", "#8c7a1e", "#5a5f66",
 )  # fmt: skip
 REGIONS = ("#e4edf7", "#fbeadb", "#e2f1e4", "#f0e6f4", "#f9e4e6", "#e0f0f3", "#f3efd9", "#ebecee")
-GROUND = "#777777"
+GROUND, GHOST = "#777777", "#9a4d6f"
+_DASHES = ((0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (3, 4)))
 _THIN = 7.0  # width below which a polygon is drawn as a line [points]
 _ROOM = 9.0  # what the number of a loop needs around it [points]
 
@@ -38,6 +39,7 @@ def sketch(
     q_a: ArrayLike | None = None,
     plane: str | None = None,
     com: bool = False,
+    others: Sequence[Array] = (),
 ) -> None:
     """Write a sketch of the mechanism to a file.
 
@@ -48,6 +50,7 @@ def sketch(
         plane: "xy", "xz" or "yz" to look along an axis of the world; the plane that the machine
             moves in if not given.
         com: Whether to mark the centres of mass.
+        others: Postures (nq,) to be drawn dashed behind it, such as other assemblies.
 
     Raises:
         OutputError: The suffix is another one, or the file cannot be written.
@@ -55,11 +58,15 @@ def sketch(
         LimitError: A coordinate lies outside of its limits.
         ClosureError: The loops cannot be closed there.
     """
-    write_figure(path, lambda: sketch_figure(machine, q_a, plane, com))
+    write_figure(path, lambda: sketch_figure(machine, q_a, plane, com, others))
 
 
 def sketch_figure(
-    machine: Machine, q_a: ArrayLike | None = None, plane: str | None = None, com: bool = False
+    machine: Machine,
+    q_a: ArrayLike | None = None,
+    plane: str | None = None,
+    com: bool = False,
+    others: Sequence[Array] = (),
 ) -> Figure:
     """The figure of a mechanism; see `sketch`.
 
@@ -73,10 +80,13 @@ def sketch_figure(
         q = machine.closure.solve(machine.check_limits(q_a))
     seen = find_plane(machine, q, plane)
     mechanism = project(machine, q, seen)
+    ghosts = [project(machine, other, seen) for other in others]
     with mpl.rc_context(STYLE):
-        legend = _legend(machine, com)
-        figure, canvas = lay_out(mechanism, seen, machine, q, legend)
+        legend = _legend(machine, com) + [(_ghost_line(i),) for i in range(len(ghosts))]
+        figure, canvas = lay_out(mechanism, seen, machine, q, legend, ghosts)
         _draw_regions(canvas, mechanism)
+        for i, ghost in enumerate(ghosts):
+            _draw_ghost(canvas, ghost, mechanism, i)
         for body in sorted(mechanism.bodies, key=lambda body: body.boom):
             _draw_body(canvas, body)
         for slide in mechanism.slides:
@@ -108,6 +118,30 @@ def _legend(machine: Machine, com: bool) -> list[tuple[Line2D, ...]]:
         if name != "loop" or machine.closure.equations.loops:
             entries.append(tuple(Line2D([], [], label=name, **mark(look)) for look in looks))
     return entries
+
+
+def _ghost_line(index: int, points: Array | None = None) -> Line2D:
+    """A dashed line in the look of another assembly, without points that of the legend."""
+    x, y = ([], []) if points is None else (points[:, 0], points[:, 1])
+    label = f"other assembly {index + 1}"
+    style = _DASHES[index % len(_DASHES)]
+    return Line2D(x, y, color=GHOST, linewidth=1.1, linestyle=style, label=label, zorder=2.2)
+
+
+def _draw_ghost(canvas: Canvas, ghost: Mechanism, home: Mechanism, index: int) -> None:
+    """The lines of another assembly, of what is elsewhere than at home."""
+    outlines = [(x.points, y.points) for x, y in zip(ghost.bodies, home.bodies, strict=True)]
+    for one, two in zip(ghost.slides, home.slides, strict=True):
+        outlines.append((np.array([one.start, one.end]), np.array([two.start, two.end])))
+    for there, here in outlines:
+        if len(there) < 2 or np.abs(there - here).max() < 1e-6 * home.size:
+            continue
+        corners = hull(there)
+        if len(corners) > 2:
+            corners = np.vstack([corners, corners[:1]])
+        line = _ghost_line(index, corners)
+        line.set_gid(f"assembly {index + 1}")
+        canvas.axes.add_line(line)
 
 
 def _draw_regions(canvas: Canvas, mechanism: Mechanism) -> None:

@@ -36,6 +36,7 @@ def lay_out(
     machine: Machine,
     q: Array,
     legend: Sequence[tuple[Line2D, ...]],
+    beside: Sequence[Mechanism] = (),
 ) -> tuple[Figure, Canvas]:
     """A figure with axes for the mechanism, and what draws on them.
 
@@ -45,8 +46,10 @@ def lay_out(
         machine: Named in the heading, with its active coordinates.
         q: (nq,) posture.
         legend: Its entries, each of lines that are drawn on top of each other.
+        beside: What is to fit, too.
     """
-    low, high = _bounds(mechanism)
+    corners = np.array([_bounds(one) for one in (mechanism, *beside)])
+    low, high = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
     span = np.maximum(high - low, 0.05 * mechanism.size)
     room = np.array([_WIDEST, _TALLEST]) - 2 * _MARGIN
     point = float((span / room).max())  # [m]

@@ -1,0 +1,199 @@
+"""Loops that are proposed where a description leaves them open, and taken over by a command."""
+
+import os
+import re
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import yaml
+from excavators import planar
+from test_open_loops import five_bar
+from typed import typed
+
+import crane
+from crane.common.errors import CraneError, CraneWarning
+from crane.formats.check import check
+
+MODELS = Path(__file__).parents[1] / "models"
+ROBOTS = Path(__file__).parents[2] / "shared/data/third_party/parallel_robots"
+
+pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+
+
+def opened(name, folder, without=None):
+    """A bundled machine without its loops, or without one; the machine file."""
+    text = (MODELS / f"{name}.yaml").read_text()
+    text = text.replace("urdf/", f"{MODELS}/urdf/")
+    data = yaml.safe_load(text)
+    data["loops"] = [loop for loop in data["loops"] if without not in (None, loop["name"])]
+    for key in ("loops", "tasks", "control", "hydraulics", "end_stops", "friction", "gas_springs"):
+        if key != "loops" or not data["loops"]:
+            data.pop(key, None)
+    path = folder / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(data))
+    return path
+
+
+def joined(loops):
+    """By frames, in either order, what loops are."""
+    return {frozenset((one.predecessor, one.successor)): (one.type, one.axis) for one in loops}
+
+
+@pytest.mark.parametrize("name", ["mini_forwarder", "patu655", "kr300"])
+def test_loops_that_were_removed_are_proposed(name, tmp_path):
+    whole = crane.load(name)
+    report = check(opened(name, tmp_path))
+    found = [one.loop for one in report.proposals]
+    assert joined(found) == joined(whole.closure.equations.loops)
+    assert yaml.safe_load("\n".join(report.proposed))["loops"] == [
+        {
+            "name": one.name, "type": one.type, "predecessor": one.predecessor,
+            "successor": one.successor, "axis": [0, 0, 1],
+        }
+        for one in found
+    ]  # fmt: skip
+    assert report.next == f"crane add loops {tmp_path / name}.yaml"
+
+
+@pytest.mark.parametrize("loop", ["A1_eye", "A2_eye", "J", "K"])
+def test_one_loop_that_was_removed_is_proposed(loop, tmp_path):
+    wanted = joined(x for x in crane.load("mini_forwarder").closure.equations.loops
+                    if x.name == loop)  # fmt: skip
+    report = check(opened("mini_forwarder", tmp_path, loop))
+    assert joined(one.loop for one in report.proposals) == wanted
+
+
+def test_the_gap_is_that_of_the_frames(tmp_path):
+    """By frames; a slide that ends in one of them covers what is along it."""
+    path = opened("mini_forwarder", tmp_path)
+    machine, report = crane.load(path), check(path)
+    data = machine.model.createData()
+    pin.forwardKinematics(machine.model, data, machine.home)
+
+    def at(link):
+        return pin.updateFramePlacement(machine.model, data, machine.frame(link)).translation
+
+    gaps = {one.loop.successor: one for one in report.proposals}
+    two = gaps["link5_J"]
+    assert two.gap == pytest.approx(np.linalg.norm(at("link4_J") - at("link5_J")), rel=1e-9)
+    rod = gaps["link2_D"]
+    assert rod.gap <= np.linalg.norm(at("link2_D") - at("A1_eye")) + 1e-15
+
+
+def test_the_machine_with_the_proposed_loops_is_the_whole_one(tmp_path):
+    added = crane.add_loops(opened("mini_forwarder", tmp_path), out=tmp_path / "closed.yaml")
+    closed, whole = crane.load(added.path), crane.load("mini_forwarder")
+    assert closed.active == whole.active and added.freedom == 3
+    rng = np.random.default_rng(0)
+    home = whole.home[whole.closure.active]
+    q_a = home + rng.uniform(-1, 1, (20, 3)) * [1, 0.003, 0.003]
+    v = rng.uniform(-1, 1, (20, 3)) * [1, 0.05, 0.05]
+    one, two = (crane.Dynamics(x).inverse(q_a, v, 0 * v) for x in (whole, closed))
+    assert two == pytest.approx(one, rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("mass", ["", "1e-9"])
+def test_frames_without_names_that_meet(mass, tmp_path):
+    """Of a linkage as CAD exporters leave it: ends that coincide, perhaps with a dummy mass."""
+    text = five_bar("tcp_a", "tcp_b").replace("0.3 0 0", "0.15 0.1 0", 1)
+    text = text.replace('"0.3 0 0" rpy', '"0.3 0 0"')
+    body = f'<inertial><mass value="{mass}"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" '
+    body += 'iyz="0"/></inertial>'
+    text = re.sub(r'<link name="(tcp_.)"/>', rf'<link name="\1">{body * bool(mass)}</link>', text)
+    text = re.sub(r'(tcp_b_frame.*?xyz=)"[^"]*"', r'\1"-0.15 0.1 0"', text, flags=re.DOTALL)
+    (tmp_path / "bars.urdf").write_text(text)
+    (proposal,) = check(tmp_path / "bars.urdf").proposals
+    assert (proposal.loop.type, proposal.loop.axis) == ("revolute", (0, 0, 1))
+    assert proposal.gap == pytest.approx(0, abs=1e-15) and not proposal.by_name
+    added = crane.add_loops(tmp_path / "bars.urdf", out=tmp_path / "bars.yaml")
+    assert added.freedom == 2
+
+
+HUNG = """<link name="{0}"><inertial><origin xyz="0.3 0 0"/><mass value="5"/><inertia ixx="0.01"
+ iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="{0}_pin" type="continuous"><origin xyz="{1}" rpy="0 {2} 0"/><parent link="{3}"/>
+ <child link="{0}"/><axis xyz="0 1 0"/></joint>"""
+
+
+def test_a_barrel_and_a_rod_that_hang_on_two_bodies_slide_in_each_other(tmp_path):
+    """Drawn by hand: barrel on the house, rod on the boom, along the line between their pins."""
+    foot, eye = np.array([0.6, 0, 0.7]), np.array([1.9, 0, 1.8])
+    pitch = -np.arctan2(*(eye - foot)[[2, 0]])
+    more = HUNG.format("lift_barrel", "0.6 0 0.7", pitch, "house")
+    more += HUNG.format("lift_rod", "1.9 0 0.3", pitch, "boom")
+    path = planar(tmp_path, more=more)
+    (proposal,) = check(path).proposals
+    loop = proposal.loop
+    assert (loop.type, loop.predecessor) == ("prismatic", "lift_barrel")
+    assert loop.successor == "lift_rod"
+    assert loop.axis == pytest.approx((1, 0, 0), abs=1e-9)
+    machine = crane.load(crane.add_loops(path, out=tmp_path / "d.yaml").path)
+    assert machine.closure.degrees_of_freedom == 2
+    lift = crane.load(tmp_path / "d.yaml", active=["lift", "fold"])
+    q = lift.closure.solve(np.array([-0.4, 1.0]))
+    data = lift.model.createData()
+    pin.forwardKinematics(lift.model, data, q)
+    barrel, rod = (
+        pin.updateFramePlacement(lift.model, data, lift.frame(x))
+        for x in ("lift_barrel", "lift_rod")
+    )
+    along = barrel.rotation[:, 0]
+    way = rod.translation - barrel.translation
+    assert np.linalg.norm(way - (way @ along) * along) < 1e-12
+    assert rod.rotation == pytest.approx(barrel.rotation, abs=1e-12)
+
+
+def test_open_machines_have_no_proposals(tmp_path):
+    assert check("tx40").proposals == ()
+    report = check(planar(tmp_path))
+    assert report.proposals == () and report.proposed == []
+    assert report.next.startswith("crane simulate ")
+
+
+@pytest.mark.parametrize("name", ["5bar_linkage_iso6d", "robot_delta", "wl16_like"])
+def test_robots_of_other_people_close_by_one_command(name, tmp_path):
+    """The loops that the file beside them says, from their URDF alone."""
+    if not ROBOTS.is_dir():
+        pytest.skip(f"{ROBOTS} is not there")
+    said = yaml.safe_load((ROBOTS / name / "robot.yaml").read_text())["closed_loop"]
+    added = crane.add_loops(ROBOTS / name / "robot.urdf", out=tmp_path / "robot.yaml")
+    assert len(added.loops) == len(said)
+    machine = crane.load(added.path)
+    assert machine.closure.residual(machine.home) < 1e-10
+    whole = crane.load(ROBOTS / name / "robot.yaml")
+    assert machine.closure.degrees_of_freedom == whole.closure.degrees_of_freedom
+
+
+def test_what_cannot_be_is_refused_in_one_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    planar(tmp_path)
+    done = typed("add", "loops", "digger.urdf", cwd=tmp_path)
+    assert done.returncode == 2 and done.stderr.splitlines()[-1] == (
+        "error: 'digger' has no frames that look like ends of a loop, write loops in a machine "
+        "file"
+    )
+    (tmp_path / "far.urdf").write_text(
+        five_bar("closing_foot_1", "closing_foot_2").replace("0.3 0 0", "5 0 0", 1)
+    )
+    with warnings.catch_warnings(), pytest.raises(CraneError) as caught:
+        warnings.simplefilter("ignore", CraneWarning)
+        crane.add_loops("far.urdf", out="far.yaml")
+    assert str(caught.value).startswith(
+        "the machine does not close with the proposed loops foot: far.yaml:"
+    )
+    assert sorted(os.listdir(tmp_path)) == ["digger.urdf", "far.urdf"]
+
+
+def test_the_command(tmp_path):
+    (tmp_path / "bars.urdf").write_text(five_bar("closing_foot_1", "closing_foot_2"))
+    done = typed("add", "loops", "bars.urdf", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("- {name: foot, type: revolute, predecessor: closing_foot_1, ")
+    assert lines[1].startswith("2 degrees of freedom, driven by ")
+    assert lines[2] == "written to bars_closed.yaml"
+    again = typed("add", "loops", "bars.urdf", cwd=tmp_path)
+    assert again.returncode == 2 and "exists already" in again.stderr
