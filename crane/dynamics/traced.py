@@ -23,7 +23,8 @@ from crane.codegen.scalar import (
 from crane.common.samples import Array
 from crane.dynamics.inertia import Pair
 from crane.dynamics.joint_forces import JointForces
-from crane.dynamics.recursion import Moving, Plan, accelerations
+from crane.dynamics.moving import Moving
+from crane.dynamics.recursion import Plan, accelerations
 from crane.machine import Machine
 
 BODY, JOINT = 10, 19  # numbers per body and per joint

@@ -6,9 +6,8 @@ that hang on two bodies and point at each other.
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 import pinocchio as pin
@@ -18,7 +17,7 @@ from crane.common.samples import Array
 from crane.description import LoopSpec, MachineSpec
 from crane.description.rigid import vector
 from crane.description.tree import Joint, Vector
-from crane.formats.machine_file.open_loops import body_of, named_pairs
+from crane.formats.machine_file.open_loops import named_pairs
 
 _NEAR = 0.05  # share of the machine's size within which two ends meet
 _MEETING = 0.01  # the same where no plane tells that they belong together
@@ -79,6 +78,7 @@ class _Search:
         self.spec, self.joints = spec, spec.tree.joints
         self.above = {joint.child: joint for joint in self.joints.values()}
         self.below = spec.tree.below()
+        self.ways, self.bodies = self._traced()
         data = model.createData()
         pin.forwardKinematics(model, data, q)
         self.places = {
@@ -87,21 +87,34 @@ class _Search:
         }
         points = np.array([place.translation for place in self.places.values()])
         self.size = float(np.linalg.norm(np.ptp(points, axis=0)))
-        self.taken = [(loop.predecessor, loop.successor) for loop in spec.loops]
+        self.joined = {frozenset((loop.predecessor, loop.successor)) for loop in spec.loops}
+
+    def _traced(self) -> tuple[dict[str, frozenset[str]], dict[str, str]]:
+        """By link the moving joints down to the root, and the link that its body begins with."""
+        root = self.spec.tree.root
+        ways, bodies, waiting = {root: frozenset[str]()}, {root: root}, [root]
+        while waiting:
+            link = waiting.pop()
+            for joint in self.below.get(link, ()):
+                moved = {joint.name} if joint.moves else set()
+                ways[joint.child] = ways[link] | moved
+                bodies[joint.child] = joint.child if joint.moves else bodies[link]
+                waiting.append(joint.child)
+        return ways, bodies
 
     def found(self) -> list[Proposal]:
         """All proposals; two bodies are joined once."""
         proposed: list[Proposal] = []
-        closed = {self._bodies(pair) for pair in self.taken}
+        closed = {self._bodies(pair) for pair in self.joined}
+        used = {frame for pair in self.joined for frame in pair}
         for group in (self._named(), self._slides(), self._meeting()):
             for proposal in sorted(group, key=self._apart):
-                loop = proposal.loop
-                ends = {loop.predecessor, loop.successor}
-                bodies = self._bodies((loop.predecessor, loop.successor))
-                if bodies not in closed and not any(ends & set(pair) for pair in self.taken):
-                    proposed.append(self._renamed(proposal, proposed))
-                    closed.add(bodies)
-                    self.taken.append((loop.predecessor, loop.successor))
+                ends = {proposal.loop.predecessor, proposal.loop.successor}
+                if self._bodies(ends) in closed or ends & used:
+                    continue
+                proposed.append(self._renamed(proposal, proposed))
+                closed.add(self._bodies(ends))
+                used |= ends
         return proposed
 
     def _named(self) -> Iterator[Proposal]:
@@ -129,7 +142,7 @@ class _Search:
 
     def _meeting(self) -> Iterator[Proposal]:
         """Ends of two bodies that meet at home, or by what the slides above them may do."""
-        for one, two in combinations(self._frames(), 2):
+        for one, two in self._near():
             if self.below.get(one) and self.below.get(two):
                 continue
             gap = self._gap(one, two)
@@ -139,6 +152,23 @@ class _Search:
             beside = gap <= _MEETING * self.size and self._is_beside(one) and self._is_beside(two)
             if kind != "spherical" or beside:
                 yield self._proposal(two, kind, (one, two), axis, by_name=False)
+
+    def _near(self) -> Iterator[tuple[str, str]]:
+        """Pairs of frames that are near enough, or may be by their slides."""
+        frames = self._frames()
+        points = np.array([self.places[link].translation for link in frames]).reshape(-1, 3)
+        reach = np.array([self._reach(link) for link in frames])
+        for i, one in enumerate(frames[:-1]):
+            far = np.linalg.norm(points[i + 1 :] - points[i], axis=1)
+            near = far <= _NEAR * self.size + reach[i] + reach[i + 1 :]
+            yield from ((one, frames[i + 1 + int(k)]) for k in np.flatnonzero(near))
+
+    def _reach(self, link: str) -> float:
+        """How far a slide that ends in a link can move it [m]."""
+        joint = self.above.get(self.bodies[link])
+        if joint is None or joint.kind != "prismatic":
+            return 0.0
+        return joint.limits.upper - joint.limits.lower
 
     def _ends(self) -> list[str]:
         """Links that carry nothing: frames, and what the last joints move."""
@@ -158,39 +188,27 @@ class _Search:
 
     def _is_beside(self, link: str) -> bool:
         """Whether a frame is not just the origin of its body."""
-        away = self.places[link].translation - self.places[self._body(link)].translation
+        away = self.places[link].translation - self.places[self.bodies[link]].translation
         return bool(np.abs(away).max() > _AWAY)
 
-    def _body(self, link: str) -> str:
-        return body_of(self.above, link)
-
     def _is_hung(self, link: str) -> bool:
-        body = self._body(link)
+        body = self.bodies[link]
         return body in self.above and self.above[body].kind == "revolute"
 
-    def _bodies(self, pair: Sequence[str]) -> frozenset[str]:
-        return frozenset(self._body(link) for link in pair)
+    def _bodies(self, pair: Collection[str]) -> frozenset[str]:
+        return frozenset(self.bodies[link] for link in pair)
 
     def _ring(self, one: str, two: str) -> list[Joint]:
         """Moving joints of the tree between two links."""
-        ways = []
-        for link in (one, two):
-            way = []
-            while link in self.above:
-                way.append(self.above[link])
-                link = self.above[link].parent
-            ways.append({joint.name for joint in way if joint.moves})
-        return [self.joints[name] for name in sorted(ways[0] ^ ways[1])]
+        return [self.joints[name] for name in sorted(self.ways[one] ^ self.ways[two])]
 
     def _gap(self, one: str, two: str) -> float:
         """Between two links, moved towards each other by a slide that ends in one of them."""
         way = self.places[two].translation - self.places[one].translation
         gaps = [float(np.linalg.norm(way))]
         for link, sign in ((one, 1.0), (two, -1.0)):
-            joint = self.above.get(self._body(link))
-            if joint is not None and joint.kind == "prismatic":
-                axis = sign * self._axis(joint)
-                reach = joint.limits.upper - joint.limits.lower
+            if reach := self._reach(link):
+                axis = sign * self._axis(self.above[self.bodies[link]])
                 along = float(np.clip(way @ axis, -reach, reach))
                 gaps.append(float(np.linalg.norm(way - along * axis)))
         return min(gaps)
@@ -214,10 +232,10 @@ class _Search:
         if not turning:
             return "spherical", (0.0, 0.0, 1.0)
         normal = turning[0]
-        off = [float(np.linalg.norm(np.cross(axis, normal))) for axis in turning]
-        off += [abs(float(axis @ normal)) for axis in sliding]
+        off = np.linalg.norm(np.cross(turning, normal), axis=1).max()
+        off = max(off, np.abs(np.reshape(sliding, (-1, 3)) @ normal).max(initial=0.0))
         axes = [self.places[link].rotation.T @ normal for link in (one, two)]
-        planar = max(off) < _PARALLEL and np.linalg.norm(axes[0] - axes[1]) < _PARALLEL
+        planar = off < _PARALLEL and np.linalg.norm(axes[0] - axes[1]) < _PARALLEL
         return ("revolute", _rounded(axes[0])) if planar else ("spherical", (0.0, 0.0, 1.0))
 
     def _proposal(
