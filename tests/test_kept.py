@@ -322,6 +322,7 @@ def another(*_):
         (Sweep, "kinetic", cached_property(another)),
         (engine, "_target", lambda: None),
         (crane.closure.compiled, "Loops", type("Loops", (), {})),
+        (crane.dynamics.compiled, "QUANTITIES", {"inverse": another}),
     ],
 )
 def test_a_patched_package_finds_nothing(place, owner, name, value):

@@ -41,12 +41,21 @@ def patched() -> bool:
     """Whether functions or classes of the modules that make formulas are not theirs."""
     for name, module in list(sys.modules.items()):
         if name.startswith("crane.") and name.split(".")[1] in _ROOMS:
-            there = list(vars(module).values())
-            own = [x for x in there if isinstance(x, type) and x.__module__ == name]
-            methods = [_function(x) for kind in own for x in list(vars(kind).values())]
-            if any(map(_foreign, there)) or any(map(_foreign, methods)):
+            there = [x for word, x in list(vars(module).items()) if word != "__builtins__"]
+            if any(map(_foreign, _standing(name, there))):
                 return True
     return False
+
+
+def _standing(name: str, values: list[Any]) -> list[Any]:
+    """What stands in a module, in its tables, and in the classes that it defines."""
+    found = values.copy()
+    for value in values:
+        if isinstance(value, dict):
+            found += list(value.values())
+        elif isinstance(value, type) and value.__module__ == name:
+            found += map(_function, list(vars(value).values()))
+    return found
 
 
 def _function(value: Any) -> Any:

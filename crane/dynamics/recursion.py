@@ -64,7 +64,7 @@ def _light(machine: Machine) -> set[int]:
     Recursion joint by joint divides by what is left of the inertia.
     """
     model = machine.model
-    data = model.createData()
+    data = machine.closure.equations.data  # large, and there already
     mass = pin.crba(model, data, machine.coordinates.configuration(machine.home))
     pin.cholesky.decompose(model, data)
     return set((np.flatnonzero(~(_LIGHT * np.diag(mass) < data.D)) + 1).tolist())

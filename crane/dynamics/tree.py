@@ -1,6 +1,7 @@
 """Equations of motion by Pinocchio's algorithms on the spanning tree, projected by gamma."""
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -73,20 +74,27 @@ class TreeDynamics:
     def __init__(self, machine: Machine, forces: JointForces, carriers: Sequence[int]):
         # a copy, so that parameters stay those of this moment
         self._model = pin.Model(machine.model)
-        self._data = self._model.createData()
         # added here, not by the parts: Pinocchio's kinetic energy forgets those of some joints
         self._armature = np.array(self._model.armature)
         self._rotors = np.flatnonzero(self._armature)
         self._closure, self._forces = machine.closure, forces
-        self._coordinates = machine.coordinates
-        joints = [0, *machine.coordinates.joints.tolist()]
+        self._coordinates, self._carriers = machine.coordinates, carriers
+
+    @cached_property
+    def _data(self) -> pin.Data:
+        return self._model.createData()
+
+    @cached_property
+    def _parts(self) -> list[_Part]:
+        """Bodies that carry each other, together; made when they are first asked."""
+        joints = [0, *self._coordinates.joints.tolist()]
         roots: dict[int, list[int]] = {}
         root_of = {0: 0}
         for body in range(1, self._model.njoints):
-            carrier = joints[carriers[self._model.joints[body].idx_v + 1]]
+            carrier = joints[self._carriers[self._model.joints[body].idx_v + 1]]
             root_of[body] = root_of[carrier] or body
             roots.setdefault(root_of[body], []).append(body)
-        self._parts = [_Part(self._model, bodies) for bodies in roots.values()]
+        return [_Part(self._model, bodies) for bodies in roots.values()]
 
     @property
     def parameters(self) -> Array:
