@@ -23,6 +23,10 @@ class Cluster:
     base: int
     joints: tuple[int, ...]
 
+    def own(self, active_joints: Sequence[int]) -> list[int]:
+        """Which of the active joints are its own."""
+        return [k for k, joint in enumerate(active_joints) if joint in self.joints]
+
 
 def clusters_of(equations: LoopEquations) -> list[Cluster]:
     """The clusters of a machine, each behind the one that carries it."""

@@ -1,4 +1,4 @@
-"""The mass matrix of the active joints from composite bodies, as traced formulas.
+"""Inertias of composite bodies, combined by gamma within clusters of joints, as traced formulas.
 
 A joint's unit acceleration moves all that hangs on it as one body, of inertia C; the wrench C s,
 carried towards the world, meets the joints that carry it (Featherstone 2008, section 6.2). Columns
@@ -6,13 +6,74 @@ of one cluster are combined by gamma before they leave it, so M_A takes as many 
 has entries.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 from crane.closure.clusters import Cluster
 from crane.closure.traced import Bodies, Loops
 from crane.codegen.scalar import Number, dot
 from crane.dynamics.inertia import Inertia, Pair, Vector, by, carried, paired, plus
 from crane.dynamics.moving import NONE
+
+
+class Columns:
+    """What unit accelerations of a cluster's independent coordinates ask for.
+
+    Args:
+        posture: The machine's bodies.
+        cluster: Which.
+        gamma: (n,) of the cluster's own coordinates, by joint.
+        inertias: Of all that hangs on each joint, at the origin of its body.
+        rotors: (nb + 1,) rotor inertias.
+
+    Attributes:
+        mass: (n, n) what they take themselves.
+        wrenches: By coordinate, what they take of the body that carries the cluster, at its
+            origin.
+    """
+
+    def __init__(
+        self,
+        posture: Bodies,
+        cluster: Cluster,
+        gamma: Mapping[int, Vector],
+        inertias: Mapping[int, Inertia],
+        rotors: Vector,
+    ):
+        count = range(len(gamma[cluster.joints[0]]))
+        tree: dict[int, dict[int, Number]] = {i: {} for i in cluster.joints}
+        self.wrenches = [NONE for _ in count]
+        for j in cluster.joints:
+            wrench = inertias[j].of(posture.axes(j))
+            for i, met, beyond in carriers(posture, j, wrench, cluster.base):
+                tree[i][j] = tree[j][i] = met
+                wrench = beyond
+            tree[j][j] = tree[j][j] + rotors[j]
+            self.wrenches = [plus(self.wrenches[k], by(gamma[j][k], wrench)) for k in count]
+        moved = {
+            i: [dot([*row.values()], [gamma[j][k] for j in row]) for k in count]
+            for i, row in tree.items()
+        }
+        self.mass: list[Vector] = [[0.0] * len(count) for _ in count]
+        for k in count:
+            column = [row[k] for row in moved.values()]
+            for j in range(k + 1):
+                entry = dot([row[j] for row in gamma.values()], column)
+                self.mass[j][k] = self.mass[k][j] = entry
+
+
+def carriers(
+    posture: Bodies, body: int, wrench: Pair, base: int
+) -> Iterator[tuple[int, Number, Pair]]:
+    """The joints that carry a wrench on a body, with its force along each.
+
+    Yields:
+        Each joint, the force, and the wrench at the origin of the body before.
+    """
+    while body != base:
+        met = paired(posture.axes(body), wrench)
+        wrench = carried(wrench, posture.arms[body])
+        yield body, met, wrench
+        body = posture.geometry.parents[body]
 
 
 class Composite:
@@ -37,62 +98,22 @@ class Composite:
         rotors: Vector,
         clusters: Sequence[Cluster],
     ):
-        self._posture, self._gamma, self._rotors = posture, loops.gamma, rotors
-        n, self._parents = len(loops.active_joints), posture.geometry.parents
-        self._inertias = [Inertia.rigid(*body) for body in masses]
+        n, parents = len(loops.active_joints), posture.geometry.parents
+        inertias = {i: Inertia.rigid(*body) for i, body in enumerate(masses, start=1)}
         for i in range(len(masses), 0, -1):
-            if parent := self._parents[i]:
-                here = self._inertias[i - 1].carried(posture.arms[i])
-                self._inertias[parent - 1] = self._inertias[parent - 1] + here
+            if parents[i]:
+                inertias[parents[i]] = inertias[parents[i]] + inertias[i].carried(posture.arms[i])
         self.mass: list[Vector] = [[0.0] * n for _ in range(n)]
-        self._own = {
-            i: [k for k, joint in enumerate(loops.active_joints) if joint in cluster.joints]
-            for cluster in clusters
-            for i in cluster.joints
-        }
+        own = {i: cluster.own(loops.active_joints) for cluster in clusters for i in cluster.joints}
         for cluster in clusters:
-            self._add(cluster)
-
-    def _add(self, cluster: Cluster) -> None:
-        """The columns of one cluster."""
-        own = self._own[cluster.joints[0]]
-        tree: dict[int, dict[int, Number]] = {i: {} for i in cluster.joints}
-        leaving: list[Pair] = [NONE] * len(own)
-        for j in cluster.joints:
-            wrench = self._inertias[j - 1].of(self._posture.axes(j))
-            body = j
-            while body != cluster.base:
-                tree[body][j] = tree[j][body] = self._met(body, wrench)
-                wrench, body = carried(wrench, self._posture.arms[body]), self._parents[body]
-            tree[j][j] = tree[j][j] + self._rotors[j]
-            leaving = [
-                plus(old, by(self._gamma[j][k], wrench))
-                for old, k in zip(leaving, own, strict=True)
-            ]
-        for k, wrench in zip(own, leaving, strict=True):
-            moved = {
-                i: dot([*row.values()], [self._gamma[j][k] for j in row])
-                for i, row in tree.items()
-            }
-            self._enter(k, moved, own)
-            self._enter(k, self._carry(cluster.base, wrench), ())
-
-    def _carry(self, body: int, wrench: Pair) -> dict[int, Number]:
-        """What a wrench on a body does along the joints that carry it."""
-        met: dict[int, Number] = {}
-        while body:
-            met[body] = self._met(body, wrench)
-            wrench, body = carried(wrench, self._posture.arms[body]), self._parents[body]
-        return met
-
-    def _met(self, body: int, wrench: Pair) -> Number:
-        return paired(self._posture.axes(body), wrench)
-
-    def _enter(self, k: int, along: dict[int, Number], own: Sequence[int]) -> None:
-        """Add forces along joints to column k; those of the same cluster are all there."""
-        for i, force in along.items():
-            for j in self._own[i]:
-                if own and j > k:
-                    continue  # by symmetry
-                entry = self.mass[j][k] + self._gamma[i][j] * force
-                self.mass[j][k] = self.mass[k][j] = entry
+            here = own[cluster.joints[0]]
+            gamma = {i: [loops.gamma[i][k] for k in here] for i in cluster.joints}
+            columns = Columns(posture, cluster, gamma, inertias, rotors)
+            for row, k in zip(columns.mass, here, strict=True):
+                for entry, j in zip(row, here, strict=True):
+                    self.mass[k][j] = entry
+            for k, wrench in zip(here, columns.wrenches, strict=True):
+                for i, met, _ in carriers(posture, cluster.base, wrench, 0):
+                    for j in own[i]:
+                        entry = self.mass[j][k] + loops.gamma[i][j] * met
+                        self.mass[j][k] = self.mass[k][j] = entry

@@ -45,13 +45,15 @@ def planned(machine: Machine) -> Plan:
     """
     if len(machine.active) <= _FEW:
         return ()
-    active = {int(column) + 1 for column in machine.closure.active}
+    active = [int(column) + 1 for column in machine.closure.active]
     light = _light(machine)
 
     def by_forces(cluster: Cluster) -> bool:
-        if len(cluster.joints) == 1:
+        own, size = len(cluster.own(active)), len(cluster.joints)
+        if size == 1:
             return True
-        return len(active & set(cluster.joints)) > _TIED and not light & set(cluster.joints)
+        # equations, as many as there are other joints, and coordinates take their squares
+        return max(size - own, _TIED) < own and not light & set(cluster.joints)
 
     return tuple(
         (cluster, by_forces(cluster)) for cluster in clusters_of(machine.closure.equations)
