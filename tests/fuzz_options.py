@@ -77,6 +77,7 @@ CALLS = {
         "slider.yaml --between base:-0.3,0,-0.1 crank:0.15,0,0 --bore 0.02 --rod 0.01 "
         "--stroke 0.25 --out {out}.yaml",
     ],
+    "add loops": ["slider.yaml --out {out}.yaml"],
     "list": [""],
     "info": ["slider.yaml", "rig.yaml"],
     "check": ["slider.yaml", "rig.yaml"],

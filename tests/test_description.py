@@ -122,7 +122,8 @@ class TestValid:
 
     def test_home_without_values_is_zero_or_the_nearest_limit(self, four_bar):
         limits = swap('lower="-1.5"', 'lower="0.25"', GROUND)
-        machine = four_bar(limits, swap("  crank: 1.2\n", ""))
+        home = "home:\n  crank: 1.2\n  coupler: -1.0\n  rocker: 1.5\n"
+        machine = four_bar(limits, swap(home, ""))
         assert machine.home[machine.column("crank")] == 0.25
 
     # Pinocchio's own reader refuses these without saying where; they are harmless.
@@ -428,7 +429,7 @@ class TestDocumentation:
         (example,) = re.findall(r"```yaml\n(.*?)```", self.PAGE, re.S)
         sections = set(re.findall(r"^(\w+):", example, re.M))
         known = set(re.findall(r"^\| `(\w+)` \|", self.PAGE.split("### ")[0], re.M))
-        elsewhere = {"couplings", "hydraulics"}  # a four-bar has neither gears nor valves
+        elsewhere = {"couplings", "drives", "hydraulics"}  # a four-bar has none of them
         assert sections == known - elsewhere
         for name in elsewhere:
             assert re.search(rf"^    {name}:$", self.PAGE.split(f"### `{name}`")[1], re.M)

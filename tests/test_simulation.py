@@ -196,7 +196,7 @@ def test_passive_joints_beyond_their_limits_are_told_in_the_same_line(tmp_path):
     (line,) = (str(one.message) for one in caught if "passes its limit" in str(one.message))
     past = np.max(run.channels["rocker"]) + 0.1
     assert "'crank' passes its limit" in line
-    assert f"'rocker' passes its limit -0.1 rad at t = 0 s, by up to {past:.3g} rad" in line
+    assert f"'rocker' passes its limit -0.1 rad at t = 0.001 s, by up to {past:.3g} rad" in line
     assert line.endswith("nothing stops them there, give them end stops")
     batch = crane.simulate_batch([machine], lambda machine: push, duration=0.5)
     assert batch.warnings[0].startswith(line)

@@ -23,7 +23,6 @@ from crane.cli.shared import (
     progress_bar,
 )
 from crane.common.errors import InputError
-from crane.description.sources import FOLDERS
 
 if TYPE_CHECKING:
     from crane.machine import Machine
@@ -153,6 +152,8 @@ def demo(out: Out = Path("demo-output"), force: Force = False) -> None:
 
 def is_run(what: str) -> bool:
     """Whether a run is meant and no machine."""
+    from crane.description.sources import FOLDERS
+
     if any((Path(what) / name).is_file() for name in FOLDERS):  # a machine in a folder
         return False
     return Path(what).is_dir() or Path(what).suffix.lower() in (".csv", ".npz")

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
+from crane.closure.coordinates import Coordinates
 from crane.closure.equations import frame_id
 from crane.common.samples import Array
 from crane.description import LoopSpec, MachineSpec
@@ -60,7 +61,7 @@ def proposals(spec: MachineSpec, model: pin.Model, q: Array) -> tuple[Proposal, 
     Args:
         spec: The machine as read.
         model: Its tree.
-        q: (nq,) its home, closed or as the file guesses it.
+        q: (nv,) its home, closed or as the file guesses it.
     """
     return tuple(_Search(spec, model, q).found())
 
@@ -71,7 +72,7 @@ class _Search:
     Args:
         spec: The machine as read.
         model: Its tree.
-        q: (nq,) posture.
+        q: (nv,) posture.
     """
 
     def __init__(self, spec: MachineSpec, model: pin.Model, q: Array):
@@ -80,7 +81,7 @@ class _Search:
         self.below = spec.tree.below()
         self.ways, self.bodies = self._traced()
         data = model.createData()
-        pin.forwardKinematics(model, data, q)
+        pin.forwardKinematics(model, data, Coordinates(model).configuration(q))
         self.places = {
             link: pin.updateFramePlacement(model, data, frame_id(model, link)).copy()
             for link in spec.tree.links

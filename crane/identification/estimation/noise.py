@@ -57,8 +57,13 @@ class Noise:
         answer = lfilter([1.0], a, np.eye(1, 4 * memory)[0])  # of e to an impulse in u
         # mean of its spectrum, by Parseval, over the spectrum at zero
         effective = float(len(e) * (answer @ answer) / answer.sum() ** 2)
-        spectrum = np.abs(np.fft.fft(a, _FREQUENCIES)) ** -2.0
-        correlated = float(np.mean(spectrum**2) / spectrum.mean() ** 2)
+        gain = np.abs(np.fft.fft(a, _FREQUENCIES)) ** 2
+        spectrum = gain.min() / gain if gain.min() else np.zeros(0)  # of a line all is correlated
+        correlated = (
+            float(np.mean(spectrum**2) / spectrum.mean() ** 2)
+            if len(spectrum)
+            else float(len(series))
+        )
         return cls(a, series, int(samples[0]), effective, correlated, memory)
 
     def at_rest(self, count: int) -> Array:
