@@ -726,6 +726,7 @@ def test_what_load_raises_is_among_the_findings(broken, tmp_path):
     assert report.summary is None
 
 
+@pytest.mark.slow
 def test_says_no_more_than_load_of_single_slips(tmp_path):
     """One slip is one finding, wherever it is: nothing that only follows from it."""
     more = {}

@@ -247,6 +247,7 @@ def from_closed_form(machine, q):
     return np.abs(np.angle(np.exp(1j * (np.array([c, d]) - oracles.five_bar(a, b))))).max()
 
 
+@pytest.mark.slow
 def test_far_samples_stay_on_the_branch_around_holes(five_bar):
     """Half of all crank angles leave the rods too short: straight ways lead through holes."""
     q_a = np.random.default_rng(14).uniform(-3, 3, (240, 2))

@@ -280,6 +280,7 @@ def test_postures_equal_those_tracked_in_numpy(machines, name, share):
     assert (closure.solve(q_a)[:, closure.active] == q_a).all()
 
 
+@pytest.mark.slow
 def test_a_folded_region_is_told_apart_from_the_branch(five_bar):
     """Five-bar far apart: same verdict as the closure in numpy, and the same posture."""
     closure = five_bar.closure

@@ -109,6 +109,7 @@ def test_limits_hold_between_samples(mini, found):
     assert found.used.max() <= 1 and found.used.max() > 0.99
 
 
+@pytest.mark.slow
 def test_accelerations_can_be_limited(slider_crank):
     free = excite(slider_crank, **QUICK, period=2.0)
     joint = slider_crank.active[0]
@@ -186,6 +187,7 @@ def test_condition_can_be_the_criterion(slider_crank):
     assert one.after.logdet < other.after.logdet
 
 
+@pytest.mark.slow
 def test_same_seed_same_bits(slider_crank):
     first, again, other = (excite(slider_crank, **QUICK, seed=seed) for seed in (4, 4, 5))
     assert np.array_equal(first.trajectory.coefficients, again.trajectory.coefficients)
@@ -281,6 +283,7 @@ def test_errors(mini, slider_crank, edited):
         excite(weak, **QUICK)
 
 
+@pytest.mark.slow
 def test_command(tmp_path):
     machine = crane.load(__file__.replace("test_excitation.py", "data/slider_crank.yaml"))
     out = tmp_path / "found"

@@ -101,6 +101,7 @@ def test_frames_of_joints_and_many_loops(tmp_path):
         crane.load(tmp_path / "bars.urdf")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["robot_delta", "wl16_like", "digit_like_2legs"])
 def test_robots_without_the_file_that_closes_them(name, tmp_path):
     """As a CAD exporter left them, with limits that can be read: told without, silent with."""

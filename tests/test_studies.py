@@ -105,6 +105,7 @@ def test_an_open_arm_has_strokes_too():
     assert found["range"] == 1.0 and found["upper_elbow_joint"] > 3
 
 
+@pytest.mark.slow
 def test_rows_do_not_depend_on_what_was_computed_before(pins, tmp_path):
     """Bitwise: alone, in another order, in two processes."""
     backwards = crane.study("mini_forwarder", {k: v[::-1] for k, v in PIN.items()})

@@ -235,6 +235,7 @@ def test_a_two_link_arm_has_the_area_of_its_ring(tmp_path):
     assert len(away) and np.minimum(np.abs(away - 0.8), np.abs(away - 0.2)).max() < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "frame"), [("kr300", None), ("ur5_robot", "ee_link")])
 def test_arms_of_many_joints_are_drawn(name, frame):
     machine = crane.load(name)
