@@ -15,6 +15,8 @@ GRAPHS = FORMATS[:-1]
 def run(kind, first, count, program="fuzz.py"):
     if kind in ("mjcf", "xacro"):
         pytest.importorskip({"mjcf": "mujoco"}.get(kind, kind))
+    if kind == "xacro":  # each in a process of its own
+        first, count = first // 10, count // 10
     assert judge(program, kind, first, count) == count
 
 
