@@ -26,7 +26,7 @@ from crane.codegen.llvm.engine import Code
 from crane.codegen.representation import Formula, Routine
 from crane.codegen.scalar import Number, needed
 
-MOST = 120_000  # operations of a formula; longer ones take minutes to compile
+MOST = 200_000  # operations of a formula; longer ones take minutes to compile
 
 
 class TooLongError(Exception):

@@ -29,26 +29,33 @@ def formula_text(formula: Formula, functions: set[tuple[str, int]]) -> str:
     pieces = [_Piece(operations, steps) for steps in _cut(_steps(operations, formula))]
     places = _places(pieces)
     targets: dict[int, list[int]] = {}
-    copied = []
+    copied: list[list[str]] = []
     for i, value in enumerate(formula.outputs):
         if isinstance(value, Expression) and operations[value.index][0] != "load":
             targets.setdefault(value.index, []).append(i)
         else:
-            copied += _copied(i, value, operations)
+            copied.append(_copied(i, value, operations))
     texts = [piece.lines(places, targets, functions) for piece in pieces]
+    for start in range(0, len(copied), PIECE):
+        texts.append([line for lines in copied[start : start + PIECE] for line in lines])
+    if len(pieces) == 1 and len(copied) <= PIECE:
+        texts = [[line for text in texts for line in text]]
     inputs = [f"ptr noalias readonly %in{i}" for i in range(formula.arrays)]
     arguments = ", ".join([*inputs, "ptr noalias %out"])
     head = f"define void @{formula.name}({arguments}) {{"
     if len(texts) <= 1:
-        return "\n".join([head, *(line for text in texts for line in text), *copied, _END])
+        return "\n".join([head, *(line for text in texts for line in text), _END])
     shared = f"{arguments}, ptr noalias %between"
-    out, lines = [], [head, f"  %between = alloca [{1 + max(places.values())} x double]"]
+    out, lines = (
+        [],
+        [head, f"  %between = alloca [{1 + max(places.values(), default=0)} x double]"],
+    )
     for number, text in enumerate(texts):
         name = f"@{formula.name}.{number}"
         out.append("\n".join([f"define internal void {name}({shared}) noinline {{", *text, _END]))
         words = [f"ptr %in{i}" for i in range(formula.arrays)]
         lines.append(f"  call void {name}({', '.join([*words, 'ptr %out, ptr %between'])})")
-    return "\n".join([*out, *lines, *copied, _END])
+    return "\n".join([*out, *lines, _END])
 
 
 def _steps(operations: Sequence[tuple], formula: Formula) -> list[list[int]]:
