@@ -11,7 +11,8 @@ from crane.codegen.llvm.functions import VECTOR, WIDEST, real
 from crane.codegen.representation import Formula
 from crane.codegen.scalar import Expression, Number, needed
 
-PIECE = 1000  # operations of one function
+WHOLE = 5000  # operations of a formula that stays one function, which runs faster
+PIECE = 1000  # of one of several
 # Products may be fused with sums. Reordering sums would gain nothing and let NaN cancel.
 _FAST = "nsz arcp contract"
 _ARITHMETIC = {"add": "fadd", "subtract": "fsub", "multiply": "fmul", "divide": "fdiv"}
@@ -71,7 +72,7 @@ def _steps(operations: Sequence[tuple], formula: Formula) -> list[list[int]]:
 
 def _cut(steps: list[list[int]]) -> list[list[list[int]]]:
     """Pieces of about equal length; a short formula stays whole, and one without steps is one."""
-    count = max(1, round(len(steps) / PIECE))
+    count = round(len(steps) / PIECE) if len(steps) > WHOLE else 1
     size = -(-len(steps) // count) if steps else 1
     return [steps[start : start + size] for start in range(0, max(1, len(steps)), size)]
 
