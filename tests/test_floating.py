@@ -8,6 +8,7 @@ import pinocchio as pin
 import pytest
 
 import crane
+from crane.common.errors import InputError
 
 DATA = Path(__file__).parent / "data"
 QUANTITIES = {
@@ -180,3 +181,28 @@ def test_a_crane_on_its_valves_in_free_fall_keeps_its_momentum(tmp_path):
         fall = [0, 0, -weight * run.time[i]]
         np.testing.assert_allclose(momentum.linear, fall, rtol=0, atol=1e-9 * weight)
         np.testing.assert_allclose(momentum.angular, 0, atol=1e-8 * weight)
+
+
+def test_a_body_that_is_held_is_where_it_floated_to(arm):
+    """Six locks are the coordinates, the three turns a rotation vector; then nothing floats."""
+    q, v, x = next(states(arm, 1, seed=4))
+    v[:6], x[:6] = 0, 0  # at rest, accelerations of the arm only
+    names = [arm.joints[i] for i in range(6)]
+    held = crane.load(arm.path, floating=True, lock=dict(zip(names, q[:6].tolist(), strict=True)))
+    assert held.active == arm.active[6:] and not held.coordinates.floating
+    wanted = crane.Dynamics(arm).inverse(q, v, x)[6:]
+    np.testing.assert_allclose(
+        crane.Dynamics(held).inverse(q[6:], v[6:], x[6:]), wanted, atol=1e-12
+    )
+    place = crane.Kinematics(arm, "lower").position(q)
+    np.testing.assert_allclose(crane.Kinematics(held, "lower").position(q[6:]), place, atol=1e-12)
+
+
+def test_one_coordinate_held_leaves_cardan_angles(arm):
+    sliding = crane.load(arm.path, floating=True, lock={"base_z": 0.3})
+    assert len(sliding.active) == 7 and not sliding.coordinates.floating
+
+
+def test_a_sketch_asks_where_the_body_is_held(arm, tmp_path):
+    with pytest.raises(InputError, match="'arm' floats, sketch it where it is held: --lock base_"):
+        crane.sketch(arm, tmp_path / "arm.png")

@@ -13,6 +13,7 @@ import numpy as np
 from crane.common.errors import CraneWarning, InputError, known
 from crane.common.magnitudes import doubt
 from crane.common.samples import FARTHEST, as_number
+from crane.description.floating import grounded
 from crane.description.sources import bundled
 from crane.description.spec import Chain, Coupling, Drive, Friction, MachineSpec
 from crane.description.tree import Joint, Limits, Link, Tree, limit
@@ -209,6 +210,7 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
     """
     joints = {joint.name: joint for joint in spec.tree.moving}
     held = []
+    spec, lock = grounded(spec, lock)
     lock, couplings = _coupled(spec.couplings, lock)
     for name, given in lock.items():
         if name not in joints:

@@ -27,7 +27,7 @@ def flyers(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
     """By name of each joint with six freedoms that floats the joints of its series, in order."""
     groups: dict[str, list[Joint]] = {}
     for joint in spec.tree.joints.values():
-        if joint.floats:
+        if joint.floats and joint.moves:
             groups.setdefault(joint.floats, []).append(joint)
     found = {}
     for name, series in groups.items():
@@ -79,6 +79,29 @@ def with_rotation_vectors(spec: MachineSpec) -> MachineSpec:
         vector = Rotation.from_euler("XYZ", angles).as_rotvec().tolist()
         home |= {name: x for name, x in zip(turns, vector, strict=True) if x}
     return dataclasses.replace(spec, home=home)
+
+
+def grounded(
+    spec: MachineSpec, lock: Mapping[str, float]
+) -> tuple[MachineSpec, Mapping[str, float]]:
+    """Home and locks of series that no longer float once some of their joints are locked.
+
+    Three turns locked together are a rotation vector, as the coordinates are; what is left of
+    them, and one or two that are locked alone, are Cardan angles.
+    """
+    from scipy.spatial.transform import Rotation
+
+    home, held = dict(spec.home), dict(lock)
+    for series in flyers(spec).values():
+        turns = series[3:]
+        if not held.keys() & set(series):
+            continue
+        all_held = held.keys() >= set(turns)
+        values = held if all_held else home
+        vector = [values.get(name, 0.0) for name in turns]
+        angles = Rotation.from_rotvec(vector).as_euler("XYZ").tolist()
+        values |= dict(zip(turns, angles, strict=True))
+    return dataclasses.replace(spec, home=home), held
 
 
 def floated(spec: MachineSpec) -> MachineSpec:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from crane.closure.traced import Bodies, Loops, MovingBodies
-from crane.codegen.scalar import Number, add
+from crane.codegen.scalar import Number
 from crane.dynamics.inertia import Inertia, Pair, Vector, by, carried, plus, shifted
 
 Hanging = tuple[Inertia, Pair]  # an inertia, and the wrench that it asks for at rest
@@ -41,18 +41,14 @@ class Moving:
         """What is left along a joint for more than the reference."""
         return self.forces[i] - self.rotors[i] * self.reference[i]
 
-    def rigid(self, i: int, arm: Vector) -> Hanging:
-        """Inertia and wrench of a body, referred to the point from which `arm` leads to it."""
+    def all_on(self, i: int, hung: Hung) -> Hanging:
+        """A body and what hangs on it, at its origin."""
         mass, lever, tensor = self.masses[i - 1]
-        lever = add(arm, lever)
-        return Inertia.rigid(mass, lever, tensor), carried(self.wrenches[i - 1], lever)
-
-    def all_on(self, i: int, arm: Vector, hung: Hung) -> Hanging:
-        """A body and what hangs on it, referred to the point from which `arm` leads to it."""
-        inertia, wrench = self.rigid(i, arm)
+        inertia = Inertia.rigid(mass, lever, tensor)
+        wrench = carried(self.wrenches[i - 1], lever)
         if i not in hung:
             return inertia, wrench
-        return inertia + hung[i][0].carried(arm), plus(wrench, carried(hung[i][1], arm))
+        return inertia + hung[i][0], plus(wrench, hung[i][1])
 
     def moved(self, i: int, carrier: Pair, rate: Number) -> Pair:
         """What a body accelerates more, from what its parent does."""

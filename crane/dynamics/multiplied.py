@@ -69,7 +69,7 @@ class Multiplied:
         """A joint, and what it hands to the body that carries it."""
         moving, axis = self._moving, self._moving.posture.axes(i)
         parent, arm = moving.posture.geometry.parents[i], moving.posture.arms[i]
-        inertia, wrench = moving.all_on(i, NONE[0], inside)
+        inertia, wrench = moving.all_on(i, inside)
         column = inertia.of(axis)
         inverse = 1.0 / (paired(axis, column) + moving.rotors[i])
         pull = moving.force(i) - paired(axis, wrench)

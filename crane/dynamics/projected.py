@@ -7,7 +7,7 @@ from crane.codegen.factors import Positive
 from crane.codegen.scalar import Number, dot
 from crane.dynamics.composite import Columns
 from crane.dynamics.inertia import Inertia, Pair, by, carried, halved, paired, plus
-from crane.dynamics.moving import NONE, Hung, Moving, hang
+from crane.dynamics.moving import Hung, Moving, hang
 
 
 class Projected:
@@ -39,7 +39,7 @@ class Projected:
         inertias: dict[int, Inertia] = {}
         self._pull: list[Number] = [0.0] * len(own)
         for i in reversed(cluster.joints):
-            inertia, wrench = moving.all_on(i, NONE[0], inside)
+            inertia, wrench = moving.all_on(i, inside)
             inertias[i], arm = inertia, posture.arms[i]
             force = moving.force(i) - paired(posture.axes(i), wrench)
             self._pull = [

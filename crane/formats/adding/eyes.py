@@ -33,7 +33,7 @@ class Eye:
     def place(self, machine: Machine, q: Array) -> pin.SE3:
         """Of the link's frame, moved to the point, in the world."""
         data = machine.model.createData()
-        pin.forwardKinematics(machine.model, data, q)
+        pin.forwardKinematics(machine.model, data, machine.coordinates.configuration(q))
         frame = pin.updateFramePlacement(machine.model, data, machine.frame(self.link))
         return frame * pin.SE3(np.eye(3), np.array(self.point))
 

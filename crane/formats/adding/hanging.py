@@ -70,7 +70,8 @@ def hung(
 def _normal(machine: Machine, eyes: Sequence[Eye], q: Array, way: Array) -> Array | None:
     """(3,) normal of the plane in which two bodies move against each other, None for space."""
     data = machine.model.createData()
-    jacobian = pin.computeJointJacobians(machine.model, data, q).reshape(6, -1)
+    at = machine.coordinates.configuration(q)
+    jacobian = pin.computeJointJacobians(machine.model, data, at).reshape(6, -1)
     turning, sliding = [], []
     for joint in path_between(machine, eyes[0].link, eyes[1].link):
         column = jacobian[:, machine.column(joint.name)]

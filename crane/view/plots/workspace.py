@@ -131,7 +131,7 @@ def _grid(space: Workspace) -> list[Array]:
 
 def _tip(space: Workspace, q: Array) -> Array:
     model, data = space.machine.model, space.machine.model.createData()
-    pin.forwardKinematics(model, data, q)
+    pin.forwardKinematics(model, data, space.machine.coordinates.configuration(q))
     frame = space.machine.frame(space.frame)
     return np.array(pin.updateFramePlacement(model, data, frame).translation)
 
@@ -144,7 +144,7 @@ def _skeleton(space: Workspace) -> Array:
     """Lines (k, 2, 2) between the joints of the machine at home, in the section."""
     machine, model = space.machine, space.machine.model
     data = model.createData()
-    pin.framesForwardKinematics(model, data, machine.home)
+    pin.framesForwardKinematics(model, data, machine.coordinates.configuration(machine.home))
     ends = []
     for joint in range(1, model.njoints):
         if model.parents[joint] > 0:

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import ArrayLike
 
+from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.machine import Machine
 from crane.view.plots.recording import STYLE, write_figure
@@ -75,6 +76,10 @@ def sketch_figure(
     with a dot, joints about a line in the plane are boxes on that line, prismatic joints are
     cylinders. Each loop has a number and a tint. Axes are equal, in metres.
     """
+    if machine.coordinates.floating:
+        columns = [at + i for at in machine.coordinates.floating for i in range(6)]
+        held = " ".join(f"--lock {machine.joints[i]}={machine.home[i]:.6g}" for i in columns)
+        raise InputError(f"'{machine.name}' floats, sketch it where it is held: {held}")
     q = machine.home
     if q_a is not None:
         q = machine.closure.solve(machine.check_limits(q_a))
