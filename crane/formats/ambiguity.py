@@ -12,7 +12,7 @@ from crane.closure.choice import slides
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
 from crane.description import MachineSpec
-from crane.formats.opening import is_robot, is_sdf
+from crane.formats.opening import is_robot, is_sdf, is_simulators
 from crane.machine import Machine
 
 _LISTED, _WRITTEN = 4, 6  # loops and coordinates in a line
@@ -32,7 +32,7 @@ def warn_of_assemblies(
     """
     if not len(closure.passive):
         return
-    drawn = _says_all(spec.path)
+    drawn = is_simulators(spec.path)
     names = closure.equations.coordinates.names
     named = [i for i, name in enumerate(names) if drawn or name in spec.home]
     most = _THOROUGH if thorough else _QUICK
@@ -50,7 +50,7 @@ def near_assemblies(machine: Machine) -> list[Array]:
     closure = machine.closure
     if not len(closure.passive):
         return []
-    said = np.arange(closure.model.nv) if _says_all(machine.path) else closure.said
+    said = np.arange(closure.model.nv) if is_simulators(machine.path) else closure.said
     return [other.q for other in ambiguities(closure, closure.guess, said, _THOROUGH)]
 
 
@@ -87,11 +87,6 @@ def _where(spec: MachineSpec) -> str:
     if is_sdf(spec.path):
         return "in <initial_position> of axes"
     return 'in <group_state name="home">' if is_robot(spec.path) else "in the key 'home'"
-
-
-def _says_all(path: Path) -> bool:
-    """Whether files of this kind have a value of every joint: MJCF and SDF."""
-    return not _in_yaml(path) and (is_sdf(path) or not is_robot(path))
 
 
 def _in_yaml(path: Path) -> bool:

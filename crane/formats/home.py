@@ -8,6 +8,7 @@ from crane.closure.choice import size, slides
 from crane.closure.exactness import CLOSED
 from crane.common.errors import CraneWarning
 from crane.description import MachineSpec
+from crane.formats.opening import is_simulators
 from crane.machine.drives import free_joints
 
 _LISTED = 4
@@ -38,10 +39,11 @@ def _sought(spec: MachineSpec, closure: Closure) -> str:
     moved = _list([names[int(i)] for i in held if i in sought.moved])
     how = f"moving {moved}, too" if moved else "the driven joints held"
     chosen = f"the nearest of {sought.count} postures" if sought.count > 1 else "the only posture"
+    keep = "convert, then crane check" if is_simulators(spec.path) else "check"
     return (
         f"{place}: home was sought, because from what the file says of it {sought.reason}; "
         f"{how}, {chosen} that was found has {names[joint]} {off:.3g} {unit} off: look at it with "
-        "crane sketch, and keep it with crane check --write-home"
+        f"crane sketch, and keep it with crane {keep} --write-home"
     )
 
 

@@ -15,7 +15,7 @@ from crane.common.errors import CraneError, CraneWarning, OutputError
 from crane.common.output import check_file, replacing
 from crane.description.sources import bundled, examples
 from crane.formats.loading import load
-from crane.formats.opening import is_robot, is_sdf
+from crane.formats.opening import is_sdf, is_simulators
 from crane.machine import Machine
 
 Edit = tuple[int, int, str]  # from, to, what stands there then
@@ -83,7 +83,7 @@ def _check_place(machine: Machine, path: Path) -> None:
     packaged = {place.resolve() for place in (*bundled().values(), *examples().values())}
     if path in packaged:
         raise OutputError(f"{path}: belongs to a package, {elsewhere}")
-    if path.suffix.lower() not in (".yaml", ".yml") and (is_sdf(path) or not is_robot(path)):
+    if is_simulators(path):
         kind = "an SDF" if is_sdf(path) else "a MJCF"
         raise OutputError(f"{path}: is {kind}, {elsewhere}")
     check_file(path)

@@ -59,6 +59,13 @@ def is_sdf(file: Path) -> bool:
     return suffix in _SDF or (suffix == ".xml" and XmlFile(file).root.tag == "sdf")
 
 
+def is_simulators(file: Path) -> bool:
+    """Whether a file is SDF or MJCF: it says all joints at home, and is not written into."""
+    if file.suffix.lower() in (".yaml", ".yml"):
+        return False
+    return is_sdf(file) or not is_robot(file)
+
+
 @contextmanager
 def robots(machine: Machine, chains: Iterable[str] | None = None) -> Iterator[list[XmlFile]]:
     """The robots that a machine was made of, while its packages are known; of MJCF there are none.

@@ -20,6 +20,7 @@ from crane.formats.adding.open_loops import Proposal, proposals
 from crane.formats.check.mechanism import check_mechanism
 from crane.formats.check.plausible import implausible
 from crane.formats.machine_file.read import read
+from crane.formats.opening import is_simulators
 from crane.machine.masses import has_mass
 
 # "four_bar.yaml:12: what", or a file that has no line to point at
@@ -207,6 +208,8 @@ def _next(
         return f"crane check {called} again, once the errors are mended"
     if is_open:
         return f"crane add loops {called}"
+    if closure.sought is not None and is_simulators(spec.path):
+        return f"crane convert {called} {file_name(spec.name)}"
     if closure.sought is not None:
         return f"crane check {called} --write-home"
     if not has_mass(closure.model):
