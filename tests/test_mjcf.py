@@ -13,6 +13,7 @@ from linkages import WRITERS, assert_same, postures, rewritten
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
+from crane.formats.check import check
 from crane.formats.mjcf.left_out import touching
 
 TREE = """<mujoco model="tree">
@@ -423,7 +424,10 @@ def test_what_is_left_out_is_told_in_three_lines(tmp_path):
     text = text.replace('name="ball" type', 'name="ball" damping="1" type')
     text = text.replace("<actuator>", f"{TENDON}<actuator>").replace("<worldbody>", FLOOR, 1)
     _, lines = machine_of(text, tmp_path)
-    lines = [line for line in lines if "home was sought" not in line]
+    (sought,) = [line for line in lines if "home was sought" in line]
+    assert sought.endswith("keep it with crane convert, then crane check --write-home")
+    assert check(tmp_path / "some.xml").next.startswith("crane convert ")
+    lines.remove(sought)
     assert len(lines) == 3 and lines[0].startswith("some.xml: MuJoCo says")
     assert lines[1].startswith("some.xml: left out of what MuJoCo has: damping, friction and stif")
     for what in ("limits of tendons (rope)", "contacts of 6 geoms (floor", "the air", "2 sensors"):
