@@ -12,7 +12,7 @@ from subject import START, Array, Runner
 import crane
 from crane.control import Free
 from crane.motion.kinematics import Kinematics
-from crane.simulation.integration import PythonStepper
+from crane.simulation.integration import Chart, PythonStepper
 
 STEPS = (0.04, 0.03, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005)  # [s]
 
@@ -24,7 +24,7 @@ def engines_of(machine: crane.Machine) -> dict[str, Engine]:
     v, nq = machine.closure.gamma(q) @ v_a, machine.model.nq
     kinematics, free, peer = Kinematics(machine), Free(machine), ConstraintDynamics(machine)
     fast = Runner(machine, free, q_a, v_a)
-    slow = PythonStepper(crane.Dynamics(machine, backend="pinocchio"), free, 0)
+    slow = PythonStepper(Chart.of(crane.Dynamics(machine, backend="pinocchio")), free, 0)
     mujocos = {(name, h): MuJoCo(machine, h, name) for name in INTEGRATORS for h in STEPS}
 
     def ours(step: float) -> Tip:

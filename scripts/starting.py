@@ -18,7 +18,7 @@ import crane
 from crane.control import PI
 from crane.dynamics.compiled import QUANTITIES
 from crane.motion.trajectories import task_trajectory
-from crane.simulation.integration import CompiledStepper
+from crane.simulation.integration import Chart, CompiledStepper
 
 
 def starts(rounds: int) -> str:
@@ -78,7 +78,7 @@ def _compiling() -> Iterator[tuple[str, float]]:
         yield quantity, time.perf_counter() - start
     control = PI(mini, task_trajectory(mini, "lift"))
     start = time.perf_counter()
-    CompiledStepper(dynamics, control, 3)
+    CompiledStepper(Chart.of(dynamics), control, 3)
     yield "the simulation's loop with PI control", time.perf_counter() - start
 
 

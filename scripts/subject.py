@@ -8,7 +8,7 @@ import pinocchio as pin
 import crane
 from crane.codegen import Program
 from crane.control import Law, ValveDrive
-from crane.simulation.integration import CompiledStepper, StiffStepper, row_layout
+from crane.simulation.integration import Chart, CompiledStepper, StiffStepper, row_layout
 
 Array = np.ndarray
 
@@ -60,9 +60,9 @@ class Runner:
         own = control.start(q_a)
         self._start = np.concatenate([machine.closure.solve(q_a), v_a, own, np.zeros(2)])
         self._stepper = (
-            StiffStepper(crane.Dynamics(machine), control)
+            StiffStepper(Chart.of(crane.Dynamics(machine)), control)
             if isinstance(control, ValveDrive)
-            else CompiledStepper(crane.Dynamics(machine), control, len(own))
+            else CompiledStepper(Chart.of(crane.Dynamics(machine)), control, len(own))
         )
         self._columns = row_layout(machine, control, len(own)).size
 

@@ -1,5 +1,6 @@
 """Closing the loops: q = f(q_A), v = gamma v_A, a = gamma a_A + drift."""
 
+import dataclasses
 import threading
 from collections.abc import Collection, Sequence
 from functools import cached_property
@@ -15,11 +16,12 @@ from crane.closure.equations import LoopEquations
 from crane.closure.home import Sought, settle
 from crane.closure.structure import Structure
 from crane.codegen import TooLongError, carefully
-from crane.common.errors import BranchEdgeError, InputError
+from crane.common.errors import BranchEdgeError, InputError, WrongBranchError
 from crane.common.samples import Array, as_samples, per_sample, solve
 from crane.description import Coupling, LoopSpec
 
 _FEW, _FAR = 100, 0.1  # samples worth sorting: how many, how far apart as a share of the range
+_SAME = 1e-6  # difference of a closed posture and what Newton's method makes of it
 _STEPS = 8  # from home to a target that is far from the one before it
 
 
@@ -42,6 +44,7 @@ class Closure:
         said: Names of joints whose home is said to be that of the guess; where the loops do not
             close from the guess, the others are sought. None: all are said, and none is sought.
         loose: Names of active joints that nothing holds at the guess while the others are sought.
+        wound: Whether pins keep the whole turns of the guess, which else are taken out.
 
     Raises:
         MechanismError: The loops cannot be closed, or the active joints do not fit the degrees of
@@ -72,6 +75,7 @@ class Closure:
         couplings: Sequence[Coupling] = (),
         said: Collection[str] | None = None,
         loose: Collection[str] = (),
+        wound: bool = False,
     ):
         self.model = model
         self.equations = LoopEquations(model, loops, couplings)
@@ -95,6 +99,11 @@ class Closure:
             None if said is None else columns(said),
             columns(loose),
         )
+        if wound:
+            turns = np.round((guess - self.structure.home) / (2 * np.pi))
+            turns[coordinates.slides] = 0.0
+            home = self.structure.home + 2 * np.pi * turns
+            self.structure = dataclasses.replace(self.structure, home=home)
         span = (coordinates.upper - coordinates.lower)[self.active]
         self._span = np.where(np.isfinite(span) & (span > 0), span, 1.0)
         self._branch = Branch(
@@ -225,6 +234,16 @@ class Closure:
         cells = np.floor(scaled * len(targets) ** (1 / scaled.shape[1]))
         order: NDArray[np.intp] = np.lexsort((scaled[:, -1], *cells[:, :-1].T))
         return order
+
+    def on_branch(self, q: Array) -> bool:
+        """Whether a closed posture (nq,) lies on the assembly branch of home."""
+        if self.compiled:
+            return self.fast.start_near(self._cursor, q)
+        try:
+            posture = self._branch.posture(q)
+        except WrongBranchError:
+            return False
+        return bool(np.abs(posture.q - q).max() < _SAME)
 
     def reach(self, cursor: Cursor, target: Array, sample: str = "") -> Array:
         """The posture at a target that is too far for one step, where the cursor is left.

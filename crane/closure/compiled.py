@@ -217,15 +217,17 @@ class FastClosure:
         return coordinates, posture, loops
 
     def add_newton(self, program: Program, signs: Array) -> None:
-        """newton(numbers, q) -> residual, change, regular, corrected q, passive rows of gamma.
+        """newton(numbers, q) -> residual, change, regular, steepest, corrected q, rows of gamma.
 
-        regular is positive on the home branch away from its edge, with surplus equations closed.
+        regular is positive on the home branch away from its edge, with surplus equations closed;
+        steepest is the largest entry of gamma, whose rows are those of passive joints.
         """
         q, _, loops = self.trace(Tape(), 0, 1)
         steps = loops.correction
         corrected = [x + steps.get(i, 0.0) for i, x in enumerate(q, start=1)]
         rows = [loops.gamma[loops.passive_joints[row]][k] for row, k in self._pairs]
-        worst = maximum(largest(rows) - _STEEP, loops.surplus - self._structure.surplus.allowed)
+        steepest = largest(rows)
+        worst = maximum(steepest - _STEEP, loops.surplus - self._structure.surplus.allowed)
         for sign, determinant in zip(signs, loops.determinants, strict=True):
             worst = maximum(worst, -(float(sign) * determinant))
         for alignment in loops.alignments:
@@ -237,6 +239,7 @@ class FastClosure:
                 "residual": [loops.residual],
                 "change": [largest(steps.values())],
                 "regular": [-1.0 * worst],
+                "steepest": [steepest],
                 "q": corrected,
                 "gamma": rows,
             },

@@ -321,13 +321,23 @@ class Machine:
                 raise InputError(
                     f"joint '{name}' is named twice among the active ones, once will do"
                 )
-        closure = Closure(
-            self.model,
-            self.closure.equations.loops,
-            names,
-            self.home,
-            self.closure.equations.couplings,
-        )
+        return self._seen_by(names, self.home, wound=False)
+
+    def seen_from(self, q: Array, names: tuple[str, ...]) -> "Machine":
+        """`driven_by` with another home posture, whose assembly branch need not be this one's.
+
+        Args:
+            q: (nq,) closed posture, whose whole turns stay.
+            names: Active joints.
+
+        Raises:
+            MechanismError: See `driven_by`.
+        """
+        return self._seen_by(names, q, wound=True)
+
+    def _seen_by(self, names: tuple[str, ...], home: Array, wound: bool) -> "Machine":
+        loops, couplings = self.closure.equations.loops, self.closure.equations.couplings
+        closure = Closure(self.model, loops, names, home, couplings, wound=wound)
         same = set(names) == set(self.active)
         return dataclasses.replace(
             self,

@@ -27,6 +27,8 @@ from crane.machine import Machine
 from crane.motion.trajectories import Trajectory, beyond_limits
 from crane.recordings.recording import Recording
 from crane.simulation.integration.adaptive import ADAPTIVE, AdaptiveSteps
+from crane.simulation.integration.charted import ChartedSteps, Way
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.halt import HaltedError, explained
 from crane.simulation.integration.state import row_layout
 from crane.simulation.integration.steps import Steps
@@ -143,7 +145,8 @@ def integrate(
     except ClosureError as error:
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
     state = np.concatenate([posture, v_a, own, np.zeros(_ENERGIES)])
-    integration = _integration(dynamics, control, len(own), method)
+    make = _integration(machine, control, len(own), method)
+    integration = ChartedSteps(Chart.of(dynamics), control, len(own), make)
     layout = row_layout(machine, control, len(own))
     times = step * np.arange(steps + 1, dtype=np.float64)
     rows = np.empty((steps + 1, layout.size), order="F")  # recorded by columns, without a copy
@@ -172,32 +175,32 @@ def _own_start(control: Controller, dynamics: Dynamics, q: Array) -> Array:
 
 
 def _integration(
-    dynamics: Dynamics, control: Controller, own: int, method: str | None
-) -> Steps | StiffSteps | AdaptiveSteps:
+    machine: Machine, control: Controller, own: int, method: str | None
+) -> Callable[[Chart], Way]:
     """What integrates by a method, or by that which the controller asks for."""
     if isinstance(control, ValveDrive) and method in (None, "rosenbrock"):
-        return _stiff(dynamics, control, own)
+        return lambda chart: _stiff(chart, control, own)
     if isinstance(control, ValveDrive) and control.period:
         raise InputError(
             f"method '{method}' does not call the valves' program, leave the method out"
         )
     if method in (None, "rk4"):
-        return Steps(dynamics, control, own)
-    if method in ADAPTIVE and dynamics.machine.coordinates.floating:
+        return lambda chart: Steps(chart, control, own)
+    if method in ADAPTIVE and machine.coordinates.floating:
         raise InputError(f"method '{method}' does not go round with a body that floats, take rk4")
     if method in ADAPTIVE:
-        return AdaptiveSteps(dynamics, control, own, method)
+        return lambda chart: AdaptiveSteps(chart, control, own, method)
     raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")
 
 
-def _stiff(dynamics: Dynamics, control: ValveDrive, own: int) -> StiffSteps | AdaptiveSteps:
+def _stiff(chart: Chart, control: ValveDrive, own: int) -> Way:
     """What integrates a circuit: machine code, or scipy where there is none."""
-    if dynamics.backend == "compiled":
+    if chart.dynamics.backend == "compiled":
         with suppress(TooLongError):
-            return StiffSteps(dynamics, control)
+            return StiffSteps(chart, control)
     if control.period:
         raise InputError("a program with a period runs on the compiled backend alone")
-    return AdaptiveSteps(dynamics, control, own, "BDF")
+    return AdaptiveSteps(chart, control, own, "BDF")
 
 
 def as_controller(controller: Controller | Command | Force | None, machine: Machine) -> Controller:

@@ -23,7 +23,7 @@ from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.motion.trajectories import Trajectory, beyond_limits
 from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS, Recording
-from crane.simulation.integration import HaltedError, Steps, explained, row_layout
+from crane.simulation.integration import Chart, HaltedError, Steps, explained, row_layout
 from rig.plant import Tolerances, drawn
 from rig.sensors import Sensors, default_sensors
 
@@ -204,7 +204,8 @@ class Rig:
         plant, dynamics = self.plant, Dynamics(self.plant)
         n, nq, active = len(plant.active), plant.model.nq, plant.closure.active
         held, substeps = _Held(plant), _substeps(dynamics, reference, step)
-        h, steps = step / substeps, Steps(dynamics, held, 0)
+        h, steps = step / substeps, Steps(Chart.of(dynamics), held, 0)
+        steps.limit(np.inf)  # the rig stays away from dead centres
         state = np.concatenate([plant.closure.solve(reference[0]), np.zeros(n + 2)])
         now = steps.slow.layout.view(state)
         rows = np.empty((substeps, row_layout(plant, held, 0).size))

@@ -1,6 +1,8 @@
 """Motion in time: Runge-Kutta and Rosenbrock methods in machine code, and scipy's."""
 
 from crane.simulation.integration.adaptive import ADAPTIVE, AdaptiveSteps
+from crane.simulation.integration.charted import ChartedSteps
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.halt import HaltedError, explained
 from crane.simulation.integration.rosenbrock import StiffStepper
 from crane.simulation.integration.runge_kutta import CompiledStepper
@@ -10,6 +12,7 @@ from crane.simulation.integration.stepwise import PythonStepper
 from crane.simulation.integration.stiff import StiffSteps
 
 __all__ = [
-    "ADAPTIVE", "AdaptiveSteps", "CompiledStepper", "HaltedError", "PythonStepper", "Steps",
-    "StiffStepper", "StiffSteps", "explained", "row_layout", "state_layout",
+    "ADAPTIVE", "AdaptiveSteps", "Chart", "ChartedSteps", "CompiledStepper", "HaltedError",
+    "PythonStepper", "Steps", "StiffStepper", "StiffSteps", "explained", "row_layout",
+    "state_layout",
 ]  # fmt: skip

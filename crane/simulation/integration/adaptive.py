@@ -7,7 +7,7 @@ import numpy as np
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
 from crane.control import Controller
-from crane.dynamics import Dynamics
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.stepwise import Progress, PythonStepper
 
@@ -21,21 +21,26 @@ class AdaptiveSteps:
     """An adaptive method with dense output, loops closed to rounding at the recorded instants.
 
     Args:
-        dynamics: The machine.
+        chart: The machine.
         control: Its controller.
         own: Number of the controller's states.
         method: One of `ADAPTIVE`.
 
     Attributes:
         slow: Observes.
-        done: Number of instants that have their row where it halted; none, it keeps no history.
+        done: Number of instants that have their row.
+        reached: Index of the instant of the state.
     """
 
-    done = 0
+    done = reached = 0
 
-    def __init__(self, dynamics: Dynamics, control: Controller, own: int, method: str):
-        self.slow = PythonStepper(dynamics, control, own)
-        self._closure, self._method = dynamics.machine.closure, method
+    def __init__(self, chart: Chart, control: Controller, own: int, method: str):
+        self.slow = PythonStepper(chart, control, own)
+        self._closure, self._method = chart.machine.closure, method
+
+    def limit(self, steepest: float) -> None:
+        """See `Steps.limit`."""
+        self.slow.limit = steepest
 
     def last(self, time: float, state: Array) -> Array:
         """See `Steps.last`."""
@@ -47,7 +52,7 @@ class AdaptiveSteps:
 
     def run(
         self, times: Array, state: Array, step: float, rows: Array, progress: Progress = None
-    ) -> None:
+    ) -> int:
         """See `Steps.run`.
 
         Raises:
@@ -71,27 +76,39 @@ class AdaptiveSteps:
                 return -_FASTEST
             return _FASTEST - float(np.abs(gamma @ at.v_a).max(initial=0.0))
 
-        calm.terminal = True  # type: ignore[attr-defined]
+        def gentle(time: float, state: Array) -> float:
+            try:
+                gamma = closure.gamma(view(state).q)[closure.passive]
+            except ClosureError:
+                return -1.0
+            return 1.0 - float(np.abs(gamma).max(initial=0.0)) / self.slow.limit
+
+        calm.terminal = gentle.terminal = True  # type: ignore[attr-defined]
+        gentle.direction = -1.0  # type: ignore[attr-defined]
+        self.done = self.reached = 0
         method: Any = self._method
         result: Any = solve_ivp(
             rate, (times[0], end), state, method=method, t_eval=[*times, end],
-            rtol=1e-9, atol=1e-11, events=calm,
+            rtol=1e-9, atol=1e-11, events=(calm, gentle),
         )  # fmt: skip
-        if result.status == 1:
-            q_a = view(result.y_events[0][0]).q[closure.active]
+        if result.status == 1 and len(result.t_events[0]):
+            q_a = self.slow.here(result.y_events[0][0])
             what = f" the motion explodes (a passive joint exceeds {_FASTEST:g} m/s or rad/s)"
             raise HaltedError(result.t_events[0][0], q_a, what, ": look at its forces and gains")
         if not result.success:
             last = float(result.t[-1]) if len(result.t) else 0.0
-            q = view(result.y[:, -1] if len(result.t) else state).q
+            here = self.slow.here(result.y[:, -1] if len(result.t) else state)
             what = f" {self._method} gives up: {result.message.rstrip('.').lower()}"
-            raise HaltedError(last, q[closure.active], what, ", try another method")
+            raise HaltedError(last, here, what, ", try another method")
         for time, row, sample in zip([*times, end], [*rows, None], result.y.T, strict=False):
             q = view(sample).q
             try:
                 q[:] = closure.solve(q[closure.active], guess=q)
             except ClosureError as error:
-                raise HaltedError(time, q[closure.active], f": {error}") from None
+                raise HaltedError(time, self.slow.here(sample), f": {error}") from None
+            state[:] = sample
+            self.reached = self.done
             if row is not None:
                 row[:] = [*sample, *self.slow.observe(time, sample)[1]]
-        state[:] = result.y[:, -1]
+                self.done += 1
+        return self.reached

@@ -6,14 +6,14 @@ from crane.closure.traced import folded
 from crane.codegen import Expression, Number, Program, Tape, largest, maximum, select
 from crane.codegen.derivative import derivatives
 from crane.codegen.factors import eliminated, loaded, stored, substituted
-from crane.codegen.scalar import add, apply, dot, minimum, scale, subtract, times
+from crane.codegen.scalar import add, apply, dot, minimum, scale, times
 from crane.common.samples import Array
 from crane.control import At, ValveDrive
-from crane.dynamics import Dynamics
-from crane.dynamics.traced import Sweep
 from crane.simulation.integration.blocks import in_blocks
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.state import seen_layout, state_layout
 from crane.simulation.integration.traced import (
+    Traced,
     columns_of,
     form_of,
     machine_at,
@@ -62,23 +62,26 @@ class StiffStepper:
     (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.7.)
 
     Args:
-        dynamics: The machine.
+        chart: The machine.
         control: Its controller.
 
     Raises:
         TooLongError: It would take too long to compile.
     """
 
-    def __init__(self, dynamics: Dynamics, control: ValveDrive):
-        machine = dynamics.machine
+    def __init__(self, chart: Chart, control: ValveDrive):
+        machine, dynamics = chart.machine, chart.dynamics
         self._fast, self._numbers = machine.closure.fast, dynamics.numbers
-        self._dynamics, self._control = dynamics, control
+        self._chart, self._control = chart, control
+        self.bounds = np.append(self._fast.bounds, chart.steep)
         self._columns = columns_of(control)
         self._state = state_layout(machine, len(control.scales))
         self._seen = seen_layout(machine, control)
         self._stiff = int(np.isfinite(control.scales).sum())
         form = form_of(control, self._columns, len(machine.active), len(control.scales), fold=True)
-        key = ("stiff", form, self._stiff, folded(self._numbers), dynamics.carriers, dynamics.plan)
+        seen = tuple(chart.seen.tolist())
+        plan = dynamics.carriers, dynamics.plan
+        key = ("stiff", form, self._stiff, folded(self._numbers), *plan, seen)
         if key not in self._fast.programs:
             self._fast.programs[key] = program_of(control, self._fast, key, self._build)
         self._program = self._fast.programs[key]
@@ -101,7 +104,7 @@ class StiffStepper:
         def call(count: int, references: Array, out: Array) -> int:
             return self._program.call(
                 "run", count, self._fast.close_address, *machine, settings, references, state,
-                out, self._lengths, self._fast.bounds, self._scales,
+                out, self._lengths, self.bounds, self._scales,
             )  # fmt: skip
 
         return in_blocks(call, self._control, times, step, rows)
@@ -115,10 +118,10 @@ class StiffStepper:
         self._program.call("observe", *machine, settings, reference, state, seen)
         return seen
 
-    def _trace(self, tape: Tape, state: int, theta: int | None) -> tuple[Sweep, At]:
+    def _trace(self, tape: Tape, state: int, theta: int | None) -> tuple[Traced, At]:
         """The machine at a state, its references between three rows or in one."""
         control, columns = self._control, self._columns
-        sweep, q_a, parts = machine_at(self._dynamics, tape, self._state, state)
+        machine = machine_at(self._chart, tape, self._state, state)
         settings = settings_of(control, tape, 2, fold=True)
         rows = [tape.loads(3, columns * row, columns) for row in range(3)]
         reference = rows[0]
@@ -127,18 +130,18 @@ class StiffStepper:
             s = tape.load(theta, 0)
             shares = ((2.0 * s - 1.0) * (s - 1.0), 4.0 * s * (1.0 - s), s * (2.0 * s - 1.0))
             reference = [dot(shares, values) for values in zip(*rows, strict=True)]
-        return sweep, At(q_a, parts.v_a, parts.own, settings, reference, sweep.inverse)
+        return machine, machine.seen(settings, reference)
 
     def _build(self, program: Program) -> None:
         control = self._control
         tape = Tape()
-        sweep, at = self._trace(tape, 5, 4)
+        machine, at = self._trace(tape, 5, 4)
         tau, own_rate = control.trace(at)
-        a_a = sweep.forward(tau, friction=True)
-        powers = [dot(tau, at.v_a), sweep.dissipation]
-        program.add("rate", 6, [*sweep.slopes, *a_a, *own_rate, *powers])
+        slopes, a_a, powers = machine.sweep.slopes, machine.forward(tau), machine.powers(tau)
+        program.add("rate", 6, [*slopes, *a_a, *own_rate, *powers])
         tape = Tape()
-        sweep, at = self._trace(tape, 4, None)
+        machine, at = self._trace(tape, 4, None)
+        sweep = machine.sweep
         tau, _ = control.trace(at)
         seen = [*tau, *sweep.friction, sweep.kinetic, sweep.potential, *control.look(at)]
         program.add("observe", 5, seen)
@@ -197,15 +200,18 @@ class StiffStepper:
                             r.leave()
                     with r.otherwise():
                         r.store(r.h, 1, wanted)
+                with r.when(result["steepest"] > r.bounds[3]):
+                    r.give(i + 1)
             r.give(r.steps)
 
     def _add_prepare(self, program: Program) -> tuple[list[list[Number]], list[list[Number]]]:
         """prepare(..., h): elimination of 1 - h gamma J, rows of the velocities times M_A."""
         tape = Tape()
-        sweep, at = self._trace(tape, 5, 4)
+        machine, at = self._trace(tape, 5, 4)
+        sweep, parts = machine.sweep, machine.parts
         tau, own_rate = self._control.trace(at)
-        net = subtract(add(tau, sweep.passive), sweep.friction)
-        unknown = [x for x in (*at.state[: self._stiff], *at.v_a) if isinstance(x, Expression)]
+        net = machine.forces(tau)
+        unknown = [x for x in (*parts.own[: self._stiff], *parts.v_a) if isinstance(x, Expression)]
         jacobian = derivatives([*own_rate[: self._stiff], *net], unknown)
         reach = GAMMA * tape.load(6, 0)
         matrix = [[-1.0 * (reach * entry) for entry in row] for row in jacobian]
@@ -263,5 +269,5 @@ class StiffStepper:
         usable = minimum(maximum(error, 1e-9), 1e9)
         change = _SAFETY * apply("exp", (-1.0 / 3.0) * apply("log", usable))
         change = minimum(maximum(change, _SLOWER), _FASTER)
-        after = wrapped(self._dynamics, after)
+        after = wrapped(self._chart, after)
         program.add("finish", 3, {"state": after, "error": [error], "change": [change]})

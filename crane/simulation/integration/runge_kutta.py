@@ -4,11 +4,11 @@ import numpy as np
 
 from crane.closure.traced import folded
 from crane.codegen import Program, Tape, largest
-from crane.codegen.scalar import add, dot, scale
+from crane.codegen.scalar import add, scale
 from crane.common.samples import Array
-from crane.control import At, TracedController
-from crane.dynamics import Dynamics
+from crane.control import TracedController
 from crane.simulation.integration.blocks import in_blocks
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.state import seen_layout, state_layout
 from crane.simulation.integration.traced import (
     columns_of,
@@ -24,7 +24,7 @@ class CompiledStepper:
     """Many steps at once in machine code, with a controller that is traced along.
 
     Args:
-        dynamics: The machine.
+        chart: The machine.
         control: Its controller.
         states: Number of the controller's states.
 
@@ -32,14 +32,16 @@ class CompiledStepper:
         TooLongError: It would take too long to compile.
     """
 
-    def __init__(self, dynamics: Dynamics, control: TracedController, states: int):
-        machine = dynamics.machine
+    def __init__(self, chart: Chart, control: TracedController, states: int):
+        machine, dynamics = chart.machine, chart.dynamics
         self._fast, self._numbers = machine.closure.fast, dynamics.numbers
-        self._dynamics, self._control = dynamics, control
+        self._chart, self._control = chart, control
+        self.bounds = np.append(self._fast.bounds, chart.steep)
         self._columns = columns_of(control)
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
         form = form_of(control, self._columns, len(machine.active), states, fold=False)
-        key = ("rk4", form, states, folded(self._numbers), dynamics.carriers, dynamics.plan)
+        seen = tuple(chart.seen.tolist())
+        key = ("rk4", form, states, folded(self._numbers), dynamics.carriers, dynamics.plan, seen)
         self._key = key
         if key not in self._fast.programs:
             self._fast.programs[key] = self._compile()
@@ -52,14 +54,11 @@ class CompiledStepper:
         control = self._control
         for name in ("observe", "rate"):
             tape = Tape()
-            sweep, q_a, parts = machine_at(self._dynamics, tape, self._state, 4)
+            machine = machine_at(self._chart, tape, self._state, 4)
             settings = settings_of(control, tape, 2, fold=False)
-            reference = tape.loads(3, 0, self._columns)
-            at = At(q_a, parts.v_a, parts.own, settings, reference, sweep.inverse)
-            tau, own_rate = control.trace(at)
-            a_a = sweep.forward(tau, friction=True)
-            powers = [dot(tau, at.v_a), sweep.dissipation]
-            outputs = {"rate": [*sweep.slopes, *a_a, *own_rate, *powers]}
+            tau, own_rate = control.trace(machine.seen(settings, tape.loads(3, 0, self._columns)))
+            sweep, a_a = machine.sweep, machine.forward(tau)
+            outputs = {"rate": [*sweep.slopes, *a_a, *own_rate, *machine.powers(tau)]}
             if name == "observe":
                 outputs["seen"] = [*tau, *sweep.friction, sweep.kinetic, sweep.potential]
             program.add(name, 5, outputs)
@@ -96,6 +95,8 @@ class CompiledStepper:
                 with r.when(closed < 1):
                     r.give(i)
                 r.copy(r.state, following, size)
+                with r.when(result["steepest"] > r.bounds[3]):
+                    r.give(i + 1)
             r.give(r.steps)
 
     def run(self, times: Array, state: Array, step: float, rows: Array) -> int:
@@ -108,7 +109,8 @@ class CompiledStepper:
             rows: (steps, size + seen), state and observations at each of the times.
 
         Returns:
-            How many steps were done; the one after them needs a closer look.
+            How many steps were done; the one after them needs a closer look, or other
+            coordinates.
         """
         machine = self._fast.geometry.numbers, self._numbers
         settings = np.ascontiguousarray(self._control.settings)
@@ -117,7 +119,7 @@ class CompiledStepper:
         def call(count: int, references: Array, out: Array) -> int:
             return self._program.call(
                 "run", count, self._fast.close_address, *machine, settings, references, state,
-                out, steps, self._fast.bounds,
+                out, steps, self.bounds,
             )  # fmt: skip
 
         return in_blocks(call, self._control, times, step, rows)
@@ -144,7 +146,7 @@ class CompiledStepper:
         k1, k2, k3, k4 = (tape.loads(array, 0, size) for array in range(1, 5))
         h = tape.load(5, 0)
         mean = add(k1, scale(2.0, add(k2, k3)), k4)
-        after = wrapped(self._dynamics, add(state, scale(h * (1.0 / 6.0), mean)))
+        after = wrapped(self._chart, add(state, scale(h * (1.0 / 6.0), mean)))
         # the largest of all changes, so that NaN and infinity anywhere show
         move = h * largest(
             [*k1[coordinates], *k2[coordinates], *k3[coordinates], *scale(1e-9, mean)]

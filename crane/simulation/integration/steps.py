@@ -4,10 +4,10 @@ from contextlib import suppress
 
 import numpy as np
 
-from crane.codegen import TooLongError, carefully
+from crane.codegen import TooLongError
 from crane.common.samples import Array
 from crane.control import Controller, TracedController, ValveDrive
-from crane.dynamics import Dynamics
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.runge_kutta import CompiledStepper
 from crane.simulation.integration.stepwise import Progress, PythonStepper
@@ -21,55 +21,69 @@ class Steps:
     """Runge-Kutta steps in machine code, with care where that stops.
 
     Args:
-        dynamics: The machine.
+        chart: The machine.
         control: Its controller.
         own: Number of the controller's states.
 
     Attributes:
         slow: Makes a step with care, or says why it cannot.
         done: Number of instants that have their row, after a run or where it halted.
+        reached: Index of the instant of the state, which may have no row yet.
     """
 
-    def __init__(self, dynamics: Dynamics, control: Controller, own: int):
-        self.slow = PythonStepper(dynamics, control, own)
-        self.done = 0
+    def __init__(self, chart: Chart, control: Controller, own: int):
+        self.slow = PythonStepper(chart, control, own)
+        self.done = self.reached = 0
         self._fast: CompiledStepper | None = None
-        if isinstance(control, ValveDrive) or dynamics.backend != "compiled":
+        if isinstance(control, ValveDrive) or chart.dynamics.backend != "compiled":
             return
         if isinstance(control, TracedController):
             with suppress(TooLongError):
-                self._fast = CompiledStepper(dynamics, control, own)
+                self._fast = CompiledStepper(chart, control, own)
+
+    def limit(self, steepest: float) -> None:
+        """Look for other coordinates from this entry of gamma on."""
+        self.slow.limit = steepest
+        if self._fast is not None:
+            self._fast.bounds[-1] = steepest
 
     def run(
         self, times: Array, state: Array, step: float, rows: Array, progress: Progress = None
-    ) -> None:
-        """Integrate from each of the times to the next.
+    ) -> int:
+        """Integrate from each of the times to the next, while the coordinates are good ones.
 
         Args:
             times: (N,) instants [s].
-            state: At the first; replaced by that a step after the last.
+            state: At the first; replaced by that where it has got to.
             step: [s].
             rows: (N, .) in any order, filled with state and observations at the instants.
             progress: Called with the number of finished steps.
 
+        Returns:
+            How many steps were made.
+
         Raises:
             HaltedError: A step cannot be taken.
         """
-        fast, size = self._fast, len(state)
-        self.done = 0
-
-        def quick(first: int, beyond: int) -> int:
-            assert fast is not None
-            return fast.run(times[first:beyond], state, step, rows[first:])
-
-        def careful(i: int) -> None:
-            self.done = i + 1
-            rows[i, :size] = state
-            rate, rows[i, size:] = self.slow.observe(times[i], state)
-            state[:] = self.slow.advance(times[i], state, rate, step)
-
-        carefully(len(times), quick if fast else None, careful, _CHUNK, progress)
-        self.done = len(times)
+        size, i = len(state), 0
+        self.done = self.reached = 0
+        while i < len(times):
+            beyond = min(i + _CHUNK, len(times))
+            if self._fast is not None:
+                i += self._fast.run(times[i:beyond], state, step, rows[i:])
+                self.done = self.reached = i
+            if i < beyond:  # it stopped, or there is none
+                if self.slow.steep(state):
+                    break
+                rows[i, :size] = state
+                self.done = i + 1
+                rate, rows[i, size:] = self.slow.observe(times[i], state)
+                state[:] = self.slow.advance(times[i], state, rate, step)
+                i += 1
+                self.reached = i
+            if progress is not None:
+                progress(i)
+        return i
 
     def last(self, time: float, state: Array) -> Array:
         """A row without a step after it.
@@ -97,9 +111,10 @@ class Steps:
             again = times[back] + part * np.arange(share * (beyond - back))
             state = rows[back, : self.slow.layout.size].copy()
             with suppress(HaltedError):
-                self.run(again, state, part, np.empty((len(again), rows.shape[1])))
-                self.slow.observe(again[-1] + part, state)
-                self.done = done
-                return part
+                made = self.run(again, state, part, np.empty((len(again), rows.shape[1])))
+                if made == len(again):
+                    self.slow.observe(again[-1] + part, state)
+                    self.done = done
+                    return part
         self.done = done
         return 0.0

@@ -8,7 +8,7 @@ from crane.codegen import Parts
 from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
 from crane.control import Controller, ValveDrive
-from crane.dynamics import Dynamics
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.state import state_layout
 
@@ -20,18 +20,32 @@ class PythonStepper:
     """One step at a time, for any controller and on any backend of `Dynamics`.
 
     Args:
-        dynamics: The machine.
+        chart: The machine.
         control: Its controller.
         own: Number of the controller's states.
 
     Attributes:
         layout: Parts of the state.
+        limit: Entry of gamma from which other coordinates are looked for.
     """
 
-    def __init__(self, dynamics: Dynamics, control: Controller, own: int):
-        self._dynamics, self._control = dynamics, control
-        self._active = dynamics.machine.closure.active
-        self.layout = state_layout(dynamics.machine, own)
+    def __init__(self, chart: Chart, control: Controller, own: int):
+        self._chart, self._dynamics, self._control = chart, chart.dynamics, control
+        self.layout = state_layout(chart.machine, own)
+        self.limit = chart.steep
+
+    def steep(self, state: Array) -> bool:
+        """Whether the chart's coordinates move others by more than the limit."""
+        closure = self._chart.machine.closure
+        try:
+            gamma = closure.gamma(self.layout.view(state).q)
+        except ClosureError:
+            return True
+        return bool(np.abs(gamma[closure.passive]).max(initial=0.0) > self.limit)
+
+    def here(self, state: Array) -> Array:
+        """(n,) coordinates of the user's."""
+        return self.layout.view(state).q[self._chart.seen]
 
     def observe(self, time: float, state: Array) -> tuple[Array, Array]:
         """Rate of the state, and [tau, friction, kinetic, potential, its channels].
@@ -45,7 +59,8 @@ class PythonStepper:
         more: Array = np.zeros(0)
         if isinstance(self._control, ValveDrive):
             control = self._control
-            where = control.at(time, at.q[self._active], at.v_a, at.own)
+            v_a = self._chart.velocities(at.q, at.v_a)
+            where = control.at(time, self.here(state), v_a, at.own)
             more = np.array(control.look(where), dtype=np.float64)
         return rate, np.concatenate([tau, seen, more])
 
@@ -60,35 +75,35 @@ class PythonStepper:
             if not np.abs(self.layout.view(rate).q).max() * step < 1:  # also NaN
                 what = f" the motion explodes (over 1 m or rad in a step of {step:g} s)"
                 otherwise = ", and with shorter steps, too: look at its forces and gains"
-                here = self.layout.view(state).q[self._active]
-                raise HaltedError(time, here, what, otherwise)
+                raise HaltedError(time, self.here(state), what, otherwise)
             rate, _ = self._rate(time + share * step, state + share * step * rate)
             total = total + weight * rate
         after = state + step / 6 * total
         machine, q = self._dynamics.machine, self.layout.view(after).q
         try:
-            closed = machine.closure.solve(q[self._active], guess=q)
+            closed = machine.closure.solve(q[machine.closure.active], guess=q)
         except ClosureError as error:
-            raise HaltedError(time + step, q[self._active], f": {error}") from None
+            raise HaltedError(time + step, self.here(after), f": {error}") from None
         q[:] = machine.coordinates.wrapped(closed)
         return after
 
     def _rate(self, time: float, state: Array) -> tuple[Array, Array]:
-        at = self.layout.view(state)
+        at, chart = self.layout.view(state), self._chart
         try:
-            tau, own_rate = self._asked(time, at)
-            rates = self._dynamics.at("rates", at.q, at.v_a, tau)
+            v_a = chart.velocities(at.q, at.v_a)
+            tau, own_rate = self._asked(time, at, v_a)
+            rates = self._dynamics.at("rates", at.q, at.v_a, chart.forces(at.q, tau))
         except ClosureError as error:
-            raise HaltedError(time, at.q[self._active], f": {error}") from None
-        return np.concatenate([rates[:-1], own_rate, [tau @ at.v_a, rates[-1]]]), tau
+            raise HaltedError(time, self.here(state), f": {error}") from None
+        return np.concatenate([rates[:-1], own_rate, [tau @ v_a, rates[-1]]]), tau
 
-    def _asked(self, time: float, at: Parts) -> tuple[Array, Array]:
+    def _asked(self, time: float, at: Parts, v_a: Array) -> tuple[Array, Array]:
         """What the controller answers, (n,) and (k,)."""
-        tau, rate = self._control(time, at.q[self._active], at.v_a, at.own)
-        if np.shape(tau) != at.v_a.shape or np.shape(rate) != at.own.shape:
+        tau, rate = self._control(time, at.q[self._chart.seen], v_a, at.own)
+        if np.shape(tau) != v_a.shape or np.shape(rate) != at.own.shape:
             raise InputError(
                 f"{type(self._control).__name__} gives forces of the shape {np.shape(tau)} and "
-                f"rates of the shape {np.shape(rate)}, give {at.v_a.shape} and {at.own.shape}: "
+                f"rates of the shape {np.shape(rate)}, give {v_a.shape} and {at.own.shape}: "
                 "one per active joint, one per state"
             )
         return np.asarray(tau), rate

@@ -5,7 +5,7 @@ import numpy as np
 from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
 from crane.control import ValveDrive
-from crane.dynamics import Dynamics
+from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.rosenbrock import StiffStepper
 from crane.simulation.integration.stepwise import Progress, PythonStepper
@@ -18,26 +18,36 @@ class StiffSteps:
     """The Rosenbrock method of `StiffStepper`, with a program of the valves where there is one.
 
     Args:
-        dynamics: The machine.
+        chart: The machine.
         control: Its controller.
 
     Attributes:
         slow: Observes.
         done: Number of instants that have their row, after a run or where it halted.
+        reached: Index of the instant of the state.
 
     Raises:
         TooLongError: It would take too long to compile.
     """
 
-    def __init__(self, dynamics: Dynamics, control: ValveDrive):
-        self._dynamics, self._control = dynamics, control
-        self._fast = StiffStepper(dynamics, control)
-        self.slow = PythonStepper(dynamics, control, len(control.scales))
+    def __init__(self, chart: Chart, control: ValveDrive):
+        self._chart, self._control = chart, control
+        self._fast = StiffStepper(chart, control)
+        self.slow = PythonStepper(chart, control, len(control.scales))
         self.done = 0
+
+    @property
+    def reached(self) -> int:
+        """See `Steps`."""
+        return self.done
+
+    def limit(self, steepest: float) -> None:
+        """See `Steps.limit`."""
+        self.slow.limit = self._fast.bounds[-1] = steepest
 
     def run(
         self, times: Array, state: Array, step: float, rows: Array, progress: Progress = None
-    ) -> None:
+    ) -> int:
         """See `Steps.run`.
 
         Raises:
@@ -51,17 +61,24 @@ class StiffSteps:
                 f"the period {control.period:g} s of the valves' program is no whole number of "
                 f"steps of {step:g} s, change one"
             )
-        at, self.done = self.slow.layout.view(state), 0
+        self.done = 0
         while self.done < len(times):
+            length = _CHUNK
             if period:
-                self._update(times[self.done], at.q, at.v_a, at.own)
-            chunk = times[self.done : self.done + (period or _CHUNK)]
+                since = round(times[self.done] / step) % period
+                length = period - since
+                if not since:
+                    self._update(times[self.done], state)
+            chunk = times[self.done : self.done + length]
             count = self._fast.run(chunk, state, step, rows[self.done :])
             self.done += count
             if count < len(chunk):
-                raise self._stopped(times[self.done], at.q, at.v_a)
+                if self.slow.steep(state):
+                    break
+                raise self._stopped(times[self.done], state)
             if progress is not None:
                 progress(self.done)
+        return self.done
 
     def last(self, time: float, state: Array) -> Array:
         """See `Steps.last`."""
@@ -71,23 +88,27 @@ class StiffSteps:
         """No step: within recorded ones the method has found the finest itself."""
         return 0.0
 
-    def _update(self, time: float, q: Array, v_a: Array, own: Array) -> None:
+    def _update(self, time: float, state: Array) -> None:
         """Let a program look at the machine, which may ask where no posture is."""
+        at = self.slow.layout.view(state)
         try:
-            self._control.update(time, q, v_a, own)
+            v_a = self._chart.velocities(at.q, at.v_a)
+            self._control.update(time, at.q, v_a, at.own)
         except ClosureError as error:
-            here = q[self._dynamics.machine.closure.active]
-            raise HaltedError(time, here, f": {error}") from None
+            raise HaltedError(time, self.slow.here(state), f": {error}") from None
 
-    def _stopped(self, time: float, q: Array, v_a: Array) -> HaltedError:
+    def _stopped(self, time: float, state: Array) -> HaltedError:
         """Why the machine cannot go on, whatever the step."""
-        closure = self._dynamics.machine.closure
-        here = q[closure.active]
+        at, closure, here = (
+            self.slow.layout.view(state),
+            self._chart.machine.closure,
+            self.slow.here(state),
+        )
         try:
-            closure.solve(here + _AHEAD * v_a, guess=q)
+            closure.solve(at.q[closure.active] + _AHEAD * at.v_a, guess=at.q)
         except ClosureError as error:
             return HaltedError(time, here, f": {error}")
-        speed = np.abs(v_a).max()
+        speed = np.abs(at.v_a).max()
         return HaltedError(
             time,
             here,

@@ -1,6 +1,7 @@
 """A machine and its controller as formulas of the state."""
 
 from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -8,10 +9,11 @@ from crane.closure import rotations
 from crane.closure.compiled import FastClosure
 from crane.closure.traced import Constants
 from crane.codegen import Expression, Layout, Number, Parts, Program, Tape
+from crane.codegen.scalar import add, dot, subtract
 from crane.common.errors import InputError
 from crane.control import At, TracedController, ValveDrive
-from crane.dynamics import Dynamics
 from crane.dynamics.traced import Sweep
+from crane.simulation.integration.charts import Chart
 
 
 def columns_of(control: TracedController) -> int:
@@ -19,25 +21,66 @@ def columns_of(control: TracedController) -> int:
     return control.references(np.zeros(1)).shape[1]
 
 
-def machine_at(
-    dynamics: Dynamics, tape: Tape, layout: Layout, state: int
-) -> tuple[Sweep, list[Number], Parts]:
-    """The dynamics, q_A and the parts of the state at the posture in an argument.
+@dataclass(frozen=True)
+class Traced:
+    """A machine at a state.
+
+    Attributes:
+        chart: What the state is in.
+        sweep: Its dynamics.
+        parts: Of the state.
+        q_a: (n,) coordinates that the controller sees.
+        v_a: (n,) their velocities.
+    """
+
+    chart: Chart
+    sweep: Sweep
+    parts: Parts
+    q_a: list[Number]
+    v_a: list[Number]
+
+    def seen(self, settings: list[Number], reference: list[Number]) -> At:
+        """What a controller sees."""
+        inverse = self.sweep.inverse if self.chart.own else _undetermined
+        return At(self.q_a, self.v_a, self.parts.own, settings, reference, inverse)
+
+    def forward(self, tau: Sequence[Number]) -> list[Number]:
+        """Accelerations of the chart's coordinates under a controller's forces."""
+        forces = self.chart.traced_forces(self.sweep.gamma, tau)
+        return self.sweep.forward(forces, friction=True)
+
+    def forces(self, tau: Sequence[Number]) -> list[Number]:
+        """What acts along the chart's coordinates: a controller's, passive forces, friction."""
+        forces = self.chart.traced_forces(self.sweep.gamma, tau)
+        return subtract(add(forces, self.sweep.passive), self.sweep.friction)
+
+    def powers(self, tau: Sequence[Number]) -> list[Number]:
+        """What a controller's forces put in and friction and dampers take out [W]."""
+        return [dot(tau, self.v_a), self.sweep.dissipation]
+
+
+def _undetermined(a_a: Sequence[Number], friction: bool) -> list[Number]:
+    raise InputError("inverse dynamics of coordinates that do not determine the motion")
+
+
+def machine_at(chart: Chart, tape: Tape, layout: Layout, state: int) -> Traced:
+    """The machine at the state in an argument.
 
     Geometry and numbers of the machine are the arguments 0 and 1.
     """
-    closure = dynamics.machine.closure
+    dynamics, closure = chart.dynamics, chart.machine.closure
     q, posture, loops = closure.fast.trace(tape, 0, state)
     parts = layout.view(tape.loads(state, 0, layout.size))
     constants = Constants(tape, 1, dynamics.numbers)
     sweep = Sweep(posture, loops, constants, q, parts.v_a, dynamics.carriers, dynamics.plan)
-    return sweep, [q[i] for i in closure.active], parts
+    v_a = parts.v_a if chart.own else [sweep.rates[i + 1] for i in chart.seen]
+    return Traced(chart, sweep, parts, [q[i] for i in chart.seen], v_a)
 
 
-def wrapped(dynamics: Dynamics, state: Sequence[Number]) -> list[Number]:
+def wrapped(chart: Chart, state: Sequence[Number]) -> list[Number]:
     """A state, q first, with rotation vectors of at most pi."""
     out = list(state)
-    for column in dynamics.machine.coordinates.floating:
+    for column in chart.machine.coordinates.floating:
         out[column + 3 : column + 6] = rotations.wrapped(out[column + 3 : column + 6])
     return out
 

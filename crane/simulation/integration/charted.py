@@ -1,0 +1,265 @@
+"""Motion through dead centres: in other coordinates where those at hand fail."""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from crane.closure.choice import units
+from crane.codegen import Number, Tape
+from crane.common.samples import Array
+from crane.control import At, Controller, TracedController, ValveDrive
+from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.halt import HaltedError
+from crane.simulation.integration.passage import (
+    BEFORE,
+    BEHIND,
+    CROSSING,
+    FINE,
+    NODES,
+    ahead,
+    corrected,
+    rank,
+)
+from crane.simulation.integration.state import row_layout
+from crane.simulation.integration.stepwise import Progress, PythonStepper
+
+_RECENT = 500  # states that are kept
+_SAME = 1e-6  # [rad], [m] between a posture as foreseen and as closed
+_AT_A_HALT = 1.5  # how many times better other coordinates are that are tried where it halts
+
+
+class Way(Protocol):
+    """What integrates in one chart: `Steps`, `StiffSteps`, `AdaptiveSteps`."""
+
+    done: int
+    slow: PythonStepper
+
+    @property
+    def reached(self) -> int:
+        """See `Steps`."""
+
+    def run(
+        self, times: Array, state: Array, step: float, rows: Array, progress: Progress = None
+    ) -> int:
+        """See `Steps.run`."""
+
+    def last(self, time: float, state: Array) -> Array:
+        """See `Steps.last`."""
+
+    def finer(self, times: Array, rows: Array, step: float) -> float:
+        """See `Steps.finer`."""
+
+    def limit(self, steepest: float) -> None:
+        """See `Steps.limit`."""
+
+
+class ChartedSteps:
+    """Steps in the user's coordinates, and in others where these come to a dead centre.
+
+    Rows are in the user's coordinates throughout: a velocity of theirs is C v_B, a friction of
+    theirs C^-T times that of the chart, see `crane.simulation.integration.charts`.
+
+    Args:
+        chart: The machine in the user's coordinates.
+        control: Its controller.
+        own: Number of the controller's states.
+        make: What integrates in a chart.
+
+    Attributes:
+        done: Number of instants that have their row, after a run or where it halted.
+        crossed: When branches of motion were crossed [s].
+    """
+
+    def __init__(self, chart: Chart, control: Controller, own: int, make: Callable[[Chart], Way]):
+        self._make, self._control = make, control
+        self._chart, self._way = chart, make(chart)
+        self._limit = chart.steep
+        self._made = [(chart, self._way)]
+        self._layout = row_layout(chart.machine, control, own)
+        self._first = self.done = 0
+        self._recent = np.zeros((0, 0))
+        self.crossed: list[float] = []
+
+    def run(
+        self, times: Array, state: Array, step: float, rows: Array, progress: Progress = None
+    ) -> None:
+        """Integrate from each of the times to the next; see `Steps.run` for arguments.
+
+        Raises:
+            HaltedError: The machine cannot go on, in no coordinates.
+        """
+        i = self.done = 0
+        while i < len(times):
+            self._first, halt = i, None
+            try:
+                made = self._way.run(times[i:], state, step, rows[i:], self._from(i, progress))
+            except HaltedError as error:
+                made, halt = self._way.reached, error
+            self.done = i + self._way.done
+            self._recent = rows[i : i + made][-_RECENT:, : len(state)].copy()
+            self._seen(rows[i : self.done])
+            i += made
+            if i == len(times) or self._turned(times[i], state, halt):
+                continue
+            if halt is None:
+                self._limit *= 2.0
+                self._way.limit(self._limit)
+            else:
+                i = self._crossed(times, i, state, step, rows, halt)
+
+    def last(self, time: float, state: Array) -> Array:
+        """See `Steps.last`."""
+        row = self._way.last(time, state)
+        self._seen(row[None])
+        return row
+
+    def finer(self, times: Array, rows: Array, step: float) -> float:
+        """See `Steps.finer`."""
+        if not self._chart.own:
+            return 0.0
+        return self._way.finer(times[self._first :], rows[self._first :], step)
+
+    def _from(self, first: int, progress: Progress) -> Progress:
+        return None if progress is None else lambda done: progress(first + done)
+
+    def _turned(self, time: float, state: Array, halt: HaltedError | None) -> bool:
+        """Whether there are better coordinates, which the state then is in."""
+        at = self._layout.view(np.resize(state, self._layout.size))
+        chart = self._chart
+        other = chart.other(at.q) if halt is None else chart.other(at.q, _AT_A_HALT)
+        if other is None:
+            return False
+        if self._inverted:
+            raise self._dead(time, at.q, other)
+        closure, start = chart.machine.closure, chart.machine.model.nv
+        velocities = closure.gamma(at.q) @ at.v_a
+        self._chart, self._way = self._known(other, at.q)
+        self._limit = self._chart.steep
+        self._way.limit(self._limit)
+        active = self._chart.machine.closure.active
+        state[start : start + len(active)] = velocities[active]
+        return True
+
+    def _crossed(
+        self, times: Array, i: int, state: Array, step: float, rows: Array, halt: HaltedError
+    ) -> int:
+        """Go on across a posture where branches of motion cross.
+
+        Args:
+            times: See `run`.
+            i: Instant of the state.
+            state: There; replaced by that at the instant that is returned.
+            step: [s].
+            rows: See `run`.
+            halt: Why it does not go on by itself.
+
+        Returns:
+            The first instant behind it.
+
+        Raises:
+            HaltedError: It cannot.
+        """
+        chart, way, size = self._chart, self._way, len(state)
+        machine, at = chart.machine, self._layout.view(np.resize(state, self._layout.size))
+        first = self._made[0][0].machine
+        if not rank(machine, at.q) < CROSSING * rank(first, first.home):
+            raise halt
+        # again up to it, with nodes far enough from it
+        speed = float(np.abs(machine.closure.gamma(at.q) @ at.v_a / units(machine.model)).max())
+        way_of_a_step = max(step * speed, 1e-300)
+        share = max(1, int(np.ceil(way_of_a_step / FINE)))
+        stride = max(1, min(int(np.ceil(FINE / way_of_a_step)), len(self._recent) // (NODES + BEFORE)))
+        fine, back = step / share, -(-(NODES + BEFORE) * stride // share)
+        if back > len(self._recent):
+            raise halt
+        state[:] = self._recent[-back]
+        instants = times[i - back] + fine * np.arange((back + 1) * share + 1)
+        near = np.empty((len(instants), rows.shape[1]))
+        try:
+            made = way.run(instants, state, fine, near)
+        except HaltedError:
+            made = way.reached
+        last = made - BEFORE * stride
+        if last < (NODES - 1) * stride + 1 or made == len(instants):
+            raise halt
+        nodes = slice(last - (NODES - 1) * stride - 1, last, stride)
+        path = ahead(instants[nodes], near[nodes, :size], way.slow.observe)
+        behind = instants[0] + fine * (made + BEHIND * stride)
+        # the same coordinates behind it
+        q = self._layout.view(np.resize(path.state(behind), self._layout.size)).q
+        other = chart.moved(q, machine.closure.active)
+        if other is None or not np.abs(other.machine.home - q).max() < _SAME:
+            raise halt
+        self._chart, self._way = self._known(other, q)
+        self._limit = self._chart.steep
+        self._way.limit(self._limit)
+        path = corrected(path, behind, self._way.slow.observe)
+        gap = i
+        while i < len(times) and times[i] < behind:
+            rows[i] = [*path.state(times[i]), *path.observed(times[i])]
+            i += 1
+        self.done = i
+        self._seen(rows[gap:i])
+        until = times[i] if i < len(times) else times[-1] + step
+        state[:] = path.state(behind)
+        left = max(1, round((until - behind) / fine))
+        part = (until - behind) / left
+        instants = behind + part * np.arange(left)
+        self._way.run(instants, state, part, near[: len(instants)])
+        self.crossed.append(float(behind))
+        return i
+
+    def _known(self, chart: Chart, q: Array) -> tuple[Chart, Way]:
+        """A chart of the same coordinates and branch that was there before, or this one."""
+        active = chart.machine.closure.active
+        for before, way in self._made:
+            closure = before.machine.closure
+            if np.array_equal(closure.active, active) and closure.on_branch(q):
+                return before, way
+        made = chart, self._make(chart)
+        self._made.append(made)
+        return made
+
+    def _seen(self, rows: Array) -> None:
+        """Put rows (N, .) into the user's coordinates."""
+        chart = self._chart
+        if chart.own or not len(rows):
+            return
+        at = self._layout.view(rows)
+        turns = chart.turns(at.q)
+        at.v_a[:] = np.einsum("nij,nj->ni", turns, at.v_a)
+        back = np.swapaxes(turns, 1, 2)
+        at.friction[:] = np.einsum("nij,nj->ni", np.linalg.pinv(back), at.friction)
+
+    @property
+    def _inverted(self) -> bool:
+        """Whether the controller asks for inverse dynamics, which its own coordinates need."""
+        control, asked = self._control, False
+        if isinstance(control, ValveDrive) or not isinstance(control, TracedController):
+            return False
+        n, tape = len(self._chart.seen), Tape()
+
+        def inverse(a_a: Sequence[Number], friction: bool) -> list[Number]:
+            nonlocal asked
+            asked = True
+            return tape.loads(5, 0, n)
+
+        columns = control.references(np.zeros(1)).shape[1]
+        sizes = n, n, self._layout.parts["own"], len(control.settings), columns
+        q_a, v_a, state, settings, reference = (tape.loads(i, 0, x) for i, x in enumerate(sizes))
+        control.trace(At(q_a, v_a, state, settings, reference, inverse))
+        return asked
+
+    def _dead(self, time: float, q: Array, other: Chart) -> HaltedError:
+        """What to say of coordinates that the controller cannot do without."""
+        machine = self._chart.machine
+        gone = np.setdiff1d(machine.closure.active, other.machine.closure.active)
+        names = " and ".join(f"'{machine.joints[i]}'" for i in gone)
+        verb = "come" if len(gone) > 1 else "comes"
+        return HaltedError(
+            time,
+            q[self._chart.seen],
+            f": {names} {verb} to a dead centre, where inverse dynamics has no answer",
+            ": keep the reference away from there, or drive other joints",
+        )

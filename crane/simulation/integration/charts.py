@@ -1,0 +1,131 @@
+"""Independent coordinates of a motion: those of the user, or others where these fail.
+
+A machine's active coordinates q_A do not describe it everywhere: at a dead centre they turn back
+and gamma = dq/dq_A is infinite, though the motion goes on as if nothing were there. In other
+independent coordinates q_B, with gamma_B = dq/dq_B and C its rows that belong to q_A,
+
+    v_A = C v_B,    tau_B = C^T tau_A.
+
+A set of coordinates with an assembly branch around a posture is a chart of the machine's closed
+postures (generalized coordinate partitioning, Wehage and Haug 1982).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from crane.closure.choice import choose, motions, scales, units
+from crane.closure.structure import Indices
+from crane.codegen.scalar import Number, dot
+from crane.common.errors import MechanismError
+from crane.common.samples import Array
+from crane.dynamics import Dynamics
+from crane.machine import Machine
+
+STEEP = 10.0  # entries of gamma, in shares of the machine's size, from which others are looked for
+_BETTER = 3.0  # times smaller has a condition to be that changes coordinates
+_SINGULAR = 1e-12  # share of the largest singular value that counts as zero
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """A machine in independent coordinates, and those that its controller and its user see.
+
+    Attributes:
+        dynamics: Of the machine in the chart's coordinates.
+        seen: (n,) columns of the joints whose coordinates and forces are the user's.
+    """
+
+    dynamics: Dynamics
+    seen: Indices
+
+    @classmethod
+    def of(cls, dynamics: Dynamics) -> "Chart":
+        """The user's coordinates of a machine."""
+        return cls(dynamics, dynamics.machine.closure.active)
+
+    @property
+    def machine(self) -> Machine:
+        """The machine in the chart's coordinates."""
+        return self.dynamics.machine
+
+    @cached_property
+    def own(self) -> bool:
+        """Whether the chart's coordinates are the user's."""
+        return np.array_equal(self.machine.closure.active, self.seen)
+
+    def turns(self, q: Array) -> Array:
+        """C (n, n) of closed postures (nq,) or (N, nq): v_A = C v_B."""
+        rows: Array = self.machine.closure.gamma(q)[..., self.seen, :]
+        return rows
+
+    def velocities(self, q: Array, v: Array) -> Array:
+        """v_A, (n,) or (N, n), of the chart's velocities at closed postures."""
+        return v if self.own else np.einsum("...ij,...j->...i", self.turns(q), v)
+
+    def forces(self, q: Array, tau: Array) -> Array:
+        """Forces (n,) along the chart's coordinates of the user's at a closed posture."""
+        return tau if self.own else self.turns(q).T @ tau
+
+    def traced_forces(self, gamma: dict[int, list[Number]], tau: Sequence[Number]) -> list[Number]:
+        """`forces` as formulas, with rows of gamma by body."""
+        if self.own:
+            return list(tau)
+        rows = [gamma[column + 1] for column in self.seen.tolist()]
+        return [dot(column, tau) for column in zip(*rows, strict=True)]
+
+    @cached_property
+    def steep(self) -> float:
+        """An entry of gamma that is large, whatever its unit."""
+        closure = self.machine.closure
+        unit = units(self.machine.model)
+        passive = unit[closure.passive]
+        ratio = passive.max(initial=1.0) / unit[closure.active].min(initial=1.0)
+        at_home = np.abs(closure.gamma(closure.home)[closure.passive]).max(initial=0.0)
+        return max(STEEP * float(ratio), 2.0 * float(at_home))
+
+    def other(self, q: Array, better: float = _BETTER) -> "Chart | None":
+        """A chart around a closed posture (nq,) whose condition is that many times smaller.
+
+        Joints that are independent and move no other one much stay.
+        """
+        machine = self.machine
+        closure, scale = machine.closure, scales(machine.model)
+        jacobian = closure.equations.evaluate(q)[1]
+        basis = motions(jacobian, scale, _SINGULAR)
+        active = closure.active
+        if basis.shape[1] != len(active):
+            return None
+
+        def condition(columns: Indices) -> float:
+            least = np.linalg.svd(basis[columns], compute_uv=False).min(initial=1.0)
+            return 1.0 / max(float(least), 1e-300)
+
+        now, everything = condition(active), range(machine.model.nv)
+        # of the present coordinates those that move the others little
+        try:
+            moved = np.abs(basis @ np.linalg.inv(basis[active])).max(axis=0)
+        except np.linalg.LinAlgError:
+            moved = np.full(len(active), np.inf)
+        floating = {c for first in machine.coordinates.floating for c in range(first, first + 6)}
+        kept = [
+            int(column)
+            for column, size in zip(active, moved, strict=True)
+            if column in floating or size < STEEP / 2
+        ]
+        for stay in (kept, sorted(floating & set(active.tolist()))):
+            found = choose(basis, everything, stay)
+            if found is not None and condition(found) * better < now:
+                return self.moved(q, found)
+        return None
+
+    def moved(self, q: Array, columns: Indices) -> "Chart | None":
+        """The chart of some coordinates around a closed posture (nq,), None where it has none."""
+        names = tuple(self.machine.joints[i] for i in columns)
+        try:
+            machine = self.machine.seen_from(q, names)
+        except MechanismError:
+            return None
+        return Chart(Dynamics(machine, backend=self.dynamics.backend), self.seen)
