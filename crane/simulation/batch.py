@@ -101,10 +101,11 @@ def simulate_batch(
         steps = count_steps(control, duration, step)
         if text := reference_beyond(machine, control, steps * step):
             beyond[i] = text
-        time, rows = integrate(Dynamics(machine), control, starts[i], steps, step)
+        time, rows, notes = integrate(Dynamics(machine), control, starts[i], steps, step)
         energy = np.hstack([rows.kinetic, rows.potential, rows.work, rows.lost])
         q_a = rows.q[:, machine.closure.active]
-        doubts = filter(None, (limits_passed(machine, time, rows.q), imbalance(rows, step)))
+        told = *notes, limits_passed(machine, time, rows.q), imbalance(rows, step)
+        doubts = filter(None, told)
         return time, q_a, rows.v_a, rows.tau, energy, "; ".join(doubts)
 
     results: dict[int, _Result] = {}

@@ -106,7 +106,9 @@ def simulate(
     if text := reference_beyond(machine, control, steps * step):
         warnings.warn(text, CraneWarning, stacklevel=2)
     dynamics = Dynamics(machine, formulation, backend)
-    time, rows = integrate(dynamics, control, initial, steps, step, method, progress)
+    time, rows, notes = integrate(dynamics, control, initial, steps, step, method, progress)
+    for note in notes:
+        warnings.warn(note, CraneWarning, stacklevel=2)
     # the energies are integrated with the motion, so they tell when the step is too long
     text = imbalance(rows, step)
     if text and formulation == "exact":
@@ -122,7 +124,7 @@ def integrate(
     step: float,
     method: str | None = None,
     progress: Progress | None = None,
-) -> tuple[Array, Parts]:
+) -> tuple[Array, Parts, list[str]]:
     """What `simulate` computes, without channels; see there for arguments and errors.
 
     Args:
@@ -135,7 +137,8 @@ def integrate(
         progress: See `simulate`.
 
     Returns:
-        Times (N,), and what `crane.simulation.integration.row_layout` names, (N, .) each.
+        Times (N,), what `crane.simulation.integration.row_layout` names, (N, .) each, and what is
+        to be said of the motion.
     """
     machine, reference = dynamics.machine, reference_of(control)
     q_a, v_a = _start(machine, initial, reference)
@@ -164,7 +167,7 @@ def integrate(
         raise explained(machine, halt, times[:done], q_a, reference, finer) from None
     if progress is not None:
         progress(1.0)
-    return times, layout.view(rows)
+    return times, layout.view(rows), integration.notes
 
 
 def _own_start(control: Controller, dynamics: Dynamics, q: Array) -> Array:

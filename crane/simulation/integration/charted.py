@@ -68,7 +68,7 @@ class ChartedSteps:
 
     Attributes:
         done: Number of instants that have their row, after a run or where it halted.
-        crossed: When branches of motion were crossed [s].
+        notes: What is to be said of the motion.
     """
 
     def __init__(self, chart: Chart, control: Controller, own: int, make: Callable[[Chart], Way]):
@@ -78,8 +78,9 @@ class ChartedSteps:
         self._made = [(chart, self._way)]
         self._layout = row_layout(chart.machine, control, own)
         self._first = self.done = 0
-        self._recent = np.zeros((0, 0))
-        self.crossed: list[float] = []
+        self._recent = np.zeros((0, self._layout.start("tau")))
+        self.notes: list[str] = []
+        self._side, self._turned_back = 1.0, False
 
     def run(
         self, times: Array, state: Array, step: float, rows: Array, progress: Progress = None
@@ -97,8 +98,8 @@ class ChartedSteps:
             except HaltedError as error:
                 made, halt = self._way.reached, error
             self.done = i + self._way.done
-            self._recent = rows[i : i + made][-_RECENT:, : len(state)].copy()
-            self._seen(rows[i : self.done])
+            self._recent = np.vstack([self._recent, rows[i : i + made, : len(state)]])[-_RECENT:]
+            self._seen(times[i : self.done], rows[i : self.done])
             i += made
             if i == len(times) or self._turned(times[i], state, halt):
                 continue
@@ -111,7 +112,7 @@ class ChartedSteps:
     def last(self, time: float, state: Array) -> Array:
         """See `Steps.last`."""
         row = self._way.last(time, state)
-        self._seen(row[None])
+        self._seen(np.array([time]), row[None])
         return row
 
     def finer(self, times: Array, rows: Array, step: float) -> float:
@@ -132,13 +133,13 @@ class ChartedSteps:
             return False
         if self._inverted:
             raise self._dead(time, at.q, other)
-        closure, start = chart.machine.closure, chart.machine.model.nv
-        velocities = closure.gamma(at.q) @ at.v_a
+        before = self._side * self._facing(at.q)
         self._chart, self._way = self._known(other, at.q)
+        self._side = before * self._facing(at.q)
         self._limit = self._chart.steep
         self._way.limit(self._limit)
-        active = self._chart.machine.closure.active
-        state[start : start + len(active)] = velocities[active]
+        self._recent = self._moved(np.vstack([self._recent, state]), chart)
+        state[:], self._recent = self._recent[-1], self._recent[:-1]
         return True
 
     def _crossed(
@@ -162,6 +163,7 @@ class ChartedSteps:
         """
         chart, way, size = self._chart, self._way, len(state)
         machine, at = chart.machine, self._layout.view(np.resize(state, self._layout.size))
+        recent, self._recent = self._recent, self._recent[:0]
         first = self._made[0][0].machine
         if not rank(machine, at.q) < CROSSING * rank(first, first.home):
             raise halt
@@ -169,11 +171,11 @@ class ChartedSteps:
         speed = float(np.abs(machine.closure.gamma(at.q) @ at.v_a / units(machine.model)).max())
         way_of_a_step = max(step * speed, 1e-300)
         share = max(1, int(np.ceil(way_of_a_step / FINE)))
-        stride = max(1, min(int(np.ceil(FINE / way_of_a_step)), len(self._recent) // (NODES + BEFORE)))
+        stride = max(1, min(int(np.ceil(FINE / way_of_a_step)), len(recent) // (NODES + BEFORE)))
         fine, back = step / share, -(-(NODES + BEFORE) * stride // share)
-        if back > len(self._recent):
+        if back > len(recent):
             raise halt
-        state[:] = self._recent[-back]
+        state[:] = recent[-back]
         instants = times[i - back] + fine * np.arange((back + 1) * share + 1)
         near = np.empty((len(instants), rows.shape[1]))
         try:
@@ -200,15 +202,26 @@ class ChartedSteps:
             rows[i] = [*path.state(times[i]), *path.observed(times[i])]
             i += 1
         self.done = i
-        self._seen(rows[gap:i])
+        self._seen(times[gap:i], rows[gap:i])
         until = times[i] if i < len(times) else times[-1] + step
         state[:] = path.state(behind)
         left = max(1, round((until - behind) / fine))
         part = (until - behind) / left
         instants = behind + part * np.arange(left)
         self._way.run(instants, state, part, near[: len(instants)])
-        self.crossed.append(float(behind))
+        self.notes.append(
+            f"at t = {behind:.4g} s the linkage passes a posture from which it could go on in "
+            "several ways: it goes on as it moves"
+        )
         return i
+
+    def _moved(self, states: Array, before: Chart) -> Array:
+        """States (N, .) in the present chart that are in the one before."""
+        nq, n = before.machine.model.nv, len(before.seen)
+        out = states.copy()
+        gamma = before.machine.closure.gamma(states[:, :nq])[:, self._chart.machine.closure.active]
+        out[:, nq : nq + n] = np.einsum("nij,nj->ni", gamma, states[:, nq : nq + n])
+        return out
 
     def _known(self, chart: Chart, q: Array) -> tuple[Chart, Way]:
         """A chart of the same coordinates and branch that was there before, or this one."""
@@ -221,13 +234,26 @@ class ChartedSteps:
         self._made.append(made)
         return made
 
-    def _seen(self, rows: Array) -> None:
-        """Put rows (N, .) into the user's coordinates."""
+    def _facing(self, q: Array) -> float:
+        """The sign of det C at a closed posture (nq,), which changes at the user's dead centres."""
+        return 1.0 if self._chart.own else float(np.linalg.slogdet(self._chart.turns(q))[0])
+
+    def _seen(self, times: Array, rows: Array) -> None:
+        """Put rows (N, .) at times (N,) [s] into the user's coordinates."""
         chart = self._chart
         if chart.own or not len(rows):
             return
         at = self._layout.view(rows)
         turns = chart.turns(at.q)
+        behind = np.flatnonzero(self._side * np.linalg.slogdet(turns)[0] < 0)
+        if len(behind) and not self._turned_back:
+            self._turned_back, user = True, self._made[0][0].machine
+            gone = np.setdiff1d(user.closure.active, chart.machine.closure.active)
+            names = " and ".join(f"'{user.joints[i]}'" for i in gone)
+            self.notes.append(
+                f"{names} passes a dead centre at t = {times[behind[0]]:.4g} s: from there on "
+                "active coordinates alone do not tell the posture, take passive joints with them"
+            )
         at.v_a[:] = np.einsum("nij,nj->ni", turns, at.v_a)
         back = np.swapaxes(turns, 1, 2)
         at.friction[:] = np.einsum("nij,nj->ni", np.linalg.pinv(back), at.friction)
