@@ -251,7 +251,7 @@ class ChartedSteps:
             gone = np.setdiff1d(user.closure.active, chart.machine.closure.active)
             names = " and ".join(f"'{user.joints[i]}'" for i in gone)
             self.notes.append(
-                f"{names} passes a dead centre at t = {times[behind[0]]:.4g} s: from there on "
+                f"{names} {'pass' if len(gone) > 1 else 'passes'} a dead centre at t = {times[behind[0]]:.4g} s: from there on "
                 "active coordinates alone do not tell the posture, take passive joints with them"
             )
         at.v_a[:] = np.einsum("nij,nj->ni", turns, at.v_a)
