@@ -12,6 +12,7 @@ from crane.closure.equations import LoopEquations
 from crane.closure.structure import Indices, Structure
 from crane.closure.traced import Bodies, Constants, Loops, folded, geometry_of
 from crane.codegen import Layout, Number, Program, Tape, largest, maximum
+from crane.codegen.scalar import minimum
 from crane.common.samples import Array
 
 _STEEP = 1e3  # an entry of gamma above this is looked at closely by `Branch`
@@ -189,6 +190,13 @@ class FastClosure:
         cursor.at[self._nq :] = found.gamma
         return True
 
+    def edge(self, q: Array) -> float:
+        """The least determinant at a posture (nq,), positive on the home branch."""
+        layout = self.outputs("newton")
+        result = np.empty(layout.size)
+        self._loops.call("newton", self.geometry.numbers, np.ascontiguousarray(q), result)
+        return float(layout.view(result).edge[0])
+
     def follow(self, cursor: "Cursor", targets: Array, out: Array) -> int:
         """Close the loops at targets (N, n) into out (N, nq) until one needs more than a step.
 
@@ -217,10 +225,11 @@ class FastClosure:
         return coordinates, posture, loops
 
     def add_newton(self, program: Program, signs: Array) -> None:
-        """newton(numbers, q) -> residual, change, regular, steepest, corrected q, rows of gamma.
+        """newton(numbers, q) -> residual, change, regular, steepest, edge, corrected q, gamma.
 
         regular is positive on the home branch away from its edge, with surplus equations closed;
-        steepest is the largest entry of gamma, whose rows are those of passive joints.
+        steepest is the largest entry of gamma, whose rows are those of passive joints; edge the
+        least determinant of a block, with its sign on the home branch.
         """
         q, _, loops = self.trace(Tape(), 0, 1)
         steps = loops.correction
@@ -228,8 +237,10 @@ class FastClosure:
         rows = [loops.gamma[loops.passive_joints[row]][k] for row, k in self._pairs]
         steepest = largest(rows)
         worst = maximum(steepest - _STEEP, loops.surplus - self._structure.surplus.allowed)
+        edge: Number = 1.0
         for sign, determinant in zip(signs, loops.determinants, strict=True):
-            worst = maximum(worst, -(float(sign) * determinant))
+            edge = minimum(edge, float(sign) * determinant)
+        worst = maximum(worst, -1.0 * edge)
         for alignment in loops.alignments:
             worst = maximum(worst, -1.0 * alignment)
         program.add(
@@ -240,6 +251,7 @@ class FastClosure:
                 "change": [largest(steps.values())],
                 "regular": [-1.0 * worst],
                 "steepest": [steepest],
+                "edge": [edge],
                 "q": corrected,
                 "gamma": rows,
             },

@@ -18,6 +18,7 @@ from crane.control import (
     Free,
     Law,
     Signals,
+    TracedController,
     ValveDrive,
     reference_of,
 )
@@ -29,6 +30,7 @@ from crane.recordings.recording import Recording
 from crane.simulation.integration.adaptive import ADAPTIVE, AdaptiveSteps
 from crane.simulation.integration.charted import ChartedSteps, Way
 from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.explicit_steps import ExplicitSteps
 from crane.simulation.integration.halt import HaltedError, explained
 from crane.simulation.integration.state import row_layout
 from crane.simulation.integration.steps import Steps
@@ -189,6 +191,8 @@ def _integration(
         )
     if method in (None, "rk4"):
         return lambda chart: Steps(chart, control, own)
+    if method == "dop853" and isinstance(control, TracedController):
+        return lambda chart: ExplicitSteps(chart, control, own)
     if method in ADAPTIVE and machine.coordinates.floating:
         raise InputError(f"method '{method}' does not go round with a body that floats, take rk4")
     if method in ADAPTIVE:

@@ -205,7 +205,7 @@ class Rig:
         n, nq, active = len(plant.active), plant.model.nq, plant.closure.active
         held, substeps = _Held(plant), _substeps(dynamics, reference, step)
         h, steps = step / substeps, Steps(Chart.of(dynamics), held, 0)
-        steps.limit(np.inf)  # the rig stays away from dead centres
+        steps.limit(np.array([np.inf, -np.inf]))  # the rig stays away from dead centres
         state = np.concatenate([plant.closure.solve(reference[0]), np.zeros(n + 2)])
         now = steps.slow.layout.view(state)
         rows = np.empty((substeps, row_layout(plant, held, 0).size))

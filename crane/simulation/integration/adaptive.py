@@ -33,14 +33,15 @@ class AdaptiveSteps:
     """
 
     done = reached = 0
+    offset = 0.0
 
     def __init__(self, chart: Chart, control: Controller, own: int, method: str):
         self.slow = PythonStepper(chart, control, own)
         self._closure, self._method = chart.machine.closure, method
 
-    def limit(self, steepest: float) -> None:
+    def limit(self, limits: Array) -> None:
         """See `Steps.limit`."""
-        self.slow.limit = steepest
+        self.slow.limits = limits
 
     def last(self, time: float, state: Array) -> Array:
         """See `Steps.last`."""
@@ -81,7 +82,7 @@ class AdaptiveSteps:
                 gamma = closure.gamma(view(state).q)[closure.passive]
             except ClosureError:
                 return -1.0
-            return 1.0 - float(np.abs(gamma).max(initial=0.0)) / self.slow.limit
+            return 1.0 - float(np.abs(gamma).max(initial=0.0)) / self.slow.limits[0]
 
         calm.terminal = gentle.terminal = True  # type: ignore[attr-defined]
         gentle.direction = -1.0  # type: ignore[attr-defined]

@@ -1,6 +1,7 @@
 """Motion through dead centres: in other coordinates where those at hand fail."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +18,7 @@ from crane.simulation.integration.passage import (
     CROSSING,
     FINE,
     NODES,
+    Path,
     ahead,
     corrected,
     rank,
@@ -24,6 +26,7 @@ from crane.simulation.integration.passage import (
 from crane.simulation.integration.state import row_layout
 from crane.simulation.integration.stepwise import Progress, PythonStepper
 
+_WIDER = np.array([2.0, 0.1])  # how limits move where nothing is better
 _RECENT = 500  # states that are kept
 _SAME = 1e-6  # [rad], [m] between a posture as foreseen and as closed
 _AT_A_HALT = 1.5  # how many times better other coordinates are that are tried where it halts
@@ -33,6 +36,7 @@ class Way(Protocol):
     """What integrates in one chart: `Steps`, `StiffSteps`, `AdaptiveSteps`."""
 
     done: int
+    offset: float  # when the state is, after the next instant without a row [s]
     slow: PythonStepper
 
     @property
@@ -50,7 +54,7 @@ class Way(Protocol):
     def finer(self, times: Array, rows: Array, step: float) -> float:
         """See `Steps.finer`."""
 
-    def limit(self, steepest: float) -> None:
+    def limit(self, limits: Array) -> None:
         """See `Steps.limit`."""
 
 
@@ -74,7 +78,7 @@ class ChartedSteps:
     def __init__(self, chart: Chart, control: Controller, own: int, make: Callable[[Chart], Way]):
         self._make, self._control = make, control
         self._chart, self._way = chart, make(chart)
-        self._limit = chart.steep
+        self._limits = chart.limits
         self._made = [(chart, self._way)]
         self._layout = row_layout(chart.machine, control, own)
         self._first = self.done = 0
@@ -91,7 +95,7 @@ class ChartedSteps:
             HaltedError: The machine cannot go on, in no coordinates.
         """
         i = self.done = 0
-        while i < len(times):
+        while i < len(times) or self._way.offset < 0:
             self._first, halt = i, None
             try:
                 made = self._way.run(times[i:], state, step, rows[i:], self._from(i, progress))
@@ -101,13 +105,18 @@ class ChartedSteps:
             self._recent = np.vstack([self._recent, rows[i : i + made, : len(state)]])[-_RECENT:]
             self._seen(times[i : self.done], rows[i : self.done])
             i += made
-            if i == len(times) or self._turned(times[i], state, halt):
+            if i == len(times) and not self._way.offset < 0:
                 continue
-            if halt is None:
-                self._limit *= 2.0
-                self._way.limit(self._limit)
+            if self._turned(times[0] + i * step, state, halt):
+                continue
+            behind = self._crossed(times, i, state, step, rows)
+            if behind is not None:
+                i = behind
+            elif halt is not None:
+                raise halt
             else:
-                i = self._crossed(times, i, state, step, rows, halt)
+                self._limits = self._limits * _WIDER
+                self._way.limit(self._limits)
 
     def last(self, time: float, state: Array) -> Array:
         """See `Steps.last`."""
@@ -134,86 +143,129 @@ class ChartedSteps:
         if self._inverted:
             raise self._dead(time, at.q, other)
         before = self._side * self._facing(at.q)
-        self._chart, self._way = self._known(other, at.q)
+        self._enter(self._known(other, at.q), self._way.offset)
         self._side = before * self._facing(at.q)
-        self._limit = self._chart.steep
-        self._way.limit(self._limit)
+        self._limits = self._chart.limits
+        self._way.limit(self._limits)
         self._recent = self._moved(np.vstack([self._recent, state]), chart)
         state[:], self._recent = self._recent[-1], self._recent[:-1]
         return True
 
-    def _crossed(
-        self, times: Array, i: int, state: Array, step: float, rows: Array, halt: HaltedError
-    ) -> int:
-        """Go on across a posture where branches of motion cross.
+    def _crossed(self, times: Array, i: int, state: Array, step: float, rows: Array) -> int | None:
+        """Go on across a posture where branches of motion cross, if there is one ahead.
 
         Args:
             times: See `run`.
-            i: Instant of the state.
-            state: There; replaced by that at the instant that is returned.
+            i: The first instant not before the state.
+            state: Replaced by that at the instant that is returned, if it is one.
             step: [s].
             rows: See `run`.
-            halt: Why it does not go on by itself.
 
         Returns:
-            The first instant behind it.
+            The first instant behind the crossing.
+        """
+        chart, way, size, recent = self._chart, self._way, len(state), self._recent
+        machine, now = chart.machine, times[0] + i * step + way.offset
+        ahead_of = self._ahead(now, state, times[0] + (i - 1) * step)
+        if ahead_of is None:
+            return None
+        crossing, speed = ahead_of
+        share = max(1, int(np.ceil(step * speed / FINE)))
+        stride = max(1, min(int(np.ceil(FINE / (step * speed))), len(recent) // (NODES + BEFORE)))
+        fine = step / share
+        until = crossing - BEFORE * stride * fine
+        first = int((until - NODES * stride * fine - times[0]) // step)
+        if not i - len(recent) <= first < i:
+            return None
+        # again up to it, with nodes far enough from it
+        kept, offset = state.copy(), way.offset
+        state[:], way.offset = recent[first - i], 0.0
+        way.limit(np.array([np.inf, -np.inf]))
+        instants = np.arange(times[first], until, fine)
+        near = np.empty((len(instants), rows.shape[1]))
+        made = 0
+        with suppress(HaltedError):
+            made = way.run(instants, state, fine, near)
+        way.limit(self._limits)
+        behind = float(crossing + BEHIND * stride * fine)
+        if made == len(instants):
+            nodes = slice(len(instants) - 1 - (NODES - 1) * stride, None, stride)
+            path = ahead(instants[nodes], near[nodes, :size], way.slow.observe)
+            q = self._layout.view(np.resize(path.state(behind), self._layout.size)).q
+            other = chart.moved(q, machine.closure.active)
+            if other is not None and np.abs(other.machine.home - q).max() < _SAME:
+                self._enter(self._known(other, q), 0.0)
+                path = corrected(path, behind, self._way.slow.observe)
+                return self._behind(path, behind, fine, times, state, step, rows)
+        state[:], way.offset = kept, offset
+        return None
+
+    def _ahead(self, now: float, state: Array, before: float) -> tuple[float, float] | None:
+        """When branches cross ahead of a state, and how fast the fastest joint moves there.
+
+        Args:
+            now: Time of the state [s].
+            state: The state.
+            before: Time of the last of the recent states [s].
+        """
+        chart, closure = self._chart, self._chart.machine.closure
+        if not closure.compiled or not len(self._recent):
+            return None
+        at, last = (
+            self._layout.view(np.resize(one, self._layout.size))
+            for one in (state, self._recent[-1])
+        )
+        here, there = closure.fast.edge(at.q), closure.fast.edge(last.q)
+        if not (now > before and 0.0 < here < there):
+            return None
+        left = here / (there - here) * (now - before)
+        v = closure.gamma(at.q) @ at.v_a
+        speed = float(np.abs(v / units(chart.machine.model)).max())
+        home = self._made[0][0].machine
+        flat = rank(chart.machine, at.q + left * v) < CROSSING * rank(home, home.home)
+        return (now + left, speed) if flat and left * speed < 3.0 * FINE else None
+
+    def _behind(
+        self,
+        path: Path,
+        behind: float,
+        fine: float,
+        times: Array,
+        state: Array,
+        step: float,
+        rows: Array,
+    ) -> int:
+        """Record a path across a crossing, and go on to the first instant behind it.
 
         Raises:
-            HaltedError: It cannot.
+            HaltedError: It does not go on there.
         """
-        chart, way, size = self._chart, self._way, len(state)
-        machine, at = chart.machine, self._layout.view(np.resize(state, self._layout.size))
-        recent, self._recent = self._recent, self._recent[:0]
-        first = self._made[0][0].machine
-        if not rank(machine, at.q) < CROSSING * rank(first, first.home):
-            raise halt
-        # again up to it, with nodes far enough from it
-        speed = float(np.abs(machine.closure.gamma(at.q) @ at.v_a / units(machine.model)).max())
-        way_of_a_step = max(step * speed, 1e-300)
-        share = max(1, int(np.ceil(way_of_a_step / FINE)))
-        stride = max(1, min(int(np.ceil(FINE / way_of_a_step)), len(recent) // (NODES + BEFORE)))
-        fine, back = step / share, -(-(NODES + BEFORE) * stride // share)
-        if back > len(recent):
-            raise halt
-        state[:] = recent[-back]
-        instants = times[i - back] + fine * np.arange((back + 1) * share + 1)
-        near = np.empty((len(instants), rows.shape[1]))
-        try:
-            made = way.run(instants, state, fine, near)
-        except HaltedError:
-            made = way.reached
-        last = made - BEFORE * stride
-        if last < (NODES - 1) * stride + 1 or made == len(instants):
-            raise halt
-        nodes = slice(last - (NODES - 1) * stride - 1, last, stride)
-        path = ahead(instants[nodes], near[nodes, :size], way.slow.observe)
-        behind = instants[0] + fine * (made + BEHIND * stride)
-        # the same coordinates behind it
-        q = self._layout.view(np.resize(path.state(behind), self._layout.size)).q
-        other = chart.moved(q, machine.closure.active)
-        if other is None or not np.abs(other.machine.home - q).max() < _SAME:
-            raise halt
-        self._chart, self._way = self._known(other, q)
-        self._limit = self._chart.steep
-        self._way.limit(self._limit)
-        path = corrected(path, behind, self._way.slow.observe)
-        gap = i
-        while i < len(times) and times[i] < behind:
-            rows[i] = [*path.state(times[i]), *path.observed(times[i])]
-            i += 1
+        first = int(np.searchsorted(times, path.times[path.before - 1], side="right"))
+        i = int(np.searchsorted(times, behind))
+        for k in range(first, i):
+            rows[k] = [*path.state(times[k]), *path.observed(times[k])]
         self.done = i
-        self._seen(times[gap:i], rows[gap:i])
-        until = times[i] if i < len(times) else times[-1] + step
+        self._seen(times[first:i], rows[first:i])
+        self._recent = self._recent[:0]
+        until = times[0] + i * step
         state[:] = path.state(behind)
-        left = max(1, round((until - behind) / fine))
-        part = (until - behind) / left
-        instants = behind + part * np.arange(left)
-        self._way.run(instants, state, part, near[: len(instants)])
+        if until - behind > 1e-6 * fine:
+            part = (until - behind) / np.ceil((until - behind) / fine)
+            instants = np.arange(behind, until - 0.5 * part, part)
+            self._way.run(instants, state, part, np.empty((len(instants), rows.shape[1])))
+            if self._way.offset < 0:
+                raise self._way.slow.stopped(behind, state)
         self.notes.append(
             f"at t = {behind:.4g} s the linkage passes a posture from which it could go on in "
             "several ways: it goes on as it moves"
         )
         return i
+
+    def _enter(self, known: tuple[Chart, Way], offset: float) -> None:
+        """Go on in a chart, from so long after the next instant [s]."""
+        self._chart, self._way = known
+        self._limits, self._way.offset = self._chart.limits, offset
+        self._way.limit(self._limits)
 
     def _moved(self, states: Array, before: Chart) -> Array:
         """States (N, .) in the present chart that are in the one before."""
@@ -235,7 +287,7 @@ class ChartedSteps:
         return made
 
     def _facing(self, q: Array) -> float:
-        """The sign of det C at a closed posture (nq,), which changes at the user's dead centres."""
+        """The sign of det C at a closed posture (nq,): it changes at the user's dead centres."""
         return 1.0 if self._chart.own else float(np.linalg.slogdet(self._chart.turns(q))[0])
 
     def _seen(self, times: Array, rows: Array) -> None:
@@ -250,8 +302,9 @@ class ChartedSteps:
             self._turned_back, user = True, self._made[0][0].machine
             gone = np.setdiff1d(user.closure.active, chart.machine.closure.active)
             names = " and ".join(f"'{user.joints[i]}'" for i in gone)
+            verb = "pass" if len(gone) > 1 else "passes"
             self.notes.append(
-                f"{names} {'pass' if len(gone) > 1 else 'passes'} a dead centre at t = {times[behind[0]]:.4g} s: from there on "
+                f"{names} {verb} a dead centre at t = {times[behind[0]]:.4g} s: from there on "
                 "active coordinates alone do not tell the posture, take passive joints with them"
             )
         at.v_a[:] = np.einsum("nij,nj->ni", turns, at.v_a)

@@ -24,8 +24,9 @@ from crane.common.samples import Array
 from crane.dynamics import Dynamics
 from crane.machine import Machine
 
-STEEP = 10.0  # entries of gamma, in shares of the machine's size, from which others are looked for
+STEEP = 5.0  # entries of gamma, in shares of the machine's size, from which others are looked for
 _BETTER = 3.0  # times smaller has a condition to be that changes coordinates
+_EDGE = 1e-2  # share of the determinant at home, where the edge of a branch is near
 _SINGULAR = 1e-12  # share of the largest singular value that counts as zero
 
 
@@ -77,8 +78,14 @@ class Chart:
         return [dot(column, tau) for column in zip(*rows, strict=True)]
 
     @cached_property
-    def steep(self) -> float:
-        """An entry of gamma that is large, whatever its unit."""
+    def limits(self) -> Array:
+        """(2,) an entry of gamma that is large, in any unit, and a determinant that is small."""
+        closure = self.machine.closure
+        least = closure.fast.edge(closure.home) if closure.compiled else 0.0
+        return np.array([self._steep, _EDGE * least])
+
+    @property
+    def _steep(self) -> float:
         closure = self.machine.closure
         unit = units(self.machine.model)
         passive = unit[closure.passive]

@@ -14,6 +14,7 @@ from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.state import seen_layout, state_layout
 from crane.simulation.integration.traced import (
     Traced,
+    beyond,
     columns_of,
     form_of,
     machine_at,
@@ -73,7 +74,7 @@ class StiffStepper:
         machine, dynamics = chart.machine, chart.dynamics
         self._fast, self._numbers = machine.closure.fast, dynamics.numbers
         self._chart, self._control = chart, control
-        self.bounds = np.append(self._fast.bounds, chart.steep)
+        self.bounds = np.append(self._fast.bounds, chart.limits)
         self._columns = columns_of(control)
         self._state = state_layout(machine, len(control.scales))
         self._seen = seen_layout(machine, control)
@@ -200,7 +201,7 @@ class StiffStepper:
                             r.leave()
                     with r.otherwise():
                         r.store(r.h, 1, wanted)
-                with r.when(result["steepest"] > r.bounds[3]):
+                with r.when(beyond(r, result)):
                     r.give(i + 1)
             r.give(r.steps)
 

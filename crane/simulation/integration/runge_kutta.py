@@ -11,6 +11,7 @@ from crane.simulation.integration.blocks import in_blocks
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.state import seen_layout, state_layout
 from crane.simulation.integration.traced import (
+    beyond,
     columns_of,
     form_of,
     machine_at,
@@ -36,7 +37,7 @@ class CompiledStepper:
         machine, dynamics = chart.machine, chart.dynamics
         self._fast, self._numbers = machine.closure.fast, dynamics.numbers
         self._chart, self._control = chart, control
-        self.bounds = np.append(self._fast.bounds, chart.steep)
+        self.bounds = np.append(self._fast.bounds, chart.limits)
         self._columns = columns_of(control)
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
         form = form_of(control, self._columns, len(machine.active), states, fold=False)
@@ -95,7 +96,7 @@ class CompiledStepper:
                 with r.when(closed < 1):
                     r.give(i)
                 r.copy(r.state, following, size)
-                with r.when(result["steepest"] > r.bounds[3]):
+                with r.when(beyond(r, result)):
                     r.give(i + 1)
             r.give(r.steps)
 

@@ -31,6 +31,8 @@ class Steps:
         reached: Index of the instant of the state, which may have no row yet.
     """
 
+    offset = 0.0
+
     def __init__(self, chart: Chart, control: Controller, own: int):
         self.slow = PythonStepper(chart, control, own)
         self.done = self.reached = 0
@@ -41,11 +43,11 @@ class Steps:
             with suppress(TooLongError):
                 self._fast = CompiledStepper(chart, control, own)
 
-    def limit(self, steepest: float) -> None:
-        """Look for other coordinates from this entry of gamma on."""
-        self.slow.limit = steepest
+    def limit(self, limits: Array) -> None:
+        """Look for other coordinates from there on, see `Chart.limits`."""
+        self.slow.limits = limits
         if self._fast is not None:
-            self._fast.bounds[-1] = steepest
+            self._fast.bounds[-2:] = limits
 
     def run(
         self, times: Array, state: Array, step: float, rows: Array, progress: Progress = None

@@ -12,6 +12,8 @@ from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.state import state_layout
 
+_AHEAD = 1e-3  # [s] how far a machine is thought on that stops
+
 Progress = Callable[[int], None] | None
 """What is told the number of finished steps."""
 
@@ -26,22 +28,24 @@ class PythonStepper:
 
     Attributes:
         layout: Parts of the state.
-        limit: Entry of gamma from which other coordinates are looked for.
+        limits: Where other coordinates are looked for, see `Chart.limits`.
     """
 
     def __init__(self, chart: Chart, control: Controller, own: int):
         self._chart, self._dynamics, self._control = chart, chart.dynamics, control
         self.layout = state_layout(chart.machine, own)
-        self.limit = chart.steep
+        self.limits = chart.limits
 
     def steep(self, state: Array) -> bool:
-        """Whether the chart's coordinates move others by more than the limit."""
-        closure = self._chart.machine.closure
+        """Whether a state is beyond the limits."""
+        closure, q = self._chart.machine.closure, self.layout.view(state).q
         try:
-            gamma = closure.gamma(self.layout.view(state).q)
+            gamma = closure.gamma(q)
         except ClosureError:
             return True
-        return bool(np.abs(gamma[closure.passive]).max(initial=0.0) > self.limit)
+        if np.abs(gamma[closure.passive]).max(initial=0.0) > self.limits[0]:
+            return True
+        return closure.compiled and closure.fast.edge(q) < self.limits[1]
 
     def here(self, state: Array) -> Array:
         """(n,) coordinates of the user's."""
@@ -86,6 +90,21 @@ class PythonStepper:
             raise HaltedError(time + step, self.here(after), f": {error}") from None
         q[:] = machine.coordinates.wrapped(closed)
         return after
+
+    def stopped(self, time: float, state: Array) -> HaltedError:
+        """Why the machine cannot go on, whatever the step."""
+        at, closure = self.layout.view(state), self._chart.machine.closure
+        try:
+            closure.solve(at.q[closure.active] + _AHEAD * at.v_a, guess=at.q)
+        except ClosureError as error:
+            return HaltedError(time, self.here(state), f": {error}")
+        speed = np.abs(at.v_a).max()
+        return HaltedError(
+            time,
+            self.here(state),
+            f" the motion cannot be followed, the fastest joint moves at {speed:.3g} m/s or rad/s",
+            ": look at its forces and gains, give end stops damping, or smooth the friction more",
+        )
 
     def _rate(self, time: float, state: Array) -> tuple[Array, Array]:
         at, chart = self.layout.view(state), self._chart

@@ -11,7 +11,6 @@ from crane.simulation.integration.rosenbrock import StiffStepper
 from crane.simulation.integration.stepwise import Progress, PythonStepper
 
 _CHUNK = 1000  # steps between reports of progress
-_AHEAD = 1e-3  # [s] how far a machine is thought on that stops
 
 
 class StiffSteps:
@@ -30,6 +29,8 @@ class StiffSteps:
         TooLongError: It would take too long to compile.
     """
 
+    offset = 0.0
+
     def __init__(self, chart: Chart, control: ValveDrive):
         self._chart, self._control = chart, control
         self._fast = StiffStepper(chart, control)
@@ -41,9 +42,9 @@ class StiffSteps:
         """See `Steps`."""
         return self.done
 
-    def limit(self, steepest: float) -> None:
+    def limit(self, limits: Array) -> None:
         """See `Steps.limit`."""
-        self.slow.limit = self._fast.bounds[-1] = steepest
+        self.slow.limits = self._fast.bounds[-2:] = limits
 
     def run(
         self, times: Array, state: Array, step: float, rows: Array, progress: Progress = None
@@ -75,7 +76,7 @@ class StiffSteps:
             if count < len(chunk):
                 if self.slow.steep(state):
                     break
-                raise self._stopped(times[self.done], state)
+                raise self.slow.stopped(times[self.done], state)
             if progress is not None:
                 progress(self.done)
         return self.done
@@ -96,22 +97,3 @@ class StiffSteps:
             self._control.update(time, at.q, v_a, at.own)
         except ClosureError as error:
             raise HaltedError(time, self.slow.here(state), f": {error}") from None
-
-    def _stopped(self, time: float, state: Array) -> HaltedError:
-        """Why the machine cannot go on, whatever the step."""
-        at, closure, here = (
-            self.slow.layout.view(state),
-            self._chart.machine.closure,
-            self.slow.here(state),
-        )
-        try:
-            closure.solve(at.q[closure.active] + _AHEAD * at.v_a, guess=at.q)
-        except ClosureError as error:
-            return HaltedError(time, here, f": {error}")
-        speed = np.abs(at.v_a).max()
-        return HaltedError(
-            time,
-            here,
-            f" the motion cannot be followed, the fastest joint moves at {speed:.3g} m/s or rad/s",
-            ": give its end stops damping, or smooth the friction more",
-        )

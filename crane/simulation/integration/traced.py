@@ -8,12 +8,19 @@ import numpy as np
 from crane.closure import rotations
 from crane.closure.compiled import FastClosure
 from crane.closure.traced import Constants
-from crane.codegen import Expression, Layout, Number, Parts, Program, Tape
+from crane.codegen import Expression, Layout, Number, Parts, Program, Tape, Value
+from crane.codegen.representation import Array as Place
+from crane.codegen.representation import Routine
 from crane.codegen.scalar import add, dot, subtract
 from crane.common.errors import InputError
 from crane.control import At, TracedController, ValveDrive
 from crane.dynamics.traced import Sweep
 from crane.simulation.integration.charts import Chart
+
+
+def beyond(r: Routine, result: Place) -> Value:
+    """Whether a closed posture is beyond a chart's limits, the last two of a routine's bounds."""
+    return (result["steepest"] > r.bounds[3]) | (result["edge"] < r.bounds[4])
 
 
 def columns_of(control: TracedController) -> int:
