@@ -76,6 +76,7 @@ class Lengths:
             return place, np.zeros((3, self._model.nv))
         world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
         columns = pin.getJointJacobian(self._model, self._data, joint, world)
+        columns = columns.reshape(6, -1)  # of a single joint it is a vector
         arm = self._data.oMi[joint].rotation @ place
         return (
             self._data.oMi[joint].translation + arm,
