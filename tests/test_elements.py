@@ -8,7 +8,7 @@ import numpy as np
 import oracles
 import pinocchio as pin
 import pytest
-from broken import MACHINE, assert_refused, case, copy_machine, swap
+from broken import MACHINE, MINI, assert_refused, case, copy_machine, swap
 from test_compiled import off
 from typed import typed
 
@@ -20,14 +20,18 @@ from crane.common.errors import CraneWarning, InputError
 from crane.dynamics.compiled import QUANTITIES
 from crane.dynamics.traced import Sweep
 from crane.identification.mechanics.base import random_samples
+from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.model import (
     Direction,
     GasScale,
     Inertial,
     Model,
     SpringForce,
+    default_terms,
     friction,
 )
+from crane.identification.mechanics.write import write_identified
+from crane.identification.signals.motion import Motion
 
 BOOM, STRUT = ("base", "link7"), ("link3_H", "A1_rod")  # of the mini forwarder
 
@@ -601,6 +605,35 @@ def test_columns_of_identification(mini):
         assert np.abs(found - tau).max() < 1e-11 * np.abs(tau).max()
     with pytest.raises(InputError, match="frame 'moon' is unknown"):
         SpringForce(plain, Direction("x", between=("base", "moon")), np.ones_like, "force")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+def test_identified_machines_keep_them(tmp_path):
+    """Also those that a lock took, whose frames are one body while it holds."""
+    path = copy_machine(MINI, tmp_path)
+    path.write_text(
+        path.read_text()
+        + "\nropes:\n  - {between: [A2_barrel, A2_rod], length: 0.05, stiffness: 300}\n"
+        "forces:\n  - {between: [base, link7], stiffness: 30, rest: 0.2, damping: 2}\n"
+        "gas_springs:\n  strut: {between: [link3_H, A1_rod], area: 2e-5, pressure: 3e5, "
+        "volume: 2e-5, rest: 0.1}\n"
+    )
+    machine, locked = crane.load(path), crane.load(path, lock={"X2": 0.012})
+    assert machine.ropes and not locked.ropes and len(locked.elements) == 2
+    time = np.arange(0, 8, 4e-3)[:, None]
+    place, turn = np.array([0.3, 0.015]), np.array([1.0, 0.012])
+    q, v, a = place + turn * np.sin(time), turn * np.cos(time), -turn * np.sin(time)
+    tau = crane.Dynamics(locked).inverse(q, v, a, friction=True)
+    tau += np.random.default_rng(0).normal(size=tau.shape) * np.ptp(tau, axis=0) * 1e-3
+    terms = [*default_terms(locked), GasScale(locked, "strut")]
+    result = identify(locked, Motion(time[:, 0], q, v, a, tau), terms=terms, feasible=True)
+    scale = result.parameters[result.model.names.index("strut.gas_scale")]
+    written = crane.load(write_identified(result, tmp_path / "out"))
+    assert written.ropes == machine.ropes and written.forces == machine.forces
+    (gas,) = written.gas_springs
+    assert gas.pressure == pytest.approx(3e5 * scale) and gas.between == STRUT
+    assert 0.1 < scale < 10 and scale != 1.0
 
 
 def test_what_mjcf_has_no_place_for_is_told(tmp_path, mini):
