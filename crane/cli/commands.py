@@ -209,7 +209,7 @@ def _describe(machine: "Machine") -> Iterator[str]:
     )
     for item, length in zip(elements, lengths, strict=True):
         one, two = item.between or ("", "")
-        yield f"  between     {one} and {two}: {item.kind}, {length:.5g} m long at home"
+        yield f"  between     {one} and {two}: {item.kind}, ends {length:.5g} m apart at home"
     for motor in machine.motors:
         terms = " + ".join(f"{factor:g} {joint}" for joint, factor in motor.factors.items())
         yield f"  drive       {motor.name}, along {terms}"
