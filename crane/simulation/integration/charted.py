@@ -29,6 +29,7 @@ from crane.simulation.integration.stepwise import Progress, PythonStepper
 _WIDER = np.array([2.0, 0.1])  # how limits move where nothing is better
 _RECENT = 500  # states that are kept
 _SAME = 1e-6  # [rad], [m] between a posture as foreseen and as closed
+_DEAD = 10.0  # how many times better others are at a dead centre
 _AT_A_HALT = 1.5  # how many times better other coordinates are that are tried where it halts
 
 
@@ -141,12 +142,12 @@ class ChartedSteps:
         if other is None:
             return False
         if self._inverted:
-            raise self._dead(time, at.q, other)
+            if halt is not None and chart.other(at.q, _DEAD) is not None:
+                raise self._dead(time, at.q, other)
+            return False
         before = self._side * self._facing(at.q)
         self._enter(self._known(other, at.q), self._way.offset)
         self._side = before * self._facing(at.q)
-        self._limits = self._chart.limits
-        self._way.limit(self._limits)
         self._recent = self._moved(np.vstack([self._recent, state]), chart)
         state[:], self._recent = self._recent[-1], self._recent[:-1]
         return True

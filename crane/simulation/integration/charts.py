@@ -18,6 +18,7 @@ import numpy as np
 
 from crane.closure.choice import choose, motions, scales, units
 from crane.closure.structure import Indices
+from crane.closure.traced import folded
 from crane.codegen.scalar import Number, dot
 from crane.common.errors import MechanismError
 from crane.common.samples import Array
@@ -56,6 +57,13 @@ class Chart:
     def own(self) -> bool:
         """Whether the chart's coordinates are the user's."""
         return np.array_equal(self.machine.closure.active, self.seen)
+
+    @property
+    def formulas(self) -> tuple:
+        """What formulas of the chart depend on besides its loops."""
+        dynamics = self.dynamics
+        parts = dynamics.carriers, dynamics.plan, dynamics.spans
+        return folded(dynamics.numbers), *parts, tuple(self.seen.tolist())
 
     def turns(self, q: Array) -> Array:
         """C (n, n) of closed postures (nq,) or (N, nq): v_A = C v_B."""

@@ -7,7 +7,6 @@ II.5 and II.6; the coefficients are scipy's).
 
 import numpy as np
 
-from crane.closure.traced import folded
 from crane.codegen import Number, Program, Tape, Value, largest, select
 from crane.codegen.representation import Array as Place
 from crane.codegen.scalar import add, apply, dot, maximum, minimum, scale, subtract
@@ -66,9 +65,7 @@ class ExplicitStepper:
         n = self._state.parts["v_a"]
         self.tolerance = np.array([tolerance])
         form = form_of(control, self._columns, n, states, fold=False)
-        seen = tuple(chart.seen.tolist())
-        plan = dynamics.carriers, dynamics.plan
-        key = ("explicit", form, states, folded(self._numbers), *plan, seen)
+        key = "explicit", form, states, *chart.formulas
         if key not in self._fast.programs:
             self._fast.programs[key] = program_of(control, self._fast, key, self._build)
         self._program = self._fast.programs[key]

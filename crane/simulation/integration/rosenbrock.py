@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from crane.closure.traced import folded
 from crane.codegen import Expression, Number, Program, Tape, largest, maximum, select
 from crane.codegen.derivative import derivatives
 from crane.codegen.factors import eliminated, loaded, stored, substituted
@@ -80,9 +79,7 @@ class StiffStepper:
         self._seen = seen_layout(machine, control)
         self._stiff = int(np.isfinite(control.scales).sum())
         form = form_of(control, self._columns, len(machine.active), len(control.scales), fold=True)
-        seen = tuple(chart.seen.tolist())
-        plan = dynamics.carriers, dynamics.plan
-        key = ("stiff", form, self._stiff, folded(self._numbers), *plan, seen)
+        key = "stiff", form, self._stiff, *chart.formulas
         if key not in self._fast.programs:
             self._fast.programs[key] = program_of(control, self._fast, key, self._build)
         self._program = self._fast.programs[key]

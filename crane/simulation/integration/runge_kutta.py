@@ -2,7 +2,6 @@
 
 import numpy as np
 
-from crane.closure.traced import folded
 from crane.codegen import Program, Tape, largest
 from crane.codegen.scalar import add, scale
 from crane.common.samples import Array
@@ -41,8 +40,7 @@ class CompiledStepper:
         self._columns = columns_of(control)
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
         form = form_of(control, self._columns, len(machine.active), states, fold=False)
-        seen = tuple(chart.seen.tolist())
-        key = ("rk4", form, states, folded(self._numbers), dynamics.carriers, dynamics.plan, seen)
+        key = "rk4", form, states, *chart.formulas
         self._key = key
         if key not in self._fast.programs:
             self._fast.programs[key] = self._compile()
