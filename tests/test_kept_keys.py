@@ -303,6 +303,7 @@ def test_machines_that_differ_are_right_from_one_folder(place, tmp_path, monkeyp
     built, first = [], []
     # something of the standard library, so that the package does not look patched
     monkeypatch.setattr(Program, "kept", partial(counted, Program.kept, built))
+    loops._SHARED.clear()  # machines of other tests may still be there
     for number, machine in enumerate(variants(tmp_path)):
         found, wanted = results(machine)
         for one, two in zip(found, wanted, strict=True):
