@@ -16,10 +16,9 @@ ROBOTS = Path(__file__).parents[2] / "shared/data/third_party/parallel_robots"
 FREEDOMS = {
     "5bar_linkage_iso6d": 2, "robot_delta": 5, "digit_like_2legs": 12, "wl16_like": 12,
 }  # fmt: skip
-# how long each falls: a dead centre of their motors ends the fall of the two large ones
+# how long each falls: motors of the two large ones come to dead centres at 0.23 and 0.14 s
 FALLS = {
-    "5bar_linkage_iso6d": 1.0, "robot_delta": 1.0,
-    "digit_like_2legs": 0.2, "wl16_like": 0.15,
+    "5bar_linkage_iso6d": 1.0, "robot_delta": 1.0, "digit_like_2legs": 0.3, "wl16_like": 1.0,
 }  # fmt: skip
 LARGE = ("digit_like_2legs", "wl16_like")
 EVERY = [pytest.param(x, marks=pytest.mark.slow) if x in LARGE else x for x in FREEDOMS]
@@ -67,10 +66,13 @@ def test_computed_torque_holds_home(name):
 
 @pytest.mark.parametrize("name", EVERY)
 def test_they_fall_without_gain_or_loss(name):
-    run = crane.simulate(robot(name), duration=FALLS[name], step=5e-4)
+    machine = robot(name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        run = crane.simulate(machine, duration=FALLS[name], method="DOP853")
     kinetic, potential, work, lost = (
         run.channels[key] for key in ("kinetic", "potential", "work", "dissipated")
     )
     balance = kinetic + potential - work + lost
     assert kinetic.max() > 1e-5 and np.abs(work).max() == 0 and np.abs(lost).max() == 0
-    assert np.ptp(balance) < 1e-5 * kinetic.max()
+    assert np.ptp(balance) < 1e-8 * kinetic.max()

@@ -50,6 +50,13 @@ def simulate(
         float | None, typer.Option(help="In seconds; that of the task if not given.")
     ] = None,
     step: Annotated[float, typer.Option(help="Step of the integration in seconds.")] = 1e-3,
+    method: Annotated[
+        str | None,
+        typer.Option(
+            help="rk4, with this step; DOP853, whose steps are as long as their error allows, "
+            "recorded every step; rosenbrock, of circuits; Radau, BDF, LSODA of scipy."
+        ),
+    ] = None,
     change: Change = None,
     lock: Lock = None,
     active: Active = None,
@@ -72,6 +79,8 @@ def simulate(
             raise InputError(f"{given[0]} does not go with --inputs, leave one out")
         if duration is not None:
             raise InputError("--duration does not go with --inputs, the file ends by itself")
+        if method is not None:
+            raise InputError("--method does not go with --inputs, leave it out")
         _replay(loaded, inputs, out, step)
         return
     control = _control(loaded, task, controller)
@@ -83,8 +92,9 @@ def simulate(
     label = task or ("hold" if control else "free motion")
     with progress_bar("simulating") as progress:
         recording = run(
-            loaded, control, duration=duration, step=step, label=label, progress=progress
-        )
+            loaded, control, duration=duration, step=step, label=label, method=method,
+            progress=progress,
+        )  # fmt: skip
     print(write_run(out, recording), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")
 

@@ -63,7 +63,9 @@ def simulate(
     (q_A, v_A), the controller's states and the energies by the classical fourth-order
     Runge-Kutta method with a fixed step (as the reduced-scale forwarder paper does). Within a
     step the passive joints move with gamma v_A; after every step the loops are closed to
-    rounding.
+    rounding. Where the active coordinates come to a dead centre the run goes on in others, with
+    the forces of the same drives, and where branches of motion cross it keeps to its own; both are
+    told in a warning (see `crane.simulation.integration.charts` and `passage`).
 
     Args:
         machine: The machine, or what `crane.load` takes.
@@ -76,10 +78,11 @@ def simulate(
         step: [s].
         label: Name of the motion to put into the recording, as its `task`.
         backend: "compiled" or "pinocchio", see `Dynamics`.
-        method: "rk4"; "rosenbrock" for hydraulic machines, see `StiffStepper`; or one of scipy's
-            adaptive methods ("DOP853", "Radau", "LSODA", ...) with relative tolerance 1e-9, whose
-            dense output is recorded every `step`. If not given, the one that the controller asks
-            for.
+        method: "rk4"; "rosenbrock" for hydraulic machines, see `StiffStepper`; "DOP853", whose
+            steps are as long as an error of 1e-11 of the state allows, in machine code where the
+            controller is (`ExplicitStepper`), else scipy's; or another of scipy's adaptive
+            methods ("Radau", "LSODA", ...) with relative tolerance 1e-9. What is between their
+            steps is recorded every `step`. If not given, the one that the controller asks for.
         formulation: "exact" or "decoupled", see `Dynamics`.
         progress: Called with the finished share, 0 to 1.
 
@@ -191,13 +194,23 @@ def _integration(
         )
     if method in (None, "rk4"):
         return lambda chart: Steps(chart, control, own)
-    if method == "dop853" and isinstance(control, TracedController):
-        return lambda chart: ExplicitSteps(chart, control, own)
+    if method == "DOP853" and not isinstance(control, ValveDrive):
+        return lambda chart: _explicit(chart, control, own)
     if method in ADAPTIVE and machine.coordinates.floating:
         raise InputError(f"method '{method}' does not go round with a body that floats, take rk4")
     if method in ADAPTIVE:
         return lambda chart: AdaptiveSteps(chart, control, own, method)
     raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")
+
+
+def _explicit(chart: Chart, control: Controller, own: int) -> Way:
+    """The explicit method of order 8: machine code, or scipy where there is none."""
+    if chart.dynamics.backend == "compiled" and isinstance(control, TracedController):
+        with suppress(TooLongError):
+            return ExplicitSteps(chart, control, own)
+    if chart.machine.coordinates.floating:
+        raise InputError("scipy's methods do not go round with a body that floats, take rk4")
+    return AdaptiveSteps(chart, control, own, "DOP853")
 
 
 def _stiff(chart: Chart, control: ValveDrive, own: int) -> Way:

@@ -1,0 +1,141 @@
+"""Runs that pass dead centres, and postures where branches cross, by any active joint."""
+
+import warnings
+
+import numpy as np
+import pytest
+import singular
+from scipy.integrate import solve_ivp
+
+import crane
+from crane.common.errors import CraneWarning, SimulationError
+from crane.control import controller
+from crane.motion.trajectories import point_to_point
+
+pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
+GRAVITY = 9.81
+
+
+def swung(angle, speed, until, inertia, lever, times):
+    """Angle of J(angle) angle'' + J' angle'^2 / 2 = lever g cos(angle), see `singular`."""
+
+    def rate(_, y):
+        half = 0.5 * (inertia(y[0] + 1e-5) - inertia(y[0] - 1e-5)) / 2e-5
+        return [y[1], (lever * GRAVITY * np.cos(y[0]) - half * y[1] ** 2) / inertia(y[0])]
+
+    found = solve_ivp(
+        rate, (0, until), [angle, speed], "DOP853", rtol=1e-13, atol=1e-13, t_eval=times
+    )
+    return found.y[0]
+
+
+def run(machine, joint, speed, duration, **settings):
+    return crane.simulate(
+        machine, initial=singular.start(machine, joint, speed), duration=duration, **settings
+    )
+
+
+@pytest.mark.parametrize("method, step", [("rk4", 2e-4), ("DOP853", 1e-3)])
+def test_a_crank_turns_through_the_dead_centres_of_its_slider(tmp_path, method, step):
+    """As it does by the crank itself, which has none."""
+    alone = singular.slider_crank(tmp_path, "a", 0.3, 0.6)
+    wanted = run(alone, "a", 12.0, 1.0, step=step, method=method)
+    machine = singular.slider_crank(tmp_path, "s", 0.3, 0.6)
+    with pytest.warns(CraneWarning, match=r"^'s' passes a dead centre at t = 0") as told:
+        found = run(machine, "a", 12.0, 1.0, step=step, method=method)
+    assert len(told) == 1
+    assert found.joints == ("s",) and np.ptp(wanted.q) > 4 * np.pi
+    q = singular.postures(machine, found)
+    np.testing.assert_allclose(q, singular.postures(alone, wanted), rtol=0, atol=2e-8)
+    assert machine.closure.residual(q).max() < 1e-13
+    rows = alone.closure.gamma(singular.postures(alone, wanted))[:, machine.column("s")]
+    np.testing.assert_allclose(found.v, rows * wanted.v, rtol=0, atol=1e-6)
+    assert singular.imbalance(found) < 1e-8
+
+
+def test_forces_and_friction_stay_those_of_the_drive(tmp_path):
+    """The slider is pushed through its dead centres, against friction of all joints."""
+    friction = {
+        joint: crane.Friction(coulomb=0.2, viscous=0.1, smoothing=0.05)
+        for joint in ("a", "b", "s")
+    }
+    machine = singular.slider_crank(tmp_path, "s", 0.3, 0.6).replace(friction=friction)
+    runs = {}
+    for active in ("s", "a"):
+        one = machine.seen_from(machine.home, (active,))
+
+        def push(t, q, v, active=active):
+            # 5 N along the slider, whichever coordinate it is seen by
+            sine, cosine = np.sin(q[0]), np.cos(q[0])
+            lever = -0.3 * sine - 0.09 * sine * cosine / np.sqrt(0.36 - 0.09 * sine**2)
+            return np.array([5.0 if active == "s" else 5.0 * lever])
+
+        runs[active] = crane.simulate(
+            one, push, singular.start(one, "a", 15.0), duration=1.0, step=2.5e-4
+        )
+        assert singular.imbalance(runs[active]) < 1e-7
+    q = [singular.postures(machine, one) for one in runs.values()]
+    assert np.ptp(q[0][:, machine.column("a")]) > 1.5 * np.pi
+    np.testing.assert_allclose(*q, rtol=0, atol=1e-7)
+    assert np.abs(runs["s"].tau - 5.0).max() == 0.0
+    work = [one.channels["work"][-1] for one in runs.values()]
+    assert work[0] == pytest.approx(work[1], rel=1e-6)
+
+
+@pytest.mark.parametrize("active", ["a", "b", "s"])
+def test_equal_lengths_go_on_where_branches_cross(tmp_path, active):
+    def inertia(a):
+        sine, cosine = np.sin(a) ** 2, np.cos(a) ** 2
+        return 1 / 3 + 1 / 12 + 2.25 * sine + 0.25 * cosine + 4.0 * sine
+
+    machine = singular.slider_crank(tmp_path, active)
+    with pytest.warns(CraneWarning, match="could go on in several ways"):
+        found = run(machine, "a", 4 / 2**0.5, 4.0, step=1e-3, method="DOP853")
+    a = singular.postures(machine, found)[:, machine.column("a")]
+    assert np.ptp(a) > 3 * np.pi
+    wanted = swung(-np.pi / 4, 4 / 2**0.5, 4.0, inertia, 1.0, found.time)
+    np.testing.assert_allclose(a, wanted, rtol=0, atol=2e-7)
+    assert singular.imbalance(found) < 1e-7
+
+
+@pytest.mark.parametrize(
+    "count, active",
+    [
+        (1, "r0"), (1, "c0"), (1, "r1"), (2, "c1"),
+        pytest.param(10, "r5", marks=pytest.mark.slow),
+        pytest.param(10, "c3", marks=pytest.mark.slow),
+        pytest.param(40, "r0", marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_parallelograms_stay_such_in_line(tmp_path, count, active):
+    """Against the pendulum that they are; the other branch is an antiparallelogram."""
+    machine = singular.windows(tmp_path, active, count)
+    found = run(machine, "r0", 1.0, 10.0, step=1e-3)
+    angle = singular.postures(machine, found)[:, machine.column("r0")]
+    inertia, lever = (count + 1) / 3 + count, (count + 1) / 2 + count
+    wanted = swung(-np.pi / 2, 1.0, 10.0, lambda _: inertia, lever, found.time)
+    np.testing.assert_allclose(angle, wanted, rtol=0, atol=1e-7)
+    assert np.ptp(angle) > 9 * np.pi
+    assert singular.imbalance(found) < 1e-8
+
+
+def test_a_rocker_that_turns_back_everywhere(tmp_path):
+    """Each of its joints has dead centres; the motion is the same by all of them."""
+    runs = [
+        singular.postures(machine, run(machine, "a", 0.0, 3.0, method="DOP853"))
+        for machine in (singular.four_bar(tmp_path, active) for active in "abc")
+    ]
+    assert np.ptp(runs[0], axis=0).min() > 1.0
+    for other in runs[1:]:
+        np.testing.assert_allclose(other, runs[0], rtol=0, atol=1e-7)
+
+
+def test_inverse_dynamics_at_a_dead_centre_is_one_line(tmp_path):
+    machine = singular.slider_crank(tmp_path, "s", 0.3, 0.6)
+    start = machine.home[machine.closure.active]
+    path = point_to_point(start, [0.95], 1.0)  # the slider gets no farther than 0.9
+    with warnings.catch_warnings(), pytest.raises(SimulationError) as caught:
+        warnings.simplefilter("ignore", CraneWarning)
+        crane.simulate(machine, controller("computed-torque", machine, path))
+    text = str(caught.value)
+    assert "'s' comes to a dead centre" in text and "\n" not in text
