@@ -108,6 +108,13 @@ class Scale:
         for law in told.get("forces", []):
             for key in law.keys() & ELEMENT.keys():
                 law[key] = float(law[key]) * by(law["joint"], ELEMENT[key])
+        for law in told.get("gas_springs", []):
+            length = 3 if kinds[law["joint"]] is TURN else 2
+            law["area"] = float(law["area"]) * self.s**length
+            law["pressure"] = float(law["pressure"]) * self.m / self.s**2
+            law["volume"] = float(law["volume"]) * self.s**3
+            if "rest" in law:
+                law["rest"] = float(law["rest"]) * by(law["joint"], "coordinate")
         for joint, law in told.get("end_stops", {}).items():
             law["stiffness"] = float(law["stiffness"]) * by(joint, "stiffness")
             law["damping"] = float(law.get("damping", 0.0)) * by(joint, "hunt")

@@ -253,11 +253,11 @@ class FastClosure:
 
     def _steepest(self, rows: Sequence[Number], per_size: Number) -> Number:
         """The largest entry of gamma."""
-        slides = self._equations.coordinates.slides
+        turns = self.geometry.revolute
         powers: dict[int, list[Number]] = {0: [], 1: [], -1: []}  # of a length in an entry
         for (row, k), entry in zip(self._pairs, rows, strict=True):
-            one, two = slides[self._passive[row]], slides[self._active[k]]
-            powers[int(one) - int(two)].append(entry)
+            one, two = turns[self._passive[row] + 1], turns[self._active[k] + 1]
+            powers[int(two) - int(one)].append(entry)
         worst = largest(powers[0])
         if powers[1]:
             worst = maximum(worst, per_size * largest(powers[1]))
@@ -358,7 +358,7 @@ class FastClosure:
 
         distance(numbers, q, q').
         """
-        long = self._equations.coordinates.slides[self._passive].tolist()
+        long = [not self.geometry.revolute[column + 1] for column in self._passive]
         tape = Tape()
         q, n = tape.loads(1, 0, self._nq), self._n
         target = tape.loads(2, 0, n)

@@ -9,8 +9,8 @@ Where the loops do not close from the guess, they are closed from anywhere
 
 So are they where the active joints are too few or too many where it closes, and where home as it
 closes from the guess is outside of limits or more than 0.5 rad (or half of the machine's size)
-from what the file says. Then home is kept where none that is found is nearer; far off, that is
-told where there are others.
+from what the file says. Then home is kept where none that is found is nearer, and told if it is
+far off.
 
 The first of these that closes counts, and of the postures that it finds the one that is nearest to
 the guess, see `Search.postures`.
@@ -103,7 +103,7 @@ def settle(
             raise refused if isinstance(refused, ActiveError) else usable
     if first is None:
         raise refused
-    if not others or search.off_said(first.home)[1] <= _FAR:
+    if search.off_said(first.home)[1] <= _FAR:
         return first, None
     return first, _sought(search, reason, others + 1, first.home)
 

@@ -18,6 +18,7 @@ from crane.common.samples import Array, solve
 _STEP = 0.02  # of a joint's scale
 _MOVED = 0.05  # share of a step that a finite motion keeps at least
 _OPEN = 1e-9  # residual that counts as open [rad], [machine's size]
+_AGAIN = 2  # closings of each direction
 _DIRECTIONS = 3  # drawn, beside those of single joints
 _WALK = 16  # steps to the end of the range
 
@@ -31,7 +32,9 @@ def locked_up(
 ) -> tuple[int, float] | None:
     """Where a machine has less freedom than its equations promise at a closed posture.
 
-    Steps in drawn directions of the null space N are closed with all equations, the shortest way.
+    Steps in drawn directions of the null space N are closed with all equations, the shortest way,
+    and again from as far in the direction that was left: a finite motion far from the first one is
+    found that way, and of no motion rounding is left.
     Joints that N lets move and that stay in all the ways that remain are locked. A linkage in line
     that may go on in several ways (a bifurcation) has more columns of N than freedom, too, but all
     its joints move.
@@ -56,9 +59,14 @@ def locked_up(
     moved = np.zeros(len(q))  # shares of the step
     for _ in range(2 * basis.shape[1]):
         way = basis @ random.normal(size=basis.shape[1])
-        near = close(q + _STEP * scale * way / np.linalg.norm(way))
-        if np.abs(equations.scaled(near)[0]).max() < _OPEN:
-            moved = np.maximum(moved, np.abs(near - q) / scale / _STEP)
+        for _ in range(_AGAIN):
+            near = close(q + _STEP * scale * way / np.linalg.norm(way))
+            if not np.abs(equations.scaled(near)[0]).max() < _OPEN:
+                break
+            way = (near - q) / scale
+            moved = np.maximum(moved, np.abs(way) / _STEP)
+            if not way.any():
+                break
     promised = np.linalg.norm(basis, axis=1)
     if not ((promised > 1e-3) & (moved < _MOVED * promised)).any():
         return None

@@ -149,7 +149,7 @@ class CompiledStepper:
         mean = add(k1, scale(2.0, add(k2, k3)), k4)
         after = wrapped(self._dynamics, add(state, scale(h * (1.0 / 6.0), mean)))
         rates = [*k1[coordinates], *k2[coordinates], *k3[coordinates]]
-        long = 3 * self._dynamics.machine.coordinates.slides.tolist()
+        long = 3 * [not turns for turns in self._fast.geometry.revolute[1:]]
         share = largest_share(rates, long, self._fast.per_size(tape))
         # the others count only so far as that NaN and infinity anywhere show
         move = h * maximum(share, largest(scale(1e-30, mean)))
