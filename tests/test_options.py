@@ -1,6 +1,6 @@
 """Options at the edge of what they take: an answer, or one line that says what is wrong.
 
-What counts as well is in fuzz_options.py: exit status 0 to 2, no traceback, within 20 s of
+What counts as well is in fuzz_options.py: exit status 0 to 2, no traceback, within 60 s of
 computing and 2 GB, an error alone on its line and nothing left behind it, and of a call that
 succeeds no figure that no machine has.
 """

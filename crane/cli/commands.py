@@ -1,6 +1,7 @@
 """Commands on machines and runs: list, info, simulate, view, plot, demo."""
 
 from collections.abc import Iterator
+from math import isinf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -179,10 +180,9 @@ def _describe(machine: "Machine") -> Iterator[str]:
     for i, joint in enumerate(machine.active):
         home = machine.home[closure.active[i]]
         free = ", free" if joint in machine.free else ""
-        yield (
-            f"    {joint:<{width}}{machine.lower[i]:.5g} to {machine.upper[i]:.5g} "
-            f"{machine.unit(joint)}, home {home:.5g}{free}"
-        )
+        unit = machine.unit(joint)
+        limits = _limits(machine.lower[i], machine.upper[i], unit)
+        yield f"    {joint:<{width}}{limits}, home {home:.5g} {unit}{free}"
     for i in closure.passive:
         joint = machine.joints[i]
         yield f"    {joint:<{width}}passive, home {machine.home[i]:.5g} {machine.unit(joint)}"
@@ -230,3 +230,12 @@ def _describe(machine: "Machine") -> Iterator[str]:
             )
     for task in machine.tasks.values():
         yield f"  task        {task.name}, {task.duration:g} s: {task.description}"
+
+
+def _limits(lower: float, upper: float, unit: str) -> str:
+    """A range in words, which may have no end."""
+    if isinf(lower) and isinf(upper):
+        return "unlimited"
+    if isinf(lower):
+        return f"at most {upper:.5g} {unit}"
+    return f"at least {lower:.5g} {unit}" if isinf(upper) else f"{lower:.5g} to {upper:.5g} {unit}"
