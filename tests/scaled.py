@@ -104,7 +104,9 @@ class Scale:
         told["home"] = {x: v * by(x, "coordinate") for x, v in told.get("home", {}).items()}
         for joint, law in told.get("friction", {}).items():
             law |= {key: law.get(key, value) for key, value in DEFAULTS.items()}
-            told["friction"][joint] = {k: float(v) * by(joint, FRICTION[k]) for k, v in law.items()}
+            told["friction"][joint] = {
+                k: float(v) * by(joint, FRICTION[k]) for k, v in law.items()
+            }
         for law in told.get("forces", []):
             for key in law.keys() & ELEMENT.keys():
                 law[key] = float(law[key]) * by(law["joint"], ELEMENT[key])

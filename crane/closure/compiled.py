@@ -234,7 +234,10 @@ class FastClosure:
         long = [not posture.geometry.revolute[joint] for joint in steps]
         corrected = [x + steps.get(i, 0.0) for i, x in enumerate(q, start=1)]
         rows = [loops.gamma[loops.passive_joints[row]][k] for row, k in self._pairs]
-        worst = maximum(self._steepest(rows, posture.per_size) - _STEEP, loops.surplus - self._structure.surplus.allowed)
+        worst = maximum(
+            self._steepest(rows, posture.per_size) - _STEEP,
+            loops.surplus - self._structure.surplus.allowed,
+        )
         for sign, determinant in zip(signs, loops.determinants, strict=True):
             worst = maximum(worst, -(float(sign) * determinant))
         for alignment in loops.alignments:

@@ -156,6 +156,8 @@ class Rounded(Exact):
             q[free] += least_squares_step(jacobian[:, free], phi) * self._unit[free]
         for _ in range(20):
             phi, jacobian = self._equations.scaled(q)
+            if not np.isfinite(jacobian).all():  # beyond all numbers: not closed
+                break
             step = np.linalg.lstsq(jacobian[:, free], -phi, rcond=_MEANT)[0]
             q[free] += step * self._unit[free]
             if not 1e-14 < np.abs(step).max(initial=0.0) < 1.0:

@@ -208,7 +208,9 @@ def analyse(
     independent = exact.independent(home, passive, rank, _SINGULAR)
     if independent is None:
         other = ""
-        if _rank(exact.jacobian(home) * units, _SINGULAR) == rank:  # a dead centre of these drives only
+        if (
+            _rank(exact.jacobian(home) * units, _SINGULAR) == rank
+        ):  # a dead centre of these drives only
             other = _listed(", or drive it by ", proposed())
         raise HomeError(
             f"the home posture ({_at(names, active, home)}) is at the edge of the assembly "

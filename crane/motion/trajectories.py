@@ -234,7 +234,9 @@ def beyond_limits(machine: Machine, reference: Trajectory, until: float = np.inf
     if not (excess > slack).any():
         return ""
     span = machine.upper - machine.lower
-    shares = excess / np.where(np.isfinite(span), span, machine.closure.units[machine.closure.active])
+    shares = excess / np.where(
+        np.isfinite(span), span, machine.closure.units[machine.closure.active]
+    )
     k, i = np.unravel_index(int(shares.argmax()), shares.shape)
     joint, value = machine.active[i], q_a[k, i]
     limit = machine.lower[i] if value < machine.lower[i] else machine.upper[i]

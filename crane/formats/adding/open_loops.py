@@ -23,7 +23,9 @@ from crane.formats.machine_file.open_loops import named_pairs
 _NEAR = 0.05  # share of the machine's size within which two ends meet
 _MEETING = 0.01  # the same where no plane tells that they belong together
 _AWAY = 1e-6  # share of the size away from a body's origin where a frame is a place of its own
-_DUMMY = 1e-6  # [kg] that CAD exporters give frames; of a light machine a share of its heaviest link
+_DUMMY = (
+    1e-6  # [kg] that CAD exporters give frames; of a light machine a share of its heaviest link
+)
 _PARALLEL = 1e-6  # sine of an angle that counts as none
 _RING = 3  # joints of the tree below which a loop would lock what it closes
 _BARREL = re.compile(r"barrel|tube|housing|cylinder|cyl", re.IGNORECASE)
