@@ -283,8 +283,8 @@ class Branch:
         loop = self._equations.names[self._equations.loop_of_row[worst]]
         return OutOfReachError(
             f"loop '{loop}' cannot be closed at {self._at(target)}{sample}: it stays "
-            f"{self._gap(worst, np.abs(phi[worst]))} open; the last posture on the way that closes is at "
-            f"{self._at(last.q_a)}"
+            f"{self._gap(worst, np.abs(phi[worst]))} open; the last posture on the way that "
+            f"closes is at {self._at(last.q_a)}"
         )
 
     def _wrong_branch(self, what: str, posture: Posture) -> WrongBranchError:

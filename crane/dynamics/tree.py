@@ -148,12 +148,14 @@ class TreeDynamics:
 
     def _forward(self, motion: ClosedState, tau_a: Array, friction: bool) -> Array:
         bias = self._project(motion, motion.drift, friction)
+        mass = self._mass(motion)
         try:
-            return solve(self._mass(motion), tau_a - bias)
+            np.linalg.cholesky(mass)  # elimination would divide by what rounding leaves
+            return solve(mass, tau_a - bias)
         except np.linalg.LinAlgError:
             raise MechanismError(
-                "the mass matrix is singular: some motion moves no mass that counts beside the "
-                "others', correct the masses and inertias"
+                "the mass matrix is not definite: some motion moves no mass that counts beside "
+                "the others', correct the masses and inertias"
             ) from None
 
     def _energy(self, motion: ClosedState) -> Array:

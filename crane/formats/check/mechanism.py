@@ -90,9 +90,8 @@ def _gaps(spec: MachineSpec, model: pin.Model, guess: Array) -> dict[str, str]:
         # rows of rotations are cosines of angles that are right ones when closed
         sine = min(1.0, float(np.linalg.norm(phi[rows & ~equations.is_translation])))
         if max(length, sine) > _OPEN:
-            found[f"loop {loop.name}"] = (
-                f"{_length(length * equations.size)} apart and {np.degrees(np.arcsin(sine)):.3g} deg askew"
-            )
+            askew = f"{np.degrees(np.arcsin(sine)):.3g} deg askew"
+            found[f"loop {loop.name}"] = f"{_length(length * equations.size)} apart and {askew}"
     return found
 
 

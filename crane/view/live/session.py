@@ -232,7 +232,10 @@ class Session:
         )
 
     def _condition(self, q: Array) -> tuple[float, str]:
-        """Condition number of J_P in shares of the machine's size, and the loop that a force of least effect belongs to."""
+        """Condition number of J_P, and the loop that a force of least effect belongs to.
+
+        In shares of the machine's size, so that metres and radians compare.
+        """
         closure = self.machine.closure
         equations, rows = closure.equations, closure.structure.rows
         if not len(rows):
