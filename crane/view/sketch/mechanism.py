@@ -100,7 +100,9 @@ class _Projection:
         first = self.origins[1]
         along = self.axes[1]
         across = first - (first @ along) * along
-        return bool(self.steep[1] < _STEEP and np.linalg.norm(across) < SAME * self.size)
+        return bool(
+            self.steep[1] < _STEEP and np.linalg.norm(across) < SAME * self.machine.closure.size
+        )
 
     def _revolute(self) -> tuple[list[Pin], list[Collar]]:
         pins, collars = [], []
