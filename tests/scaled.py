@@ -5,7 +5,6 @@ Then times scale by sqrt(s), forces by m, torques by m s, and a motion that star
 likewise (Froude's similarity).
 """
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -110,13 +109,13 @@ class Scale:
         for law in told.get("forces", []):
             for key in law.keys() & ELEMENT.keys():
                 law[key] = float(law[key]) * by(law["joint"], ELEMENT[key])
-        for law in told.get("gas_springs", []):
-            length = 3 if kinds[law["joint"]] is TURN else 2
+        for joint, law in told.get("gas_springs", {}).items():
+            length = 3 if kinds[joint] is TURN else 2
             law["area"] = float(law["area"]) * self.s**length
             law["pressure"] = float(law["pressure"]) * self.m / self.s**2
             law["volume"] = float(law["volume"]) * self.s**3
             if "rest" in law:
-                law["rest"] = float(law["rest"]) * by(law["joint"], "coordinate")
+                law["rest"] = float(law["rest"]) * by(joint, "coordinate")
         for joint, law in told.get("end_stops", {}).items():
             law["stiffness"] = float(law["stiffness"]) * by(joint, "stiffness")
             law["damping"] = float(law.get("damping", 0.0)) * by(joint, "hunt")
@@ -142,9 +141,3 @@ class Scale:
             if element.get(key) is not None:
                 values = (repr(float(x) * factor) for x in element.get(key).split())
                 element.set(key, " ".join(values))
-
-
-def copied(path, folder):
-    """The machine as it is, beside its scaled ones."""
-    shutil.copytree(path.parent, folder, dirs_exist_ok=True)
-    return folder / path.name

@@ -40,8 +40,8 @@ class Base(Brief):
         independent: (r,) columns of W that carry the base parameters.
         grouping: K (r, p): base parameters are K beta; identity in the independent columns.
         unobservable: Names of parameters without any effect.
-        units: (p,) to compare parameters with: those of bodies that a machine of this size has
-            with 1 kg, 1, l, l^2, and 1 of friction and the like.
+        units: (p,) to compare parameters with: of a body of 1 kg in a machine of size l 1, l and
+            l^2; of friction and the like what makes as much force at most.
     """
 
     names: tuple[str, ...]
@@ -147,11 +147,15 @@ def base_parameters(model: Model, samples: Samples | None = None, seed: int = 0)
     p, n = len(model.names), len(model.machine.active)
     if samples is None:
         samples = random_samples(model, max(60, 4 * p // n), seed)
-    rows = model.regressor(samples).reshape(-1, p)
-    size = model.machine.closure.size
-    body = [1.0, *[size] * 3, *[size**2] * 6]
+    closure, bodies = model.machine.closure, 10 * len(model.bodies)
+    # forces as virtual work per 1 rad and the machine's size, so that drives compare
+    rows = (model.regressor(samples) * closure.units[closure.active, None]).reshape(-1, p)
     units = np.ones(p)
-    units[: 10 * len(model.bodies)] = np.tile(body, len(model.bodies))
+    body = [1.0, *[closure.size] * 3, *[closure.size**2] * 6]
+    units[:bodies] = np.tile(body, len(model.bodies))
+    norms = np.linalg.norm(rows, axis=0) * units
+    if norms[bodies:].any():  # friction and the like compare among themselves
+        units[bodies:] = norms[:bodies].max(initial=0.0) / norms[bodies:].max() or 1.0
     return group(model.names, rows, units, lambda column: _preference(model, column))
 
 
