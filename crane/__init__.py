@@ -20,7 +20,7 @@ if TYPE_CHECKING:
         ValvePD,
         joystick,
     )
-    from crane.description import EndStop, ForceElement, Friction, GasSpring, PIGains
+    from crane.description import EndStop, ForceElement, Friction, GasSpring, PIGains, Rope
     from crane.dynamics import Dynamics
     from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
     from crane.formats.adding import add_cylinder, add_loops
@@ -58,7 +58,7 @@ _HOMES = {
     "crane.common.errors": "CraneError CraneWarning",
     "crane.control": "PI Command ComputedTorque Controller Law Sampled Signals TipVelocity "
     "ValveDrive ValvePD joystick",
-    "crane.description": "EndStop ForceElement Friction GasSpring PIGains",
+    "crane.description": "EndStop ForceElement Friction GasSpring PIGains Rope",
     "crane.dynamics": "Dynamics",
     "crane.formats": "load write_machine write_mjcf write_urdf_plus",
     "crane.formats.adding": "add_cylinder add_loops",
@@ -87,7 +87,7 @@ __all__ = [
     "PI", "Batch", "Closure", "Command", "Comparison", "ComputedTorque", "Controller",
     "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation", "ForceElement", "Friction",
     "GasSpring", "Identification", "Kinematics", "Law", "Machine", "PDGains", "PIGains",
-    "Payload", "Recording", "Sampled", "Signals", "Study", "TipVelocity", "Trajectory",
+    "Payload", "Recording", "Rope", "Sampled", "Signals", "Study", "TipVelocity", "Trajectory",
     "ValveDrive", "ValvePD", "Workspace", "add_cylinder", "add_loops", "check", "excite",
     "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
     "identify_valve", "joystick", "load", "point_to_point", "polynomial",

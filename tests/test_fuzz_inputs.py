@@ -9,7 +9,7 @@ import pytest
 from judge import judge
 
 SOME = {"visuals": 8, "meshes": 1, "npz": 10, "csv": 12}
-MANY = {"visuals": 300, "meshes": 20, "npz": 120, "csv": 180}  # meshes: 20 files each
+MANY = {"visuals": 120, "meshes": 10, "npz": 50, "csv": 90}  # meshes: 20 files each
 
 
 def run(kind, first, count):

@@ -16,8 +16,8 @@ from mujoco_oracle import Oracle  # noqa: E402
 FILES = Path(__file__).parent / "data" / "mjcf"
 REACH = {  # [rad], [m] about home that active coordinates are drawn from
     "ankle": 0.15, "delta": 0.2, "differential": 0.3, "excavator": 0.05, "flyer": 0.6,
-    "gantry": 0.2, "gripper": 0.05, "hexapod": 0.03, "leg": 0.05, "walker": 0.2, "welded": 0.15,
-    "wrist": 0.15,
+    "gantry": 0.2, "gripper": 0.05, "hexapod": 0.03, "leg": 0.05, "struts": 0.2, "walker": 0.2,
+    "welded": 0.15, "wrist": 0.15,
 }  # fmt: skip
 TOLERANCE = 1e-9
 

@@ -21,4 +21,4 @@ def test_calls_that_were_reported():
 @pytest.mark.slow
 @pytest.mark.parametrize("part", range(4))
 def test_options_at_the_edge(part):
-    assert judge("fuzz_options.py", 1000 + 250 * part, 40) == 40
+    assert judge("fuzz_options.py", 1000 + 250 * part, 20) == 20

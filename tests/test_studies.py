@@ -247,7 +247,7 @@ def workers(nanny):
 @pytest.mark.parametrize("nanny", [True, False])
 def test_a_worker_that_dies_loses_nothing(nanny, tmp_path):
     """One of two workers is killed at a third of the way, and started again or not."""
-    vary = {"link3_G.x": np.linspace(0.09, 0.1, 11), "payload.mass": np.linspace(0, 0.1, 5)}
+    vary = {"link3_G.x": np.linspace(0.09, 0.1, 6), "payload.mass": np.linspace(0, 0.1, 3)}
     local = crane.study("mini_forwarder", vary)
     killed = []
     with warnings.catch_warnings(), workers(nanny) as (address, pids):

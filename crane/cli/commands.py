@@ -163,6 +163,7 @@ def is_run(what: str) -> bool:
 def _describe(machine: "Machine") -> Iterator[str]:
     from crane.common.units import quantity
     from crane.dynamics import Dynamics
+    from crane.dynamics.lengths import Lengths
 
     closure = machine.closure
     structure = closure.structure
@@ -202,6 +203,13 @@ def _describe(machine: "Machine") -> Iterator[str]:
             for _, columns in structure.blocks
         ]
         yield f"  solved as   {', then '.join(order)}"
+    elements = [item for item in machine.elements if item.between is not None]
+    lengths, _ = Lengths(machine, [item.between for item in elements if item.between]).at(
+        machine.home
+    )
+    for item, length in zip(elements, lengths, strict=True):
+        one, two = item.between or ("", "")
+        yield f"  between     {one} and {two}: {item.kind}, ends {length:.5g} m apart at home"
     for motor in machine.motors:
         terms = " + ".join(f"{factor:g} {joint}" for joint, factor in motor.factors.items())
         yield f"  drive       {motor.name}, along {terms}"

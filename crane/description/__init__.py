@@ -8,6 +8,7 @@ from crane.description.spec import (
     Chain,
     Coupling,
     Drive,
+    Element,
     EndStop,
     ForceElement,
     Friction,
@@ -15,11 +16,12 @@ from crane.description.spec import (
     LoopSpec,
     MachineSpec,
     PIGains,
+    Rope,
     Task,
 )
 
 __all__ = [
-    "LOOP_TYPES", "Chain", "Coupling", "Drive", "EndStop", "ForceElement", "Friction", "GasSpring",
-    "LoopSpec", "MachineSpec", "PIGains", "Task", "bundled", "changed", "driven", "examples",
-    "inertia_problem", "locked", "parameters",
+    "LOOP_TYPES", "Chain", "Coupling", "Drive", "Element", "EndStop", "ForceElement", "Friction",
+    "GasSpring", "LoopSpec", "MachineSpec", "PIGains", "Rope", "Task", "bundled", "changed",
+    "driven", "examples", "inertia_problem", "locked", "parameters",
 ]  # fmt: skip

@@ -15,7 +15,14 @@ from crane.common.magnitudes import doubt
 from crane.common.samples import FARTHEST, as_number
 from crane.description.floating import grounded
 from crane.description.sources import bundled
-from crane.description.spec import Chain, Coupling, Drive, Friction, MachineSpec
+from crane.description.spec import (
+    Chain,
+    Coupling,
+    Drive,
+    Element,
+    Friction,
+    MachineSpec,
+)
 from crane.description.tree import Joint, Limits, Link, Tree, limit
 from crane.hydraulics.components import Hydraulics, number_names
 
@@ -199,7 +206,7 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
     """A machine with some joints fixed.
 
     What refers to a locked joint, such as its friction, goes with it, and so do tasks of active
-    joints if one of them is locked.
+    joints if one of them is locked, and what acts between two frames that make one body now.
 
     Args:
         spec: The machine as read.
@@ -219,13 +226,21 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
     active = spec.active and tuple(name for name in spec.active if name not in lock)
     if (spec.active and not active) or not joints.keys() - lock.keys():
         raise InputError(f"with {', '.join(lock)} locked nothing drives the machine, lock less")
+    tree = spec.tree.replacing(*held)
+    body = tree.bodies()
+
+    def acts(item: Element) -> bool:
+        if item.between is None:
+            return item.joint not in lock
+        return len({body[frame] for frame in item.between}) > 1
+
     chains = tuple(
         dataclasses.replace(chain, joints=tuple(j for j in chain.joints if j not in lock))
         for chain in spec.chains
     )
     return dataclasses.replace(
         spec,
-        tree=spec.tree.replacing(*held),
+        tree=tree,
         chains=chains,
         active=active,
         free=tuple(name for name in spec.free if name not in lock),
@@ -233,9 +248,10 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
         home={joint: value for joint, value in spec.home.items() if joint not in lock},
         friction={joint: value for joint, value in spec.friction.items() if joint not in lock},
         control={joint: value for joint, value in spec.control.items() if joint not in lock},
-        forces=tuple(item for item in spec.forces if item.joint not in lock),
+        forces=tuple(filter(acts, spec.forces)),
         hydraulics=spec.hydraulics and spec.hydraulics.only(active or ()),
-        gas_springs=tuple(item for item in spec.gas_springs if item.joint not in lock),
+        gas_springs=tuple(filter(acts, spec.gas_springs)),
+        ropes=tuple(filter(acts, spec.ropes)),
         end_stops=tuple(item for item in spec.end_stops if item.joint not in lock),
         tasks={
             name: dataclasses.replace(

@@ -45,7 +45,7 @@ def _is_free(spec: MachineSpec, series: list[Joint]) -> bool:
             return False  # it rides on another body
         at = above[at].parent
     names = {joint.name for joint in series}
-    forced = {part.joint for part in spec.forces} | {part.joint for part in spec.gas_springs}
+    forced = {part.joint for part in spec.elements if part.between is None}
     forced |= {part.joint for part in spec.end_stops}
     driven = set(spec.active or ()) - set(spec.free)
     driven |= {joint for drive in spec.drives for joint in drive.factors}

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 from crane.common.errors import InputError
 from crane.common.samples import as_number
@@ -14,11 +15,26 @@ from crane.hydraulics.components import Hydraulics
 def _check(item: object, what: str, *positive: str) -> None:
     """Raise for numbers that are not finite, or negative where that has no meaning."""
     for name, value in vars(item).items():
-        if name == "joint":
+        if name in ("joint", "between"):
             continue
         number = as_number(value, f"{name} of {what}", "")
         if name in positive and number < 0:
             raise InputError(f"{name} of {what} is {number:g}, it must not be negative")
+
+
+def element_name(item: "Element") -> str:
+    """What errors call an element."""
+    if item.between is None:
+        return f"{item.kind} of '{item.joint}'"
+    return f"{item.kind} between {' and '.join(map(repr, item.between))}"
+
+
+def _check_ends(item: "Element") -> None:
+    """Raise for an element that acts on nothing, or between one frame and itself."""
+    if item.between is None and not item.joint:
+        raise InputError(f"a {item.kind} acts on nothing, give it a joint or two frames")
+    if item.between is not None and not len(item.between) == len(set(item.between)) == 2:
+        raise InputError(f"the {element_name(item)} needs two frames, give two")
 
 
 @dataclass(frozen=True)
@@ -167,40 +183,61 @@ class Friction:
 
 @dataclass(frozen=True)
 class ForceElement:
-    """A passive force along one tree joint: f = force - stiffness (q - rest) - damping v.
+    """A passive force along one tree joint, or along the distance of two frames.
+
+    f = force - stiffness (q - rest) - damping q'
+
+    with q the joint's coordinate, or the distance of the frames' origins: what is positive
+    pushes them apart.
 
     Attributes:
-        joint: The joint it acts on, active or passive.
+        joint: The joint it acts on, active or passive; none with `between`.
         stiffness: [N/m] or [N m/rad].
         rest: Coordinate at which the spring is slack [m] or [rad].
         damping: [N s/m] or [N m s/rad].
-        force: Constant force in the joint's positive direction [N] or [N m].
+        force: Constant force in the positive direction [N] or [N m].
+        between: Two links, on two bodies or on one and the world.
     """
 
-    joint: str
+    joint: str = ""
     stiffness: float = 0.0
     rest: float = 0.0
     damping: float = 0.0
     force: float = 0.0
+    between: tuple[str, str] | None = None
+    kind: ClassVar[str] = "force element"
 
     def __post_init__(self) -> None:
-        _check(self, f"force element of '{self.joint}'", "stiffness", "damping")
+        _check_ends(self)
+        what = element_name(self)
+        if self.joint and self.between:
+            raise InputError(f"{what} is on '{self.joint}', too, keep one of the two")
+        _check(self, what, "stiffness", "damping")
+
+    @property
+    def directed(self) -> bool:
+        """Whether it asks for a direction where its frames meet: it pushes there, or damps."""
+        return bool(self.damping or self.force + self.stiffness * self.rest)
 
 
 @dataclass(frozen=True)
 class GasSpring:
-    """Enclosed gas that acts along one tree joint: a counterbalance, an accumulator.
+    """Enclosed gas that acts along one tree joint, or along the distance of two frames.
 
-    f = area pressure (V0 / V)^exponent,    V = V0 + area (q - rest).
+    f = area pressure (V0 / V)^exponent,    V = V0 + area (q - rest)
+
+    with q the joint's coordinate, or the distance of the frames' origins: a counterbalance, an
+    accumulator, a gas strut.
 
     Attributes:
-        joint: The joint it acts on, active or passive.
+        joint: The joint it acts on, active or passive; with `between` a name of its own.
         area: Of the piston, positive where the gas drives the joint in its positive direction
             [m2], or [m3/rad].
         pressure: At `rest` [Pa], above the outside's.
         volume: V0, at `rest` [m3].
         rest: Coordinate they belong to [m] or [rad].
         exponent: Of the polytropic change; 1 at constant temperature, 1.4 without heat flow.
+        between: Two links, on two bodies or on one and the world.
     """
 
     joint: str
@@ -209,13 +246,61 @@ class GasSpring:
     volume: float
     rest: float = 0.0
     exponent: float = 1.0
+    between: tuple[str, str] | None = None
+    kind: ClassVar[str] = "gas spring"
 
     def __post_init__(self) -> None:
-        what = f"gas spring of '{self.joint}'"
+        _check_ends(self)
+        what = element_name(self)
         _check(self, what, "pressure", "volume", "exponent")
         for name in ("area", "volume", "exponent"):
             if getattr(self, name) == 0:
                 raise InputError(f"{name} of {what} is 0, give one")
+
+    @property
+    def directed(self) -> bool:
+        """Whether it asks for a direction where its frames meet."""
+        return self.pressure != 0
+
+
+@dataclass(frozen=True)
+class Rope:
+    """A rope or chain between two frames: it pulls where it is taut, and does nothing else.
+
+    f = stiffness d max(0, 1 + damping d') towards each other, d = distance - length > 0
+
+    as an end stop does at the distance `length`. So it never pushes, whatever its damping, and
+    its force does not jump where it gets taut.
+
+    Attributes:
+        between: Two links, on two bodies or on one and the world.
+        length: Up to which it is slack [m].
+        stiffness: [N/m].
+        damping: [s/m].
+    """
+
+    between: tuple[str, str]
+    length: float
+    stiffness: float
+    damping: float = 0.0
+    kind: ClassVar[str] = "rope"
+    joint: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        _check_ends(self)
+        what = element_name(self)
+        _check(self, what, "length", "stiffness", "damping")
+        for name in ("length", "stiffness"):
+            if getattr(self, name) == 0:
+                raise InputError(f"{name} of {what} is 0, give one")
+
+    @property
+    def directed(self) -> bool:
+        """Whether it asks for a direction where its frames meet: it is slack there."""
+        return False
+
+
+Element = ForceElement | GasSpring | Rope  # what may act between two frames
 
 
 @dataclass(frozen=True)
@@ -314,3 +399,9 @@ class MachineSpec:
     payload: Load | None = None  # what payload.mass hangs on the tip; None: a point mass
     free: tuple[str, ...] = ()  # independent coordinates that nothing drives
     drives: tuple[Drive, ...] = ()  # what the format says motors act on; (): the active joints
+    ropes: tuple[Rope, ...] = ()
+
+    @property
+    def elements(self) -> tuple[Element, ...]:
+        """Its force elements, gas springs and ropes, along joints and between frames."""
+        return (*self.forces, *self.gas_springs, *self.ropes)

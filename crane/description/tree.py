@@ -153,6 +153,17 @@ class Tree:
                 found.setdefault(joint.parent, []).append(joint)
         return found
 
+    def bodies(self) -> dict[str, str]:
+        """By link the one that all fixed to it and to each other are named after."""
+        above = {joint.child: joint for joint in self.joints.values()}
+        found: dict[str, str] = {}
+        for link in self.links:
+            body = link
+            while body in above and not above[body].moves:
+                body = above[body].parent
+            found[link] = body
+        return found
+
     def replacing(self, *parts: Link | Joint) -> "Tree":
         """The tree with other links and joints in place of those of the same names, or more."""
         links, joints = dict(self.links), dict(self.joints)

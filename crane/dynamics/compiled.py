@@ -10,7 +10,7 @@ from crane.closure.traced import Constants, folded
 from crane.codegen import Number, Program, Tape, largest
 from crane.common.samples import Array
 from crane.dynamics.recursion import Plan
-from crane.dynamics.traced import Sweep
+from crane.dynamics.traced import Spans, Sweep
 from crane.machine import Machine
 
 # What can be asked of a sweep, given a second argument x (n,): a_A for inverse and regressor,
@@ -48,6 +48,7 @@ class QuantityCode:
         numbers: See `numbers_of`.
         carriers: See `crane.dynamics.formulation`.
         plan: See `crane.dynamics.recursion`.
+        spans: See `crane.dynamics.traced.spans_of`.
 
     Attributes:
         size: Length of the result of one sample.
@@ -64,15 +65,16 @@ class QuantityCode:
         numbers: Array,
         carriers: tuple[int, ...],
         plan: Plan,
+        spans: Spans,
     ):
         fast = self._fast = machine.closure.fast
         self._numbers = numbers
         nq, n = machine.model.nv, len(machine.active)
-        key = (quantity, folded(numbers), carriers, plan)
+        key = (quantity, folded(numbers), carriers, plan, spans)
         if key not in fast.programs:
             fast.programs[key] = fast.kept(
                 ("quantity", *key),
-                lambda program: _build(program, quantity, fast, numbers, n, carriers, plan),
+                lambda program: _build(program, quantity, fast, numbers, n, carriers, plan, spans),
             )
         self._program = program = fast.programs[key]
         self.size = program.outputs("formula").size
@@ -138,11 +140,12 @@ def _build(
     n: int,
     carriers: tuple[int, ...],
     plan: Plan,
+    spans: Spans,
 ) -> None:
     tape = Tape()
     q, posture, loops = fast.trace(tape, 0, 2)
     constants = Constants(tape, 1, numbers)
-    sweep = Sweep(posture, loops, constants, q, tape.loads(3, 0, n), carriers, plan)
+    sweep = Sweep(posture, loops, constants, q, tape.loads(3, 0, n), carriers, plan, spans)
     outputs = QUANTITIES[quantity](sweep, tape.loads(3, n, n))
     program.add("formula", 4, outputs)
     tape = Tape()  # what is not finite is left to the checks that name it

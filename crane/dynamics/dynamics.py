@@ -12,7 +12,7 @@ from crane.dynamics.compiled import QuantityCode
 from crane.dynamics.formulation import carriers
 from crane.dynamics.joint_forces import JointForces
 from crane.dynamics.recursion import planned
-from crane.dynamics.traced import numbers_of
+from crane.dynamics.traced import numbers_of, spans_of
 from crane.dynamics.tree import TreeDynamics
 from crane.machine import Machine
 from crane.machine.masses import has_mass
@@ -64,6 +64,7 @@ class Dynamics:
         self.carriers = carriers(machine, formulation)
         self.plan = planned(machine) if formulation == "exact" else ()
         self.forces = JointForces(machine)
+        self.spans = spans_of(machine, self.forces)
         self.backend = backend if machine.closure.compiled else "pinocchio"
         self.tree = TreeDynamics(machine, self.forces, self.carriers)
         self._formulas: dict[str, QuantityCode | None] = {}
@@ -306,7 +307,9 @@ class Dynamics:
         if quantity not in self._formulas:
             try:
                 self._formulas[quantity] = (
-                    QuantityCode(quantity, self.machine, self.numbers, self.carriers, self.plan)
+                    QuantityCode(
+                        quantity, self.machine, self.numbers, self.carriers, self.plan, self.spans
+                    )
                     if self.backend == "compiled"
                     else None
                 )

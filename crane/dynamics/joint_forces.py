@@ -1,8 +1,12 @@
-"""Forces along single joints: friction, springs, dampers, constant forces, end stops."""
+"""Forces along joints and distances: friction, springs, dampers, gas, end stops, ropes."""
+
+from collections import Counter
 
 import numpy as np
 
 from crane.common.samples import Array
+from crane.description import ForceElement, GasSpring, Rope
+from crane.dynamics.lengths import Lengths, Pair
 from crane.machine import Machine
 
 _LAW = (
@@ -15,24 +19,31 @@ _JUMP = 1e300  # sharpness of a sign that is not smoothed
 
 
 class JointForces:
-    """Friction and passive forces of all joints of a machine, in tree coordinates.
+    """Friction and passive forces of a machine, as forces along the joints of its tree.
+
+    A passive force acts along a coordinate: that of a joint, or the distance of two frames. The
+    law is the same; what acts along a distance l acts on the joints with F dl/dv.
 
     The laws stand here in numpy and once more as formulas, `Sweep._law` of
     `crane.dynamics.traced`, on purpose: each is what checks the other.
 
     Args:
-        machine: The machine whose `friction`, `forces`, `gas_springs` and `end_stops` act.
+        machine: The machine whose `friction`, `forces`, `gas_springs`, `ropes` and `end_stops`
+            act.
 
     Attributes:
-        table: (nv, 19) per joint: Coulomb friction, its offset, viscous friction, its offset, one
-            over the smoothing velocity, stiction, one over its velocity; stiffness, damping,
-            constant force, energy of the spring at q = 0; stiffness and damping of the end stops,
-            lower and upper limit; force of a gas spring at rest, its area over its volume there,
-            where that is, exponent.
+        lengths: The distances that something acts along; m of them.
+        table: (nv + m, 19) per joint, then per distance: Coulomb friction, its offset, viscous
+            friction, its offset, one over the smoothing velocity, stiction, one over its velocity;
+            stiffness, damping, constant force, energy of the spring at q = 0; stiffness and
+            damping of the end stops, lower and upper limit; force of a gas spring at rest, its
+            area over its volume there, where that is, exponent. A rope is an end stop.
     """
 
     def __init__(self, machine: Machine):
-        table = self.table = np.zeros((machine.model.nv, len(_LAW)))
+        rows, pairs = _rows(machine)
+        self._joints, self.lengths = machine.model.nv, Lengths(machine, pairs)
+        table = self.table = np.zeros((self._joints + len(pairs), len(_LAW)))
         table[:, _LAW.index("sharpness")] = 1.0
         for joint, friction in machine.friction.items():
             table[machine.column(joint), :7] = (
@@ -44,33 +55,35 @@ class JointForces:
                 friction.stiction,
                 1.0 / friction.stribeck,
             )
-        for element in machine.forces:
-            # springs of one joint add up: sum k (q - rest) = K q - sum k rest
-            table[machine.column(element.joint), 7:11] += (
-                element.stiffness,
-                element.damping,
-                element.force + element.stiffness * element.rest,
-                0.5 * element.stiffness * element.rest**2,
-            )
         for stop in machine.end_stops:
             i = machine.column(stop.joint)
             lower, upper = machine.coordinates.lower, machine.coordinates.upper
             table[i, 11:15] = stop.stiffness, stop.damping, lower[i], upper[i]
         table[:, 15:] = 0.0, 1.0, 0.0, 1.0
-        for gas in machine.gas_springs:
-            table[machine.column(gas.joint), 15:] = (
-                gas.area * gas.pressure,
-                gas.area / gas.volume,
-                gas.rest,
-                gas.exponent,
-            )
+        for row, item in zip(rows, machine.elements, strict=True):
+            match item:
+                case ForceElement():
+                    # springs of one joint add up: sum k (q - rest) = K q - sum k rest
+                    table[row, 7:11] += (
+                        item.stiffness,
+                        item.damping,
+                        item.force + item.stiffness * item.rest,
+                        0.5 * item.stiffness * item.rest**2,
+                    )
+                case GasSpring():
+                    table[row, 15:] = (
+                        item.area * item.pressure,
+                        item.area / item.volume,
+                        item.rest,
+                        item.exponent,
+                    )
+                case Rope():
+                    table[row, 11:15] = item.stiffness, item.damping, 0.0, item.length
         (
-            self._coulomb, self._coulomb_offset, self._viscous, self._viscous_offset,
-            self._sharpness, self._stiction, self._stribeck,
             self._stiffness, self._damping, self._constant, self._slack,
             self._stop, self._stop_damping, self._lower, self._upper,
             self._gas, self._gas_share, self._gas_rest, self._gas_exponent,
-        ) = np.ascontiguousarray(table.T)  # fmt: skip
+        ) = np.ascontiguousarray(table[:, 7:].T)  # fmt: skip
 
     def friction(self, v: Array) -> Array:
         """Drive force that friction consumes at every joint.
@@ -84,16 +97,14 @@ class JointForces:
         Returns:
             (nv,) [N], [N m].
         """
-        sign = np.tanh(v * self._sharpness)
-        sticking = self._stiction * np.exp(-((v * self._stribeck) ** 2))
-        return (
-            (self._coulomb + sticking) * sign
-            + self._coulomb_offset
-            + (self._viscous + self._viscous_offset * sign) * v
-        )
+        law = self.table[: self._joints].T
+        coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck = law[:7]
+        sign = np.tanh(v * sharpness)
+        sticking = stiction * np.exp(-((v * stribeck) ** 2))
+        return (coulomb + sticking) * sign + coulomb_offset + (viscous + viscous_offset * sign) * v
 
     def passive(self, q: Array, v: Array) -> Array:
-        """Force of springs, dampers, constant forces and end stops on every joint.
+        """Force of springs, dampers, constant forces, gas, end stops and ropes on every joint.
 
         f = force - stiffness (q - rest) - damping v, and at end stops, d beyond the limit,
         f = -+ stiffness d max(0, 1 + damping d') (Hunt and Crossley, 1975), and of gas springs
@@ -106,12 +117,15 @@ class JointForces:
         Returns:
             (nv,) or (N, nv) [N], [N m].
         """
+        lengths, slopes = self.lengths.at(q)
+        rates = np.einsum("...ki,...i->...k", slopes, v)
+        q, v = np.concatenate([q, lengths], axis=-1), np.concatenate([v, rates], axis=-1)
         over, under = np.maximum(0.0, q - self._upper), np.maximum(0.0, self._lower - q)
         stopping = under * np.maximum(0.0, 1 - self._stop_damping * v) - over * np.maximum(
             0.0, 1 + self._stop_damping * v
         )
         springs = self._constant - self._stiffness * q - self._damping * v
-        return springs + self._stop * stopping + self.gas(q)
+        return self._on_joints(springs + self._stop * stopping + self._gas_law(q), slopes)
 
     def gas(self, q: Array) -> Array:
         """Force of the gas springs on every joint.
@@ -122,6 +136,16 @@ class JointForces:
         Returns:
             (nv,) or (N, nv) [N], [N m].
         """
+        lengths, slopes = self.lengths.at(q)
+        return self._on_joints(self._gas_law(np.concatenate([q, lengths], axis=-1)), slopes)
+
+    def _on_joints(self, along: Array, slopes: Array) -> Array:
+        """Forces along joints and distances (nv + m,) as forces along joints (nv,)."""
+        joints = along[..., : self._joints]
+        return joints + np.einsum("...ki,...k->...i", slopes, along[..., self._joints :])
+
+    def _gas_law(self, q: Array) -> Array:
+        """Of the gas along joints and distances (nv + m,)."""
         out = np.zeros_like(q)
         here = np.flatnonzero(self._gas)
         swollen = 1.0 + self._gas_share[here] * (q[..., here] - self._gas_rest[here])
@@ -129,11 +153,12 @@ class JointForces:
         return out
 
     def potential(self, q: Array) -> float:
-        """Energy stored in springs, constant forces, gas and end stops [J].
+        """Energy stored in springs, constant forces, gas, end stops and ropes [J].
 
         Args:
             q: (nq,) [m], [rad].
         """
+        q = np.concatenate([q, self.lengths.at(q)[0]])
         depth = np.maximum(0.0, np.maximum(q - self._upper, self._lower - q))
         here = np.flatnonzero(self._gas)
         swollen = 1.0 + self._gas_share[here] * (q[here] - self._gas_rest[here])
@@ -148,3 +173,23 @@ class JointForces:
             + self._slack.sum()
             + 0.5 * self._stop @ depth**2
         )
+
+
+def _rows(machine: Machine) -> tuple[list[int], list[Pair]]:
+    """The row of the table that each element is in, and the frames of the rows after the joints.
+
+    Springs between the same frames share one, as those on one joint do, and so do a spring, a gas
+    spring and a rope; of two gas springs or ropes each has its own.
+    """
+    found: dict[tuple[Pair, int], int] = {}
+    alike: Counter[tuple[str, Pair]] = Counter()
+    rows = []
+    for item in machine.elements:
+        if item.between is None:
+            rows.append(machine.column(item.joint))
+            continue
+        number = alike[item.kind, item.between]
+        if not isinstance(item, ForceElement):
+            alike[item.kind, item.between] += 1
+        rows.append(found.setdefault((item.between, number), machine.model.nv + len(found)))
+    return rows, [pair for pair, _ in found]

@@ -1,4 +1,4 @@
-"""One forward sweep (Kane's form) and the forces along joints as traced formulas."""
+"""One forward sweep (Kane's form) and the forces along joints and distances, as formulas."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -24,13 +24,16 @@ from crane.common.samples import Array
 from crane.dynamics.composite import Composite
 from crane.dynamics.inertia import Pair
 from crane.dynamics.joint_forces import JointForces
+from crane.dynamics.lengths import LEAST
 from crane.dynamics.moving import Moving
 from crane.dynamics.recursion import Plan, accelerations
 from crane.machine import Machine
 
-BODY, JOINT = 10, 19  # numbers per body and per joint
+BODY, JOINT = 10, 19  # numbers per body, and of the law of a joint or distance
+Effects = tuple[Number, Number, Number, Number]
 _SOLVED = 7  # freedoms up to which solving with M_A takes fewer operations than recursion
 _UPPER = np.triu_indices(3)
+Spans = tuple[tuple[int, int], ...]  # by distance the bodies of both ends; 0 is the world
 
 
 def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Array:
@@ -38,7 +41,7 @@ def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Arr
 
     Per body mass, COM (3), inertia about it (xx, xy, xz, yy, yz, zz) in the body's directions of
     the geometry; per joint the 19 numbers of `JointForces.table`; gravity (3); per joint its rotor
-    inertia.
+    inertia; per distance its 19 numbers, and where its two ends are on their bodies, likewise.
     """
     bodies = []
     for i, joint in enumerate(machine.coordinates.joints, start=1):
@@ -50,7 +53,19 @@ def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Arr
         bodies.append([inertia.mass, *(turn.T @ inertia.lever), *tensor[_UPPER]])
     gravity = machine.model.gravity.linear
     rotors = machine.model.armature
-    return np.concatenate([np.ravel(bodies), np.ravel(forces.table), gravity, rotors])
+    joints, lengths = np.split(forces.table, [len(bodies)])
+    numbers = [np.ravel(bodies), np.ravel(joints), gravity, rotors]
+    for law, ends in zip(lengths, forces.lengths.ends, strict=True):
+        turns = (geometry.turns[machine.coordinates.bodies[joint]] for joint, _ in ends)
+        places = (turn.T @ place for turn, (_, place) in zip(turns, ends, strict=True))
+        numbers += [law, *places]
+    return np.concatenate(numbers)
+
+
+def spans_of(machine: Machine, forces: JointForces) -> Spans:
+    """The bodies that the ends of each distance of `JointForces.lengths` are on."""
+    bodies = machine.coordinates.bodies
+    return tuple((bodies[one], bodies[two]) for (one, _), (two, _) in forces.lengths.ends)
 
 
 class Sweep:
@@ -65,6 +80,7 @@ class Sweep:
         carriers: See `crane.dynamics.formulation`.
         plan: How forward dynamics goes through the machine's clusters; see
             `crane.dynamics.recursion`.
+        spans: See `spans_of`.
 
     Attributes:
         gamma: Rows of gamma by joint.
@@ -81,8 +97,9 @@ class Sweep:
         v_a: Sequence[Number],
         carriers: Sequence[int],
         plan: Plan = (),
+        spans: Spans = (),
     ):
-        self._carriers, self._plan = carriers, plan
+        self._carriers, self._plan, self._spans = carriers, plan, spans
         self._posture, self._loops, self._q = posture, loops, q
         self._size = len(posture.geometry.parents)
         self._n = len(v_a)
@@ -92,6 +109,10 @@ class Sweep:
         gravity = constants.vector((BODY + JOINT) * bodies)
         self._gravity = times(posture.rotation[0], gravity)
         self._rotors: Vector = [0.0, *constants.vector((BODY + JOINT) * bodies + 3, bodies)]
+        after = (BODY + JOINT + 1) * bodies + 3
+        self._span_numbers = [
+            constants.vector(after + (JOINT + 6) * k, JOINT + 6) for k in range(len(spans))
+        ]
         self.gamma = loops.gamma
         self.rates: Vector = [0.0, *(dot(self.gamma[i], v_a) for i in range(1, self._size))]
         # the loops' drift is that of the whole machine whatever carries a body
@@ -230,8 +251,8 @@ class Sweep:
         ]
         return self._projected(self._along_tree(wrenches))
 
-    def _law(self, i: int) -> tuple[Number, Number, Number, Number]:
-        """Of joint i: passive force, friction, power taken out, energy stored.
+    def _law(self, law: Vector, q: Number, rate: Number) -> Effects:
+        """Of a joint or distance: passive force, friction, power taken out, energy stored.
 
         Written apart from `JointForces`, which has the same in numpy, so that each checks the
         other.
@@ -240,8 +261,7 @@ class Sweep:
             coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck,
             stiffness, damping, constant, slack, stop, stop_damping, lower, upper,
             gas, gas_share, gas_rest, gas_exponent,
-        ) = self._laws[i - 1]  # fmt: skip
-        q, rate = self._q[i - 1], self.rates[i]
+        ) = law  # fmt: skip
         friction = viscous * rate + coulomb_offset
         if coulomb != 0.0 or viscous_offset != 0.0 or stiction != 0.0:
             sign = apply("tanh", sharpness * rate)
@@ -272,11 +292,59 @@ class Sweep:
         return force, friction, lost, stored
 
     @cached_property
-    def _at_joints(self) -> tuple[Vector, Vector, Vector, Vector]:
-        """`_law` of all joints (nb + 1,), one quantity after the other."""
-        laws = [(0.0,) * 4, *(self._law(i) for i in range(1, self._size))]
-        force, friction, lost, stored = (list(column) for column in zip(*laws, strict=True))
-        return force, friction, lost, stored
+    def _at_joints(self) -> list[Effects]:
+        """`_law` of all joints (nb + 1,)."""
+        laws = (self._law(*x) for x in zip(self._laws, self._q, self.rates[1:], strict=True))
+        return [(0.0,) * 4, *laws]
+
+    @cached_property
+    def _at_lengths(self) -> list[tuple[dict[int, Number], Effects]]:
+        """Of every distance dl/dv by joint, and `_law`; see `crane.dynamics.lengths`.
+
+        The force along it is a wrench [u; p_2 x u] on the second body, and its reaction on the
+        first, so what carries both feels nothing.
+        """
+        posture, out = self._posture, []
+        for bodies, numbers in zip(self._spans, self._span_numbers, strict=True):
+            law, places = numbers[:JOINT], (numbers[JOINT:-3], numbers[-3:])
+            one, two = (
+                add(posture.origin[body], times(posture.rotation[body], place))
+                for body, place in zip(bodies, places, strict=True)
+            )
+            way = subtract(two, one)
+            length = apply("sqrt", dot(way, way))
+            direction = scale(1.0 / maximum(length, LEAST), way)
+            moment = cross(two, direction)
+            before, behind = (_carriers(posture.geometry.parents, body) for body in bodies)
+            slopes: dict[int, Number] = {}
+            for i in sorted(before ^ behind):
+                linear, angular = posture.columns[i]
+                slope = dot(direction, linear) + dot(moment, angular)
+                slopes[i] = slope if i in behind else -slope
+            rate = dot(list(slopes.values()), [self.rates[i] for i in slopes])
+            out.append((slopes, self._law(law, length, rate)))
+        return out
+
+    @cached_property
+    def _passive(self) -> Vector:
+        """f, passive forces along the joints (nb + 1,)."""
+        out = [force for force, _, _, _ in self._at_joints]
+        for slopes, (force, _, _, _) in self._at_lengths:
+            for i, slope in slopes.items():
+                out[i] = out[i] + force * slope
+        return out
+
+    @property
+    def _friction(self) -> Vector:
+        """tau_F, friction along the joints (nb + 1,)."""
+        return [friction for _, friction, _, _ in self._at_joints]
+
+    def _sum(self, which: int) -> Number:
+        """Of what `_law` gives, over all joints and distances."""
+        total: Number = 0.0
+        for effects in (*self._at_joints, *(effects for _, effects in self._at_lengths)):
+            total = total + effects[which]
+        return total
 
     @property
     def slopes(self) -> Vector:
@@ -292,17 +360,17 @@ class Sweep:
     @property
     def passive(self) -> Vector:
         """gamma^T f."""
-        return self._projected(self._at_joints[0])
+        return self._projected(self._passive)
 
     @property
     def friction(self) -> Vector:
         """gamma^T tau_F."""
-        return self._projected(self._at_joints[1])
+        return self._projected(self._friction)
 
     @property
     def dissipation(self) -> Number:
-        """Power that friction, dampers and end stops take out [W]."""
-        return dot(self._at_joints[2], [1.0] * self._size)
+        """Power that friction, dampers, end stops and ropes take out [W]."""
+        return self._sum(2)
 
     @cached_property
     def kinetic(self) -> Number:
@@ -320,8 +388,8 @@ class Sweep:
 
     @cached_property
     def potential(self) -> Number:
-        """Weights, springs, constant forces, end stops [J]."""
-        total = dot(self._at_joints[3], [1.0] * self._size)
+        """Weights, springs, constant forces, gas, end stops, ropes [J]."""
+        total = self._sum(3)
         for mass, centre, _ in self._bodies:
             height = subtract(centre, self._posture.origin[0])
             total = total - mass * dot(self._gravity, height)
@@ -334,8 +402,7 @@ class Sweep:
 
     def _forces(self, friction: bool) -> Vector:
         """Forces along the joints (nb + 1,) that nobody commands."""
-        passive, braking, _, _ = self._at_joints
-        return subtract(passive, braking) if friction else passive
+        return subtract(self._passive, self._friction) if friction else self._passive
 
     def forward(self, tau: Sequence[Number], friction: bool) -> Vector:
         """M_A^-1 (tau - bias + passive [- friction])."""
@@ -385,6 +452,15 @@ class Sweep:
                 for k in range(self._n):
                     out[k].append(row[k] * rate)
         return out
+
+
+def _carriers(parents: Sequence[int], body: int) -> set[int]:
+    """The joints that carry a body."""
+    found = set()
+    while body:
+        found.add(body)
+        body = parents[body]
+    return found
 
 
 def _body_row(u: Vector, r: Vector, w: Vector, e: Vector, a: Vector) -> Vector:

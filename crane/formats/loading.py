@@ -16,6 +16,7 @@ from crane.formats.ambiguity import warn_of_assemblies
 from crane.formats.home import warn_of_home
 from crane.formats.machine_file.read import read
 from crane.machine.assemble import assemble, closed, home_guess
+from crane.machine.between import check_elements
 from crane.machine.drives import free_joints, motors
 from crane.machine.machine import Machine, fixed
 from crane.machine.masses import check_masses
@@ -87,6 +88,7 @@ def _load(
     warn_of_home(spec, closure)
     warn_of_assemblies(spec, closure, guess)
     check_masses(spec, model, closure)
+    check_elements(spec, closure)
     coordinates = closure.equations.coordinates
     lower, upper = coordinates.lower, coordinates.upper
     return Machine(
@@ -103,6 +105,7 @@ def _load(
         friction=MappingProxyType(dict(spec.friction)),
         forces=spec.forces,
         gas_springs=spec.gas_springs,
+        ropes=spec.ropes,
         end_stops=spec.end_stops,
         tip=spec.tip,
         tasks=MappingProxyType(dict(spec.tasks)),

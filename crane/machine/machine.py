@@ -19,11 +19,13 @@ from crane.common.samples import Array, as_number, as_sample, as_samples
 from crane.description import (
     Chain,
     Drive,
+    Element,
     EndStop,
     ForceElement,
     Friction,
     GasSpring,
     PIGains,
+    Rope,
     Task,
     bundled,
     examples,
@@ -33,6 +35,7 @@ from crane.description.rigid import loaded
 from crane.description.sources import WITH
 from crane.description.tree import Tree
 from crane.hydraulics import Hydraulics
+from crane.machine.between import misplaced
 
 _LIMIT_SLACK = 1e-9  # [rad], [machine's size] beyond a limit that counts as on it
 
@@ -73,7 +76,8 @@ class Machine:
         upper: (n,) upper limits of the active joints [m], [rad].
         friction: Friction by joint.
         forces: Passive force elements.
-        gas_springs: Enclosed gas along joints, at most one per joint.
+        gas_springs: Enclosed gas along joints, at most one per joint, and between frames.
+        ropes: Ropes between frames.
         end_stops: End stops.
         tip: Name of the tip's frame.
         tasks: Named reference motions.
@@ -103,6 +107,7 @@ class Machine:
     friction: Mapping[str, Friction]
     forces: tuple[ForceElement, ...]
     gas_springs: tuple[GasSpring, ...]
+    ropes: tuple[Rope, ...]
     end_stops: tuple[EndStop, ...]
     tip: str | None
     tasks: Mapping[str, Task]
@@ -135,6 +140,11 @@ class Machine:
     def home(self) -> Array:
         """(nv,) the home posture, closed."""
         return self.closure.home
+
+    @property
+    def elements(self) -> tuple[Element, ...]:
+        """Its force elements, gas springs and ropes, along joints and between frames."""
+        return (*self.forces, *self.gas_springs, *self.ropes)
 
     @property
     def undriven(self) -> tuple[str, ...]:
@@ -252,21 +262,29 @@ class Machine:
         friction: Mapping[str, Friction] | None = None,
         forces: tuple[ForceElement, ...] | None = None,
         gas_springs: tuple[GasSpring, ...] | None = None,
+        ropes: tuple[Rope, ...] | None = None,
         end_stops: tuple[EndStop, ...] | None = None,
         hydraulics: Hydraulics | None = None,
     ) -> "Machine":
-        """The same machine with other friction, forces, gas springs, end stops or hydraulics.
+        """The same machine with other friction, springs, ropes, end stops or hydraulics.
 
         Raises:
             InputError: A joint is unknown, has two gas springs, an end stop or a cylinder but no
-                limits, or a cylinder without being active.
+                limits, or a cylinder without being active; or the frames of an element are
+                unknown, make one body or meet at home.
         """
         for joint in friction or {}:
             self.column(joint)
-        for force in forces or ():
-            self.column(force.joint)
+        elements: list[Element] = [*(forces or ()), *(gas_springs or ()), *(ropes or ())]
+        for item in elements:
+            if item.between is None:
+                self.column(item.joint)
+            else:
+                for link in item.between:
+                    self.frame(link)
+        for problem in misplaced(self.closure, elements):
+            raise InputError(problem)
         for spring in gas_springs or ():
-            self.column(spring.joint)
             if [other.joint for other in gas_springs or ()].count(spring.joint) > 1:
                 raise InputError(f"joint '{spring.joint}' has two gas springs, keep one")
         for stop in end_stops or ():
@@ -289,6 +307,7 @@ class Machine:
             friction=self.friction if friction is None else MappingProxyType(dict(friction)),
             forces=self.forces if forces is None else tuple(forces),
             gas_springs=self.gas_springs if gas_springs is None else tuple(gas_springs),
+            ropes=self.ropes if ropes is None else tuple(ropes),
             end_stops=self.end_stops if end_stops is None else tuple(end_stops),
             hydraulics=self.hydraulics if hydraulics is None else hydraulics,
         )

@@ -36,7 +36,8 @@ _PER_CORE = 8  # processes: more would wait for each other, and each has the mac
 _IDLE = ("control", "supply", "oil", "cylinder", "valve", "valve_control")
 # What of a machine its files describe.
 _DESCRIBED = (
-    "tree", "active", "friction", "forces", "gas_springs", "end_stops", "tasks", "hydraulics",
+    "tree", "active", "friction", "forces", "gas_springs", "ropes", "end_stops", "tasks",
+    "hydraulics",
 )  # fmt: skip
 
 Progress = Callable[[float], None]

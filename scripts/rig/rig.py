@@ -88,6 +88,7 @@ class Rig:
         self.plant = plant.replace(
             forces=machine.forces,
             gas_springs=machine.gas_springs,
+            ropes=machine.ropes,
             end_stops=machine.end_stops,
         )
         random = np.random.default_rng([seed, 1])

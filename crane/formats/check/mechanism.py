@@ -16,6 +16,7 @@ from crane.description.findings import Findings, flag
 from crane.formats.ambiguity import warn_of_assemblies
 from crane.formats.home import warn_of_home
 from crane.machine.assemble import assemble, closed, home_guess
+from crane.machine.between import check_elements
 from crane.machine.masses import check_masses
 
 _OPEN = 1e-6  # [rad], [machine's size] from which on a loop is said to be open
@@ -51,6 +52,7 @@ def check_mechanism(spec: MachineSpec, found: Findings) -> Closure | None:
         flag(error)
         loops.remove(idle[0])
     check_masses(spec, model, closure)
+    check_elements(spec, closure)
     _warn_of_limits(spec, closure)
     warn_of_home(spec, closure)
     warn_of_assemblies(spec, closure, guess, thorough=True)

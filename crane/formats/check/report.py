@@ -246,7 +246,9 @@ def _printable(text: str) -> str:
 def _summary(spec: MachineSpec, closure: Closure) -> str:
     residual = float(closure.residual(closure.home))
     joints, freedom = closure.model.njoints - 1, closure.degrees_of_freedom
+    between = sum(x.between is not None for x in spec.elements)
+    elements = f"{between} element{'s' * (between > 1)} between frames, " if between else ""
     return (
         f"{_printable(spec.name)}: {joints} joints, {len(spec.loops)} loops, {freedom} degrees of "
-        f"freedom, loops closed to {residual:.1e} m at home"
+        f"freedom, {elements}loops closed to {residual:.1e} m at home"
     )

@@ -1,10 +1,10 @@
-"""The sections of a machine file on forces along joints."""
+"""The sections of a machine file on forces along joints and between frames."""
 
 import warnings
 
 from crane.common.errors import CraneWarning
 from crane.description.findings import recoverable
-from crane.description.spec import EndStop, ForceElement, Friction, GasSpring
+from crane.description.spec import EndStop, ForceElement, Friction, GasSpring, Rope, element_name
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
 
@@ -52,23 +52,27 @@ def _friction(joint: str, item: Section) -> Friction:
 def read_forces(top: Section, tree: TreeBuilder) -> tuple[ForceElement, ...]:
     """Springs, dampers and constant forces."""
     forces = []
-    keys = ("joint", "stiffness", "rest", "damping", "force")
+    keys = ("joint", "between", "stiffness", "rest", "damping", "force")
     for item in top.sections("forces", "force element of", *keys):
         with recoverable():
-            forces.append(_force_element(tree.joint(item), item))
+            forces.append(_force_element(item, tree))
     return tuple(forces)
 
 
-def _force_element(joint: str, item: Section) -> ForceElement:
+def _force_element(item: Section, tree: TreeBuilder) -> ForceElement:
+    between = tree.frames(item) if "between" in item else None
+    if between and "joint" in item:
+        raise item.fail("joint", "an element is on a joint or between frames, keep one of the two")
     element = ForceElement(
-        joint,
+        "" if between else tree.joint(item),
         stiffness=item.number("stiffness", 0.0, minimum=0.0),
         rest=item.number("rest", 0.0),
         damping=item.number("damping", 0.0, minimum=0.0),
         force=item.number("force", 0.0),
+        between=between,
     )
     if not (element.stiffness or element.damping or element.force):
-        problem = f"the element on '{joint}' does nothing, give it stiffness, damping or force"
+        problem = f"the {element_name(element)} does nothing, give stiffness, damping or force"
         raise item.fail(None, problem)
     return element
 
@@ -86,17 +90,19 @@ def read_rotors(top: Section, tree: TreeBuilder) -> dict[str, float]:
 
 
 def read_gas_springs(top: Section, tree: TreeBuilder) -> tuple[GasSpring, ...]:
-    """Enclosed gas along joints."""
+    """Enclosed gas along joints, and between frames under names of their own."""
     springs = []
-    keys = ("area", "pressure", "volume", "rest", "exponent")
-    for joint, item in top.mappings("gas_springs", "gas spring of", *keys):
+    keys = ("area", "pressure", "volume", "rest", "exponent", "between")
+    for name, item in top.mappings("gas_springs", "gas spring of", *keys):
         with recoverable():
-            tree.check_joint(joint, item.where())
-            springs.append(_gas_spring(joint, item))
+            between = tree.frames(item) if "between" in item else None
+            if not between:
+                tree.check_joint(name, item.where())
+            springs.append(_gas_spring(name, between, item))
     return tuple(springs)
 
 
-def _gas_spring(joint: str, item: Section) -> GasSpring:
+def _gas_spring(joint: str, between: tuple[str, str] | None, item: Section) -> GasSpring:
     area = item.number("area")
     volume = item.number("volume", minimum=0.0)
     exponent = item.number("exponent", GasSpring.exponent, minimum=0.0)
@@ -104,7 +110,23 @@ def _gas_spring(joint: str, item: Section) -> GasSpring:
         if value == 0:
             raise item.fail(key, f"'{key}' of gas spring of '{joint}' is 0, give one")
     pressure, rest = item.number("pressure", minimum=0.0), item.number("rest", 0.0)
-    return GasSpring(joint, area, pressure, volume, rest, exponent)
+    return GasSpring(joint, area, pressure, volume, rest, exponent, between)
+
+
+def read_ropes(top: Section, tree: TreeBuilder) -> tuple[Rope, ...]:
+    """Ropes between frames."""
+    ropes = []
+    for item in top.sections("ropes", "rope", "between", "length", "stiffness", "damping"):
+        with recoverable():
+            between = tree.frames(item)
+            length, stiffness = (item.number(key, minimum=0.0) for key in ("length", "stiffness"))
+            for key, value in (("length", length), ("stiffness", stiffness)):
+                if value == 0:
+                    raise item.fail(key, f"'{key}' of {item.title} is 0, give one")
+            ropes.append(
+                Rope(between, length, stiffness, item.number("damping", 0.0, minimum=0.0))
+            )
+    return tuple(ropes)
 
 
 def read_end_stops(top: Section, tree: TreeBuilder) -> tuple[EndStop, ...]:

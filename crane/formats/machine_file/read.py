@@ -29,6 +29,7 @@ from crane.formats.machine_file.forces import (
     read_forces,
     read_friction,
     read_gas_springs,
+    read_ropes,
     read_rotors,
 )
 from crane.formats.machine_file.open_loops import warn_of_open_loops
@@ -44,7 +45,7 @@ Part = TypeVar("Part")
 
 _KEYS = (
     "name", "source", "chains", "loops", "active", "free", "drives", "home", "friction", "forces",
-    "gas_springs", "end_stops", "rotor_inertia", "couplings",
+    "gas_springs", "ropes", "end_stops", "rotor_inertia", "couplings",
     "tip", "payload", "tasks", "control", "hydraulics",
 )  # fmt: skip
 
@@ -142,7 +143,7 @@ def _read_machine(path: Path) -> MachineSpec:
     return MachineSpec(
         name, source, path, chains, with_rotors(tree.tree, rotors), loops, active, home, friction,
         forces, gas_springs, end_stops, tip, tasks, control, hydraulics, couplings, where, payload,
-        free, _part(_drives, (), top, tree),
+        free, _part(_drives, (), top, tree), _part(read_ropes, (), top, tree),
     )  # fmt: skip
 
 

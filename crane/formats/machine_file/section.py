@@ -338,12 +338,17 @@ class Section:
                 flag(self.fail(key, problem))
                 self.complete = False
                 continue
-            name = item.get("name", item.get("joint"))
-            section = Section(
-                item, f"{title} '{name}'" if isinstance(name, str) else f"a {title}", self._file
-            )
+            section = Section(item, _titled(title, item), self._file)
             section.only(*keys)
             yield section
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._data)
+
+
+def _titled(title: str, item: _Map) -> str:
+    """What errors call an item of a list: by its name, its joint or its two frames."""
+    name = item.get("name", item.get("joint", item.get("between")))
+    if isinstance(name, list) and all(isinstance(frame, str) for frame in name):
+        return f"the {title.removesuffix(' of')} between {' and '.join(map(repr, name))}"
+    return f"{title} '{name}'" if isinstance(name, str) else f"a {title}"

@@ -121,6 +121,26 @@ class TreeBuilder:
         self.check_joint(joint, section.where("joint"))
         return joint
 
+    def frames(self, section: Section) -> tuple[str, str]:
+        """The two frames that a section is between, on two bodies.
+
+        Raises:
+            DescriptionError: There are not two, one is unknown, or both are on one body.
+        """
+        links, where = section.names("between"), section.where("between")
+        if len(links) != 2:
+            raise section.fail("between", f"{section.title} is between two frames, name two")
+        for link in links:
+            self.check_link(link, where, "the frame")
+        one, two = links
+        body = self._body.get(one)
+        if body is not None and body == self._body.get(two):
+            raise section.fail(
+                "between",
+                f"'{one}' and '{two}' are both on the body '{body}', choose frames of two bodies",
+            )
+        return one, two
+
     def check_loop(self, loop: LoopSpec) -> None:
         """Raise for a loop between frames that do not move against each other."""
         body = self._body.get(loop.predecessor)

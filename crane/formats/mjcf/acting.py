@@ -1,15 +1,16 @@
-"""What acts along joints of a MJCF: friction, springs, rotors, of tendons and actuators too.
+"""What acts in a MJCF: friction, springs, rotors of joints, tendons and actuators.
 
 A fixed tendon or an actuator of one joint has the length L = c q, so a spring, damper or rotor of
 the size s along L counts c^2 s at the joint, and friction |c| s. Several joints of one tendon are
-bound by it, which no element of a machine does.
+bound by it, which no element of a machine does. The spring and damper of a tendon straight from
+site to site are a force element between them, or a rope where the spring is slack from 0 on.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from crane.description.spec import ForceElement, Friction
+from crane.description.spec import ForceElement, Friction, Rope
 from crane.formats.mjcf.file import MujocoFile, rows
 
 _ALONG = {  # fields of tendons, by the words that tell of them
@@ -23,18 +24,20 @@ _ALONG = {  # fields of tendons, by the words that tell of them
 
 @dataclass
 class Acting:
-    """What acts along joints, by their names.
+    """What acts along joints, by their names, and between frames.
 
     Attributes:
         viscous: [N s/m], [N m s/rad].
         coulomb: [N], [N m].
         springs: Force elements.
+        ropes: Ropes.
         rotors: Rotor inertias [kg], [kg m2].
     """
 
     viscous: dict[str, float] = field(default_factory=dict)
     coulomb: dict[str, float] = field(default_factory=dict)
     springs: list[ForceElement] = field(default_factory=list)
+    ropes: list[Rope] = field(default_factory=list)
     rotors: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -47,12 +50,15 @@ class Acting:
         }
 
 
-def read_acting(mjcf: MujocoFile, parts: Mapping[int, Sequence[str]]) -> Acting:
-    """All that acts along single joints; what does not is noted as left out.
+def read_acting(
+    mjcf: MujocoFile, parts: Mapping[int, Sequence[str]], sites: Mapping[int, str]
+) -> Acting:
+    """All that acts along single joints and between sites; the rest is noted as left out.
 
     Args:
         mjcf: The file.
         parts: Joints that each joint of MuJoCo became.
+        sites: Link of each site.
     """
     found = Acting()
     for joint, names in parts.items():
@@ -61,7 +67,7 @@ def read_acting(mjcf: MujocoFile, parts: Mapping[int, Sequence[str]]) -> Acting:
         else:
             _of_joint(mjcf.model, joint, names[0], found)
     for tendon in range(mjcf.model.ntendon):
-        _of_tendon(mjcf, tendon, parts, found)
+        _of_tendon(mjcf, tendon, parts, sites, found)
     for actuator in range(len(mjcf.model.actuator_trntype)):
         _of_actuator(mjcf, actuator, parts, found)
     return found
@@ -78,6 +84,17 @@ def fixed_tendon(mjcf: MujocoFile, tendon: int) -> dict[int, float] | None:
         joint = int(model.wrap_objid[wrap])
         found[joint] = found.get(joint, 0.0) + float(model.wrap_prm[wrap])
     return {joint: factor for joint, factor in found.items() if factor}
+
+
+def straight(mjcf: MujocoFile, tendon: int) -> tuple[int, int] | None:
+    """The sites of a tendon straight from one to another, on two bodies; None for others."""
+    model, start = mjcf.model, mjcf.model.tendon_adr[tendon]
+    wraps = range(start, start + model.tendon_num[tendon])
+    sites = [int(model.wrap_objid[i]) for i in wraps]
+    if [mjcf.kind("Wrap", model.wrap_type[i]) for i in wraps] != ["SITE"] * 2:
+        return None
+    one, two = (int(model.body_weldid[model.site_bodyid[site]]) for site in sites)
+    return None if one == two else (sites[0], sites[1])
 
 
 def isotropic(mjcf: MujocoFile, joint: int) -> float:
@@ -127,7 +144,11 @@ def _of_several(mjcf: MujocoFile, joint: int, names: Sequence[str], found: Actin
 
 
 def _of_tendon(
-    mjcf: MujocoFile, tendon: int, parts: Mapping[int, Sequence[str]], found: Acting
+    mjcf: MujocoFile,
+    tendon: int,
+    parts: Mapping[int, Sequence[str]],
+    sites: Mapping[int, str],
+    found: Acting,
 ) -> None:
     model, factors = mjcf.model, fixed_tendon(mjcf, tendon)
     lost = [
@@ -149,8 +170,32 @@ def _of_tendon(
         _add(found.coulomb, name, abs(c) * float(model.tendon_frictionloss[tendon]))
         _add(found.rotors, name, c * c * _value(model, "tendon_armature", tendon))
         lost = [what for what in lost if what not in ("friction", "armature")]
+    elif ends := straight(mjcf, tendon):
+        acting = _between((sites[ends[0]], sites[ends[1]]), mjcf, tendon, found)
+        lost = [what for what in lost if what not in acting]
     for what in lost:
         mjcf.lose(f"{what} of tendons", mjcf.tendon(tendon))
+
+
+def _between(links: tuple[str, str], mjcf: MujocoFile, tendon: int, found: Acting) -> list[str]:
+    """Add the spring and damper of a tendon between two sites; which of both it is."""
+    model, acting = mjcf.model, []
+    stiffness = damping = rest = 0.0
+    lower, upper = (float(x) for x in model.tendon_lengthspring[tendon])
+    if tendon not in rows(model, "tendon_stiffnesspoly") and (lower == upper or lower == 0):
+        acting.append("stiffness")
+        size = float(model.tendon_stiffness[tendon])
+        if lower == upper:
+            stiffness, rest = size, upper
+        elif size:
+            found.ropes.append(Rope(links, length=upper, stiffness=size))
+    if tendon not in rows(model, "tendon_dampingpoly"):
+        acting.append("damping")
+        damping = float(model.tendon_damping[tendon])
+    if stiffness or damping:
+        rest = rest if stiffness else 0.0
+        found.springs.append(ForceElement("", stiffness, rest, damping, between=links))
+    return acting
 
 
 def _of_actuator(

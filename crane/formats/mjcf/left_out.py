@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from crane.formats.mjcf.acting import fixed_tendon
+from crane.formats.mjcf.acting import fixed_tendon, straight
 from crane.formats.mjcf.file import MujocoFile, rows
 
 _GRAVITY = (0.0, 0.0, -9.81)
@@ -25,9 +25,16 @@ def note_the_rest(mjcf: MujocoFile) -> None:
     _note_joints(mjcf, off)
     _note_actuators(mjcf, off)
     model = mjcf.model
-    spatial = [i for i in range(model.ntendon) if fixed_tendon(mjcf, i) is None]
+    spatial = [
+        i
+        for i in range(model.ntendon)
+        if fixed_tendon(mjcf, i) is None and straight(mjcf, i) is None
+    ]
     if spatial:
-        mjcf.lose("tendons in space", *map(mjcf.tendon, spatial))
+        mjcf.lose(
+            "tendons that are not straight from a site to one of another body",
+            *map(mjcf.tendon, spatial),
+        )
     for what, field in _SEEN.items():
         if count := int(getattr(model, field, 0)):
             mjcf.lose(f"{count} {what}{'s' * (count > 1)}")

@@ -60,7 +60,7 @@ class _Reader:
         for link, (body, place) in frames.made.items():
             self._add_link(link, frames.where[link])
             self._fix(link, self.bodies[body], place)
-        acting, drives = read_acting(mjcf, self.parts), read_drives(mjcf, self.parts)
+        acting, drives = read_acting(mjcf, self.parts, frames.sites), read_drives(mjcf, self.parts)
         note_the_rest(mjcf)
         urdf = Urdf(
             mjcf.file,
@@ -96,6 +96,7 @@ class _Reader:
             home=home,
             friction=acting.friction,
             forces=tuple(acting.springs),
+            ropes=tuple(acting.ropes),
             tip=tip,
             couplings=couplings,
             where=places(loops, couplings) | homes,

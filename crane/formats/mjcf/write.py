@@ -10,7 +10,8 @@ from lxml import etree
 
 from crane.common.errors import CraneWarning, InputError
 from crane.common.output import replacing
-from crane.description import Coupling, Drive, LoopSpec
+from crane.description import Coupling, Drive, ForceElement, LoopSpec, Rope
+from crane.description.spec import element_name
 from crane.formats.parts import (
     ends,
     finished,
@@ -35,8 +36,9 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
     the axis; couplings `joint`, of more than two joints `tendon`. Drives have a motor each, by a
     fixed tendon where they act along more than one joint; where drives are not the active joints,
     a text names these. Frames are sites, the home posture is the key "home". Coulomb and viscous
-    friction, springs and rotor inertias are there; the damping of force elements becomes viscous
-    friction. A warning names what else is left out. There are no shapes, so nothing collides.
+    friction, springs and rotor inertias are there; the damping of force elements on joints becomes
+    viscous friction; force elements and ropes between frames are spatial tendons. A warning names
+    what else is left out. There are no shapes, so nothing collides.
 
     Args:
         machine: The machine, as it is: with its changes, locks and payload.
@@ -46,7 +48,8 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
         InputError: A loop or a joint is of a kind that MJCF has not.
         OutputError: It cannot be written.
     """
-    content = _Writer(machine).content()
+    writer = _Writer(machine)
+    content = writer.content()
     with replacing(path) as part:
         part.write_bytes(content)
     lost = plain_friction(machine) + only_in_machine_files(machine)
@@ -54,7 +57,8 @@ def write_mjcf(machine: Machine, path: str | Path) -> None:
         machine.joints[column + i] for column in machine.coordinates.floating for i in range(6)
     ]
     lost += [f"the friction of {joint}" for joint in floating if joint in machine.friction]
-    lost += [f"the constant force on {item.joint}" for item in machine.forces if item.force]
+    lost += [f"the constant force on {x.joint}" for x in machine.forces if x.force and x.joint]
+    lost += writer.lost
     left_out(machine, "MJCF", lost)
 
 
@@ -84,6 +88,7 @@ class _Writer:
         self.bodies: dict[int, etree._Element] = {}  # by index of the joint
         self.home: list[float] = []
         self.names: set[str] = set()  # of sites
+        self.lost: list[str] = []
 
     def content(self) -> bytes:
         """All of the file."""
@@ -106,6 +111,10 @@ class _Writer:
             self._coupling(equality, tendons, coupling)
         for drive in self.machine.drives:
             self._drive(actuator, tendons, drive)
+        acting: list[ForceElement | Rope] = [*self.machine.forces, *self.machine.ropes]
+        for item in acting:
+            if item.between is not None:
+                self._between(tendons, item, item.between)
         self.root.extend(part for part in (tendons, equality, actuator) if len(part))
         key = add(add(self.root, "keyframe"), "key", name="home", qpos=text(self.home))
         assert key is not None
@@ -265,6 +274,35 @@ class _Writer:
         polynomial = text([coupling.offset, 0, 0, 0, 0])
         etree.SubElement(equality, "tendon", {**stiff, "tendon1": tendon, "polycoef": polynomial})
 
+    def _between(
+        self, tendons: etree._Element, item: ForceElement | Rope, links: tuple[str, str]
+    ) -> None:
+        """A tendon straight from frame to frame.
+
+        MuJoCo's springs have no constant force, so that of an element moves the length at which
+        its spring is slack. Damping of a rope acts while it is taut, that of a tendon always.
+        """
+        name, values = element_name(item), {}
+        if isinstance(item, Rope):
+            values = {"stiffness": [item.stiffness], "springlength": [0.0, item.length]}
+            self.lost += [f"the damping of the {name}"] * bool(item.damping)
+        else:
+            push = item.force + item.stiffness * item.rest
+            if push < 0 or (push and not item.stiffness):
+                self.lost.append(f"the constant force of the {name}")
+            if item.stiffness:
+                rest = max(push, 0.0) / item.stiffness if item.force else max(item.rest, 0.0)
+                values = {"stiffness": [item.stiffness], "springlength": [rest]}
+            if item.damping:
+                values["damping"] = [item.damping]
+        if not values:
+            return
+        tendon = _named(tendons, "spatial", "_".join(links))
+        for key, numbers in values.items():
+            tendon.set(key, text(numbers))
+        for link in links:
+            etree.SubElement(tendon, "site", site=self._end(link)[2])
+
     def _drive(self, actuator: etree._Element, tendons: etree._Element, drive: Drive) -> None:
         along = {"joint": drive.name}
         if dict(drive.factors) != {drive.name: 1.0}:
@@ -272,14 +310,19 @@ class _Writer:
         etree.SubElement(actuator, "motor", {"name": drive.name, **along})
 
 
-def _tendon(tendons: etree._Element, name: str, factors: Mapping[str, float]) -> str:
-    """Add a fixed tendon, under a name that no other has."""
+def _named(tendons: etree._Element, tag: str, name: str) -> etree._Element:
+    """Add a tendon, under a name that no other has."""
     while any(tendon.get("name") == name for tendon in tendons):
         name += "_"
-    tendon = etree.SubElement(tendons, "fixed", name=name)
+    return etree.SubElement(tendons, tag, name=name)
+
+
+def _tendon(tendons: etree._Element, name: str, factors: Mapping[str, float]) -> str:
+    """Add a fixed tendon."""
+    tendon = _named(tendons, "fixed", name)
     for joint, factor in factors.items():
         etree.SubElement(tendon, "joint", joint=joint, coef=text([factor]))
-    return name
+    return str(tendon.get("name"))
 
 
 def _placed(place: pin.SE3) -> dict[str, str]:

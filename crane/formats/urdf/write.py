@@ -76,6 +76,7 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
     draw(robot, machine)
     lost = plain_friction(machine) + only_in_machine_files(machine)
     lost += ["springs and forces"] if machine.forces else []
+    lost += ["ropes"] if machine.ropes else []
     lost += ["rotor inertias"] if rotors_of(machine) else []
     lost += ["drives along several joints"] if drives_of(machine) else []
     with replacing(path) as part:

@@ -12,6 +12,7 @@ from crane.common.samples import Array, Brief, as_samples
 from crane.description import Friction
 from crane.dynamics import Dynamics
 from crane.dynamics.joint_forces import JointForces
+from crane.dynamics.lengths import Lengths
 from crane.machine import Machine
 
 PER_BODY = ("m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
@@ -91,18 +92,32 @@ def body_names(machine: Machine) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Direction:
-    """Along what a force acts: a joint of the tree, or a combination of active joints.
+    """Along what a force acts: a joint of the tree, active joints together, or a distance.
 
     Attributes:
-        name: The joint's, or what to call the combination (a motor that turns with two joints).
+        name: The joint's, or what to call the combination (a motor that turns with two joints) or
+            the distance.
         factors: By active joint; None for the joint `name`.
+        between: Two links whose distance it is.
     """
 
     name: str
     factors: Mapping[str, float] | None = None
+    between: tuple[str, str] | None = None
+
+    def coordinate(self, machine: Machine, at: Samples) -> Array:
+        """(N,) [m], [rad]."""
+        if self.between is not None:
+            return Lengths(machine, [self.between]).at(at.q)[0][:, 0]
+        if self.factors is None:
+            return at.q[:, machine.column(self.name)]
+        return np.einsum("ij,ij->i", self.rows(machine, at), at.q_a)
 
     def rows(self, machine: Machine, at: Samples) -> Array:
         """(N, n) derivative of the direction's coordinate by q_A."""
+        if self.between is not None:
+            slopes = Lengths(machine, [self.between]).at(at.q)[1]
+            return np.einsum("ki,kij->kj", slopes[:, 0], at.gamma)
         if self.factors is None:
             return at.gamma[:, machine.column(self.name)]
         row = np.zeros(len(machine.active))
@@ -114,6 +129,17 @@ class Direction:
                 )
             row[machine.active.index(joint)] = factor
         return np.broadcast_to(row, at.v_a.shape)
+
+
+def _direction(machine: Machine, given: str | Direction) -> Direction:
+    """The direction of a joint's name, or the one given; raises for what is not there."""
+    direction = Direction(given) if isinstance(given, str) else given
+    if direction.between is not None:
+        for link in direction.between:
+            machine.frame(link)
+    elif direction.factors is None:
+        machine.column(direction.name)
+    return direction
 
 
 Shape = Callable[[Array], Array]
@@ -138,9 +164,7 @@ class Along:
         nominal: Mapping[str, float] | None = None,
         positive: Sequence[str] = (),
     ):
-        if isinstance(direction, str):
-            machine.column(direction)  # raises for unknown ones
-            direction = Direction(direction)
+        direction = _direction(machine, direction)
         self._machine, self._direction, self._shapes = machine, direction, shapes
         self.names = tuple(f"{direction.name}.{name}" for name in shapes)
         self.nominal = np.array([(nominal or {}).get(name, 0.0) for name in shapes])
@@ -213,9 +237,7 @@ class Presliding:
     """
 
     def __init__(self, machine: Machine, direction: str | Direction, length: float):
-        if isinstance(direction, str):
-            machine.column(direction)
-            direction = Direction(direction)
+        direction = _direction(machine, direction)
         if not length > 0:
             raise InputError(f"the length of presliding of '{direction.name}' is {length:g}")
         self._machine, self._direction, self._length = machine, direction, length
@@ -225,10 +247,7 @@ class Presliding:
     def columns(self, at: Samples) -> Array:
         """See `Term`."""
         rows = self._direction.rows(self._machine, at)
-        if self._direction.factors is None:
-            way = at.q[:, self._machine.column(self._direction.name)]
-        else:
-            way = np.einsum("ij,ij->i", rows, at.q_a)
+        way = self._direction.coordinate(self._machine, at)
         state, last = at.memory.get(self, (0.0, way[0]))
         steps = np.diff(way, prepend=last) / self._length
         steps[list(at.starts)] = 0.0
@@ -267,44 +286,54 @@ class RotorInertia:
 
 
 class GasScale:
-    """A factor on the force of a gas spring, whose nominal value is 1."""
+    """A factor on the force of a gas spring, whose nominal value is 1.
+
+    Args:
+        machine: The machine.
+        joint: That the gas spring acts on, or its own name.
+    """
 
     def __init__(self, machine: Machine, joint: str):
         springs = [spring for spring in machine.gas_springs if spring.joint == joint]
         if not springs:
             names = [spring.joint for spring in machine.gas_springs]
             raise InputError(f"joint '{joint}' has no gas spring, {known(names, joint)}")
-        self._column = machine.column(joint)
         self._forces = JointForces(machine.replace(gas_springs=tuple(springs)))
         self.names, self.nominal, self.signs = (f"{joint}.gas_scale",), np.ones(1), (True,)
 
     def columns(self, at: Samples) -> Array:
         """See `Term`."""
-        force = self._forces.gas(at.q)[:, self._column]
-        return -(at.gamma[:, self._column] * force[:, None])[:, :, None]
+        return -np.einsum("kij,ki->kj", at.gamma, self._forces.gas(at.q))[:, :, None]
 
 
 class SpringForce:
-    """A passive force of known shape along a joint times an unknown factor.
+    """A passive force of known shape along a joint or distance times an unknown factor.
 
     Args:
         machine: The machine.
-        joint: Active or passive.
-        shape: Coordinate (N,) [m], [rad] -> force in the joint's positive direction per factor.
+        direction: A joint's name, active or passive, or a combination or distance.
+        shape: Coordinate (N,) [m], [rad] -> force in the positive direction per factor.
         name: Of the factor.
         nominal: Its value.
     """
 
     def __init__(
-        self, machine: Machine, joint: str, shape: Shape, name: str, nominal: float = 0.0
+        self,
+        machine: Machine,
+        direction: str | Direction,
+        shape: Shape,
+        name: str,
+        nominal: float = 0.0,
     ):
-        self._column, self._shape = machine.column(joint), shape
-        self.names, self.nominal, self.signs = (f"{joint}.{name}",), np.array([nominal]), (False,)
+        self._machine, self._shape = machine, shape
+        self._direction = _direction(machine, direction)
+        self.names, self.nominal = (f"{self._direction.name}.{name}",), np.array([nominal])
+        self.signs = (False,)
 
     def columns(self, at: Samples) -> Array:
         """See `Term`."""
-        force = self._shape(at.q[:, self._column])
-        return -(at.gamma[:, self._column] * force[:, None])[:, :, None]
+        force = self._shape(self._direction.coordinate(self._machine, at))
+        return -(self._direction.rows(self._machine, at) * force[:, None])[:, :, None]
 
 
 def default_terms(machine: Machine) -> list[Term]:

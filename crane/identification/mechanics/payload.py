@@ -203,7 +203,7 @@ def identify_payload(
         """Forces (N, n) of the machine without the load."""
         return dynamics.at("inverse with friction", at.q, at.v_a, at.a_a)
 
-    bare = machine.replace(friction={}, forces=(), gas_springs=(), end_stops=())
+    bare = machine.replace(friction={}, forces=(), gas_springs=(), ropes=(), end_stops=())
     extra = [friction(bare, joint, ("coulomb",), smoothing=0.0) for joint in names]
     model = Model(bare, [load, *extra], own)
     # weight tells a load: what smoothing takes from the accelerations bounds no bandwidth

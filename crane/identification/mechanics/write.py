@@ -13,7 +13,7 @@ from lxml import etree
 
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
 from crane.common.output import replacing, staging
-from crane.description import Chain, Friction, MachineSpec
+from crane.description import Chain, Friction, MachineSpec, locked
 from crane.dynamics import Dynamics
 from crane.formats import load, read
 from crane.formats.parallel_robots import is_parallel_robot
@@ -173,21 +173,23 @@ def _content(result: Identification, spec: MachineSpec, names: Mapping[str, str]
     if spec.payload is not None:
         data["payload"] = {"urdf": names[spec.payload.chain.name]}
     data["friction"], scales = _identified(result, spec)
-    held = set(machine.locks)
-    data["forces"] = [
-        _numbers(x) for x in (*machine.forces, *(x for x in spec.forces if x.joint in held))
-    ]
+    moving = locked(spec, machine.locks) if machine.locks else spec
+
+    def of(kind: str) -> list[Any]:
+        """The machine's elements of a kind, and those that its locks took."""
+        kept = getattr(moving, kind)
+        return [*getattr(machine, kind), *(x for x in getattr(spec, kind) if x not in kept)]
+
+    data["forces"] = [_numbers(item) for item in of("forces")]
     data["gas_springs"] = {
         item.joint: _numbers(
             item, joint=None, pressure=item.pressure * scales.get(item.joint, 1.0)
         )
-        for item in (*machine.gas_springs, *(x for x in spec.gas_springs if x.joint in held))
+        for item in of("gas_springs")
     }
-    data["end_stops"] = {
-        item.joint: _numbers(item, joint=None)
-        for item in (*machine.end_stops, *(x for x in spec.end_stops if x.joint in held))
-    }
-    for key in ("loops", "forces", "gas_springs", "end_stops"):
+    data["ropes"] = [_numbers(item) for item in of("ropes")]
+    data["end_stops"] = {item.joint: _numbers(item, joint=None) for item in of("end_stops")}
+    for key in ("loops", "forces", "gas_springs", "ropes", "end_stops"):
         if not data.get(key):
             data.pop(key, None)
     return str(

@@ -79,7 +79,10 @@ class StiffStepper:
         self._seen = seen_layout(machine, control)
         self._stiff = int(np.isfinite(control.scales).sum())
         form = form_of(control, self._columns, len(machine.active), len(control.scales), fold=True)
-        key = ("stiff", form, self._stiff, folded(self._numbers), dynamics.carriers, dynamics.plan)
+        key = (
+            "stiff", form, self._stiff, folded(self._numbers), dynamics.carriers, dynamics.plan,
+            dynamics.spans,
+        )  # fmt: skip
         if key not in self._fast.programs:
             self._fast.programs[key] = program_of(control, self._fast, key, self._build)
         self._program = self._fast.programs[key]

@@ -39,7 +39,10 @@ class CompiledStepper:
         self._columns = columns_of(control)
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
         form = form_of(control, self._columns, len(machine.active), states, fold=False)
-        key = ("rk4", form, states, folded(self._numbers), dynamics.carriers, dynamics.plan)
+        key = (
+            "rk4", form, states, folded(self._numbers), dynamics.carriers, dynamics.plan,
+            dynamics.spans,
+        )  # fmt: skip
         self._key = key
         if key not in self._fast.programs:
             self._fast.programs[key] = self._compile()

@@ -30,7 +30,9 @@ def machine_at(
     q, posture, loops = closure.fast.trace(tape, 0, state)
     parts = layout.view(tape.loads(state, 0, layout.size))
     constants = Constants(tape, 1, dynamics.numbers)
-    sweep = Sweep(posture, loops, constants, q, parts.v_a, dynamics.carriers, dynamics.plan)
+    sweep = Sweep(
+        posture, loops, constants, q, parts.v_a, dynamics.carriers, dynamics.plan, dynamics.spans
+    )
     return sweep, [q[i] for i in closure.active], parts
 
 
