@@ -11,9 +11,10 @@ from crane.dynamics import Dynamics
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.stepwise import Progress, PythonStepper
 
-_FASTEST = (
-    300.0  # [rad/s], [m/s] of a passive joint: where the branch ends they grow beyond bounds
-)
+# of a passive joint in rad and shares of the machine's size per `Closure.pace`: where the branch
+# ends they grow beyond bounds
+_FASTEST = 300.0
+_ACCURACY = 1e-11  # that matters, likewise; of all else in SI units
 ADAPTIVE = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 
 
@@ -56,6 +57,7 @@ class AdaptiveSteps:
         from scipy.integrate import solve_ivp
 
         closure, end = self._closure, times[0] + step * len(times)
+        units, pace = closure.units, closure.pace
         view = self.slow.layout.view
 
         def rate(time: float, state: Array) -> Array:
@@ -69,17 +71,22 @@ class AdaptiveSteps:
                 gamma = closure.gamma(at.q)[closure.passive]
             except ClosureError:
                 return -_FASTEST
-            return _FASTEST - float(np.abs(gamma @ at.v_a).max(initial=0.0))
+            rates = gamma @ at.v_a / units[closure.passive]
+            return _FASTEST - pace * float(np.abs(rates).max(initial=0.0))
 
+        enough = np.full(len(state), _ACCURACY)
+        view(enough).q[:] *= units
+        view(enough).v_a[:] *= units[closure.active] / pace
         calm.terminal = True  # type: ignore[attr-defined]
         method: Any = self._method
         result: Any = solve_ivp(
             rate, (times[0], end), state, method=method, t_eval=[*times, end],
-            rtol=1e-9, atol=1e-11, events=calm,
+            rtol=1e-9, atol=enough, events=calm,
         )  # fmt: skip
         if result.status == 1:
             q_a = view(result.y_events[0][0]).q[closure.active]
-            what = f" the motion explodes (a passive joint exceeds {_FASTEST:g} m/s or rad/s)"
+            fastest = f"{_FASTEST / pace:.3g} rad/s or {_FASTEST * closure.size / pace:.3g} m/s"
+            what = f" the motion explodes (a passive joint exceeds {fastest})"
             raise HaltedError(result.t_events[0][0], q_a, what, ": look at its forces and gains")
         if not result.success:
             last = float(result.t[-1]) if len(result.t) else 0.0

@@ -56,9 +56,11 @@ class PythonStepper:
             HaltedError: The motion explodes, or the loops cannot be closed any more.
         """
         total = rate = first
+        units = self._dynamics.machine.closure.units
         for share, weight in ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
-            if not np.abs(self.layout.view(rate).q).max() * step < 1:  # also NaN
-                what = f" the motion explodes (over 1 m or rad in a step of {step:g} s)"
+            if not np.abs(self.layout.view(rate).q / units).max() * step < 1:  # also NaN
+                size = self._dynamics.machine.closure.size
+                what = f" the motion explodes (over 1 rad or {size:.3g} m in a step of {step:g} s)"
                 otherwise = ", and with shorter steps, too: look at its forces and gains"
                 here = self.layout.view(state).q[self._active]
                 raise HaltedError(time, here, what, otherwise)
