@@ -522,7 +522,7 @@ MECHANISM = [
         "loop that stays open",
         [
             "four_bar.yaml:10: error: loop 'pin' cannot be closed from the home guess "
-            "(crank = 1.2): it stays 0.0962 rad open, correct the frames or the guess (it "
+            "(crank = 1.2): it stays 0.0961 rad open, correct the frames or the guess (it "
             "is 10 mm apart and 5.73 deg askew)",
         ],
         swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.3 0 0.01" rpy="0.1 0 0"/>', ROCKER),
@@ -560,7 +560,7 @@ MECHANISM = [
         [
             "four_bar.yaml:10: error: loop 'pin' cannot be closed from the home guess "
             "(crank = 1.2): it stays 0.101 m open, correct the frames or the guess (it is "
-            "102 mm apart and 0.00469 deg askew)",
+            "102 mm apart and 0.0723 deg askew)",
             "four_bar.yaml:20: error: 'coulomb' of friction of 'crank' is -0.3, give at least 0",
             "four_bar.yaml:38: error: 'duration' of task 'reach' is 'soon', give a number",
             "four_bar.yaml:42: error: 'ki' of control of 'crank' is -20, give at least 0",

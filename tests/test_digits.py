@@ -54,10 +54,11 @@ def aside(text, far):
 def assert_closed(machine, least, most):
     """Independent equations to rounding, all others within what is allowed, here and elsewhere."""
     closure, structure = machine.closure, machine.closure.structure
-    assert least <= structure.surplus.gap <= most
+    surplus, units = structure.surplus, closure.equations.row_units
+    assert least <= surplus.gap * units[surplus.row] <= most
     for reach in (0.0, 0.02, -0.03):
         q = closure.solve(machine.home[closure.active] + reach)
-        phi = closure.equations.evaluate(q)[0]
+        phi = closure.equations.scaled(q)[0]
         assert np.abs(phi[structure.rows]).max() < 2e-13
         assert np.abs(phi).max() <= structure.surplus.allowed
 

@@ -258,10 +258,32 @@ def test_valve_stuck_open_runs_into_the_end_stop(loaded):
     recording = crane.simulate(loaded, stuck, duration=15.0)
     check_balances(loaded, recording)
     upper = loaded.upper[LIFT]
-    assert recording.q[-1, LIFT] == pytest.approx(upper, abs=5e-3)
+    assert recording.q[-1, LIFT] == pytest.approx(upper, abs=3e-4)
     assert abs(recording.v[-1, LIFT]) < 1e-4
     # the compensator lets nothing back: what the jolt pressed together stays, but for leakage
     assert recording.channels["pressure_X_lift_a"][-1] > 0.99 * 9.25e6
+
+
+@pytest.mark.parametrize(("lever", "duration"), [(1.0, 14.0), (-1.0, 9.0)])
+def test_a_tonne_on_the_stops_moves_them_as_steel_gives_way(lever, duration):
+    """At rest the stop carries what the oil presses beyond the weight: k d, a third of a mm."""
+    machine = crane.load("patu655", changes={"payload.mass": 1000.0})
+    levers = joystick(machine, {"X_lift": [(0, 0), (0.5, lever), (duration, lever)]})
+    recording = crane.simulate(machine, levers, duration=duration)
+    check_balances(machine, recording)
+    q = recording.q[:, LIFT]
+    beyond = np.maximum(machine.lower[LIFT] - q, q - machine.upper[LIFT])
+    (stop,) = (stop for stop in machine.end_stops if stop.joint == "X_lift")
+    weight = crane.Dynamics(machine, backend="pinocchio").gravity(recording.q[-1])[LIFT]
+    channels = recording.channels
+    cylinder = machine.hydraulics.cylinders["X_lift"]
+    pressed = cylinder.area_a * channels["pressure_X_lift_a"][-1]
+    pressed -= cylinder.area_b * channels["pressure_X_lift_b"][-1]
+    pushed = stop.stiffness * beyond[-1]
+    friction = 310.0  # at rest, either way
+    assert abs(abs(pressed - weight) - pushed) < friction
+    assert 1e-4 < beyond[-1] < 6e-4 and beyond.max() < 1.5e-3
+    assert np.abs(recording.v[-1]).max() < 1e-3
 
 
 def test_ten_times_the_load_comes_down():

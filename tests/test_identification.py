@@ -82,7 +82,7 @@ def test_measured_arms():
     assert base_parameters(model).rank == 45
     arm = [i for i, name in enumerate(model.names) if not name.startswith(("barrel", "rod"))]
     W = model.regressor(random_samples(model, 300, seed=1)).reshape(-1, len(model.names))
-    assert group([model.names[i] for i in arm], W[:, arm]).rank == 36
+    assert group([model.names[i] for i in arm], W[:, arm], np.ones(len(arm))).rank == 36
 
 
 def test_the_mini_forwarder(mini):

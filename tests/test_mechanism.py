@@ -115,7 +115,7 @@ MECHANISM = [
     case(
         "axes at an angle",
         "four_bar.yaml:10: loop 'pin' cannot be closed from the home guess (crank ="
-        " 1.2): it stays 0.0962 rad open, correct the frames or the guess",
+        " 1.2): it stays 0.0961 rad open, correct the frames or the guess",
         swap('<origin xyz="0.3 0 0"/>', '<origin xyz="0.3 0 0" rpy="0.1 0 0"/>', ROCKER),
     ),
     case(
@@ -190,8 +190,8 @@ MINI_FORWARDER = [
     case(
         "chain on a wrong pin",
         "mini_forwarder.yaml:{line of active:}: the active joints q1, X1, X2 cannot"
-        " drive q4, q9, q2: choose others, such as [q1, q4, q3] (condition 1.76), or [q1, q2, q3] "
-        "(condition 1.83)",
+        " drive q4, q9, q2: choose others, such as [q1, q9, q3] (condition 1.76), or [q1, q4, q3] "
+        "(condition 1.76)",
         swap("chain_b1.urdf, parent: link1_B", "chain_b1.urdf, parent: link1_C", MINI),
         machine=MINI,
     ),

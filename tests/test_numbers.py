@@ -20,11 +20,11 @@ from crane.studies.run import Job, variant
         ("2", -np.inf, "the size is not made of real numbers, give a number"),
         ([1.0], -np.inf, "the size is [1.0] m, give a number"),
         (0.0, 0, "the size is 0.0 m, give a number above 0"),
-        (1e308, -np.inf, "the size is 1e+308 m, give a number from -1e+15 to 1e+15"),
-        (-1e300, -np.inf, "the size is -1e+300 m, give a number from -1e+15 to 1e+15"),
-        (1e16, 0, "the size is 1e+16 m, give a number from 1e-15 to 1e+15"),
-        (1e-320, 0, "the size is 1e-320 m, give a number from 1e-15 to 1e+15"),
-        (1e16, 3.0, "the size is 1e+16 m, give a number from 3 to 1e+15"),
+        (1e308, -np.inf, "the size is 1e+308 m, give a number from -1e+30 to 1e+30"),
+        (-1e300, -np.inf, "the size is -1e+300 m, give a number from -1e+30 to 1e+30"),
+        (1e31, 0, "the size is 1e+31 m, give a number from 1e-30 to 1e+30"),
+        (1e-320, 0, "the size is 1e-320 m, give a number from 1e-30 to 1e+30"),
+        (1e31, 3.0, "the size is 1e+31 m, give a number from 3 to 1e+30"),
     ],
 )
 def test_numbers_that_no_machine_has(value, above, told):

@@ -402,3 +402,16 @@ def test_the_load_is_scaled_and_drawn(patu, loaded):
 
     assert drawn(loaded) and drawn(half) and not drawn(patu)
     assert not drawn(crane.load("patu655", {"payload.mass": 0.0}))
+
+
+def test_end_stops_are_as_stiff_as_the_cylinders():
+    """Tube and rod of steel in series between the pins, the rod out: E / (Lt / At + Lr / Ar)."""
+    stiffness = {stop.joint: stop.stiffness for stop in crane.load("patu655").end_stops}
+    tube, rod = np.pi / 4 * (0.12**2 - 0.10**2), np.pi / 4 * 0.056**2
+    for joint, length in (("X_lift", 0.820), ("X_tilt", 1.050)):  # pin to pin with the rod in
+        # of the tube its first 40 mm are solid, of the rod 50 mm are the piston
+        stretched = (length - 0.10 - 0.04) / tube + (length - 0.08 - 0.05) / rod
+        assert stiffness[joint] == pytest.approx(2.1e11 / stretched, rel=0.01)
+    tube, rod = np.pi / 4 * (1.2**2 - 1) * 0.063**2, np.pi / 4 * 0.036**2
+    length = 1.2 + 2 * 0.063  # stroke, piston and gland
+    assert stiffness["X_ext"] == pytest.approx(2.1e11 / (length / tube + length / rod), rel=0.01)

@@ -16,12 +16,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from crane.closure.choice import Indices, size, slides, units
+from crane.closure.choice import Indices
 from crane.closure.equations import LoopEquations
 from crane.common.samples import Array
 from crane.description import LOOP_TYPES
 
-_ZERO = 1e-11
+_ZERO = 1e-11  # in shares
 _ITERATIONS = 80
 _STEP = 1.0  # [rad], or share of the machine's size: of an iteration at most
 _HALVINGS = 12
@@ -42,10 +42,10 @@ class Residual:
 
     def __init__(self, equations: LoopEquations):
         self._equations = equations
-        self._shares = np.where(np.arange(6) < 3, size(equations.model), 1.0)
+        self._shares = np.where(np.arange(6) < 3, equations.size, 1.0)
         self._locked = [np.flatnonzero(LOOP_TYPES[loop.type]) for loop in equations.loops]
         own = equations.loop_of_row >= len(equations.loops)
-        self._coupled = np.where(equations.is_translation[own], self._shares[0], 1.0)
+        self._coupled = equations.row_units[own]
 
     def evaluate(self, q: Array) -> tuple[Array, Array]:
         """Residuals (m,) and their slopes (m, nv)."""
@@ -119,10 +119,9 @@ class Search:
     def __init__(
         self, equations: LoopEquations, guess: Array, said: Indices, more: int | None = None
     ):
-        model = equations.model
         more = min(max(_SPARE // max(len(guess), 1), _MORE[0]), _MORE[1]) if more is None else more
         self._residual, self.guess = Residual(equations), guess
-        self._unit, self._turns = units(model), ~slides(model)
+        self._unit = equations.units
         self._lower, self._upper = equations.coordinates.lower, equations.coordinates.upper
         self._said, self._more = said, more
         self._rates = equations.coordinates.rates
@@ -160,7 +159,8 @@ class Search:
         for loose in (beyond, free):
             q, gap = self.descend(start, free, loose)
             held = np.setdiff1d(free, beyond)
-            kept = (q >= self._lower - _ZERO) & (q <= self._upper + _ZERO)
+            slack = _ZERO * self._unit
+            kept = (q >= self._lower - slack) & (q <= self._upper + slack)
             if gap <= enough and kept[held].all():
                 return q
             if not np.isfinite([self._lower[held], self._upper[held]]).any():

@@ -16,13 +16,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from crane.closure.anywhere import Search
-from crane.closure.choice import slides, units
 from crane.closure.closure import Closure
 from crane.closure.exactness import DIGITS
+from crane.closure.home import within
 from crane.closure.structure import Indices
 from crane.common.samples import Array, solve
 
-_CLOSED = 1e-9
+_CLOSED = 1e-9  # residual, in shares of the machine's size
 _SAME = 1e-3  # [rad], or share of the machine's size: postures that are not different
 _STEP = 1.0  # the same, of an iteration at most
 _ITERATIONS = 15
@@ -96,8 +96,8 @@ class _Search:
         self.closure, self.guess, self.named = closure, guess, named
         self.model, self.equations = closure.model, closure.equations
         self.home, self.blocks = closure.home, closure.structure.blocks
-        self._unit = units(self.model)
-        self._turns = ~slides(self.model)
+        self._unit = self.equations.units
+        self._turns = ~self.equations.coordinates.slides
         self._massless = not any(inertia.mass > 0 for inertia in list(self.model.inertias)[1:])
 
     def difference(self, one: Array, two: Array) -> Array:
@@ -117,9 +117,7 @@ class _Search:
 
     def within_limits(self, q: Array, columns: Indices) -> bool:
         """Whether some joints are."""
-        coordinates = self.equations.coordinates
-        lower, upper = coordinates.lower, coordinates.upper
-        return bool(((q >= lower - 1e-9) & (q <= upper + 1e-9))[columns].all())
+        return bool(within(self.equations, q)[columns].all())
 
     def others(self, index: int, most: int) -> list[Array]:
         """Solutions of a block with what is before it as at home, without that of home."""
@@ -172,8 +170,8 @@ class _Search:
 
     def _across(self, rows: Indices, columns: Indices) -> Array:
         """(4, nq) postures on both sides of home, where its equations determine least."""
-        jacobian = self.equations.evaluate(self.home)[1][np.ix_(rows, columns)]
-        weakest = np.linalg.svd(jacobian * self._unit[columns])[2][-1]
+        jacobian = self.equations.scaled(self.home)[1][np.ix_(rows, columns)]
+        weakest = np.linalg.svd(jacobian)[2][-1]
         out = np.tile(self.home, (4, 1))
         out[:, columns] += np.outer([0.5, -0.5, 1.5, -1.5], weakest * self._unit[columns])
         return out
@@ -212,7 +210,7 @@ class _Search:
         """
         q = q.copy()
         for _ in range(_ITERATIONS):
-            phi, jacobian = self.equations.evaluate(q)
+            phi, jacobian = self.equations.scaled(q)
             residual = np.abs(phi[rows]).max(initial=0.0)
             if residual < 1e-13:
                 break
@@ -225,14 +223,14 @@ class _Search:
                 apart = (q - other)[columns] / self._unit[columns]
                 turning = self._turns[columns]
                 square = np.where(turning, 2 - 2 * np.cos(apart), apart**2).sum()
-                slope = np.where(turning, 2 * np.sin(apart), 2 * apart) / self._unit[columns]
+                slope = np.where(turning, 2 * np.sin(apart), 2 * apart)
                 pushed -= float(slope @ step) / max(square * (1 + square), 1e-12)
             step = step / (1 - pushed if abs(1 - pushed) > 1e-6 else 1e-6)
-            largest = float((np.abs(step) / self._unit[columns]).max())
+            largest = float(np.abs(step).max())
             if not largest < np.inf:
                 return None
-            q[columns] += step * min(1.0, _STEP / max(largest, 1e-300))
-        if not np.abs(self.equations.evaluate(q)[0][rows]).max(initial=0.0) < _CLOSED:
+            q[columns] += self._unit[columns] * step * min(1.0, _STEP / max(largest, 1e-300))
+        if not np.abs(self.equations.scaled(q)[0][rows]).max(initial=0.0) < _CLOSED:
             return None
         angles = columns[self._turns[columns]]
         q[angles] = np.remainder(q[angles] + np.pi, 2 * np.pi) - np.pi
@@ -265,7 +263,7 @@ class _Search:
     def assessed(self, q: Array, rows: Indices) -> Assembly | None:
         """Likewise of a whole posture, in which some rows are solved another way."""
         passive = self.closure.passive
-        if np.abs(self.equations.evaluate(q)[0]).max() > self.closure.structure.surplus.allowed:
+        if np.abs(self.equations.scaled(q)[0]).max() > self.closure.structure.surplus.allowed:
             return None
         if self.equations.turned_over(q) is not None or not self.within_limits(q, passive):
             return None
@@ -297,7 +295,7 @@ class _Search:
                 self.model, data, self.equations.coordinates.configuration(posture)
             )
             places.append([
-                place.homogeneous
+                np.column_stack([place.rotation, place.translation / self.equations.size])
                 for place, inertia in zip(data.oMi, self.model.inertias, strict=True)
                 if inertia.mass > 0 or self._massless
             ])  # fmt: skip

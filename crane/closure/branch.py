@@ -9,7 +9,8 @@ from crane.closure.structure import Indices, Structure
 from crane.common.errors import BranchEdgeError, MechanismError, OutOfReachError, WrongBranchError
 from crane.common.samples import Array, solve
 
-_TOLERANCE = 1e-12  # of a closed loop, per metre of machine
+# All in rad and shares of the machine's size, so that a branch is the same at any scale.
+_TOLERANCE = 1e-12  # of a closed loop
 _EDGE = 1e-6  # relative least singular value of a block where the passive joints get undetermined
 _SHORTEST = 2.0**-24  # step of the continuation at which it gives up
 
@@ -21,7 +22,7 @@ class Posture:
     Attributes:
         q: (nq,).
         q_a: (n,) its active coordinates.
-        jacobian: (m, nv) of the independent loop equations.
+        jacobian: (m, nv) of the independent loop equations, as `LoopEquations.scaled` has it.
         gamma: (m, n) passive rows of gamma.
     """
 
@@ -59,36 +60,44 @@ class Branch:
         self._names = [names[i] for i in active]
         self._active, self._passive, self._span = active, passive, span
         self._blocks = structure.by_size()
-        places = equations.model.jointPlacements
-        self.size = max(1.0, *(float(np.abs(place.translation).max()) for place in places))
+        self._units, self._slides = equations.units, equations.coordinates.slides
+        model = equations.model
+        places = [*model.jointPlacements, *(frame.placement for frame in model.frames)]
+        self._far = max(float(np.abs(place.translation).max()) for place in places)
         home = self.newton(structure.home, structure.home[active], 30)
         if home is None:
             raise MechanismError("the home posture does not close, change 'home'", "home")
         self.home = home
         self._sign = self._signs(home)
 
+    def far(self, q: Array) -> float:
+        """The longest part of a posture (nq,) whose rounding is that of its loops, at least 1."""
+        slid = float(np.abs(q[self._slides]).max(initial=self._far))
+        return max(1.0, slid / self._equations.size)
+
     def newton(self, q: Array, q_a: Array, iterations: int) -> Posture | None:
         """Close the loops at q_A from a near posture; None where that does not work."""
         q = q.copy()
         q[self._active] = q_a
-        before = np.inf
+        far, before = self.far(q), np.inf
         for _ in range(iterations):
-            phi, jacobian = self._equations.evaluate(q)
+            phi, jacobian = self._equations.scaled(q)
             phi, jacobian = phi[self._structure.rows], jacobian[self._structure.rows]
             residual = np.abs(phi).max(initial=0.0)
-            rounded = residual <= 4e-15 * self.size
-            stalled = residual <= 0.1 * _TOLERANCE * self.size and residual > 0.25 * before
+            rounded = residual <= 4e-15 * far
+            stalled = residual <= 0.1 * _TOLERANCE * far and residual > 0.25 * before
             try:
                 if rounded or stalled:
-                    right = jacobian[:, self._active]
-                    return Posture(q, q_a, jacobian, solve(jacobian[:, self._passive], -right))
+                    gamma = solve(jacobian[:, self._passive], -jacobian[:, self._active])
+                    units = self._units[self._passive, None] / self._units[self._active]
+                    return Posture(q, q_a, jacobian, gamma * units)
                 change = solve(jacobian[:, self._passive], -phi)
             except np.linalg.LinAlgError:
                 return None
             if not np.abs(change).max() < 1.0:  # also NaN
                 return None
             before = residual
-            q[self._passive] += change
+            q[self._passive] += change * self._units[self._passive]
         return None
 
     def step(self, q: Array, target: Array) -> Posture | None:
@@ -96,7 +105,7 @@ class Branch:
         if not (np.abs(target - q[self._active]) < 0.01 * self._span).all():
             return None
         posture = self.newton(q, target, 5)
-        if posture is None or not self._follows(q, posture, np.zeros(0)):
+        if posture is None or not self._follows(q, posture, np.zeros(len(self._passive))):
             return None
         self._check(posture, "")
         return posture
@@ -143,6 +152,12 @@ class Branch:
 
     def check_edge(self, jacobian: Array, solved: Array, q_a: Array, sample: str = "") -> None:
         """Raise where J_P is singular, which shows in what was solved with it.
+
+        Args:
+            jacobian: (m, nv) see `LoopEquations.scaled`.
+            solved: What was solved with its passive columns.
+            q_a: (n,) where.
+            sample: See `reach`.
 
         Raises:
             BranchEdgeError: It is.
@@ -205,7 +220,7 @@ class Branch:
 
     def _moved(self, at: Posture, q_a: Array, move: Array, iterations: int) -> Posture | None:
         """The posture at q_A from one beside it, None where it is not on the same branch."""
-        if not np.abs(move).max(initial=0.0) < 1.0:
+        if not np.abs(move / self._units[self._passive]).max(initial=0.0) < 1.0:
             return None
         predicted = at.q.copy()
         predicted[self._passive] += move
@@ -218,20 +233,23 @@ class Branch:
         """Whether a posture continues the branch it was predicted on."""
         if (self._signs(posture) * self._sign < 0).any():
             return False
-        off = np.abs(posture.q - predicted)[self._passive].max(initial=0.0)
-        return bool(off <= 0.02 + 0.5 * np.abs(move).max(initial=0.0))
+        units = self._units[self._passive]
+        off = np.abs((posture.q - predicted)[self._passive] / units).max(initial=0.0)
+        moved = np.abs(move / units).max(initial=0.0)
+        return bool(off <= 0.02 + 0.5 * moved)
 
     def _check(self, posture: Posture, sample: str) -> None:
         """Raise unless every equation holds and the passive joints are determined."""
-        self.check_edge(posture.jacobian, posture.gamma, posture.q_a, sample)
+        units = self._units[self._passive, None] / self._units[self._active]
+        self.check_edge(posture.jacobian, posture.gamma / units, posture.q_a, sample)
         if len(self._structure.redundant):
-            phi, _ = self._equations.evaluate(posture.q)
+            phi, _ = self._equations.scaled(posture.q)
             extra = np.abs(phi[self._structure.redundant])
-            if extra.max() > max(1e3 * _TOLERANCE * self.size, self._structure.surplus.allowed):
-                row = self._structure.redundant[extra.argmax()]
+            if extra.max() > self._structure.surplus.allowed:
+                row = int(self._structure.redundant[extra.argmax()])
                 loop = self._equations.names[self._equations.loop_of_row[row]]
                 raise OutOfReachError(
-                    f"loop '{loop}' stays {extra.max():.3g} {self._unit(row)} open at "
+                    f"loop '{loop}' stays {self._gap(row, extra.max())} open at "
                     f"{self._at(posture.q_a)}{sample}, its surplus equations hold only near home: "
                     "the mechanism is overconstrained, use a looser loop type"
                 )
@@ -239,12 +257,12 @@ class Branch:
     def _out_of_reach(self, target: Array, last: Posture, sample: str) -> OutOfReachError:
         from scipy.optimize import least_squares  # slow to import
 
-        q = last.q.copy()
+        q, units = last.q.copy(), self._units[self._passive]
         q[self._active] = target
 
         def evaluate(passive: Array) -> tuple[Array, Array]:
-            q[self._passive] = passive
-            phi, jacobian = self._equations.evaluate(q)
+            q[self._passive] = passive * units
+            phi, jacobian = self._equations.scaled(q)
             return phi, jacobian[:, self._passive]
 
         def residual(passive: Array) -> Array:
@@ -253,21 +271,20 @@ class Branch:
         def slope(passive: Array) -> Array:
             return evaluate(passive)[1]
 
-        nearest = least_squares(residual, q[self._passive], slope, xtol=1e-12)
+        nearest = least_squares(residual, q[self._passive] / units, slope, xtol=1e-12)
         phi = residual(nearest.x)
         worst = int(np.abs(phi).argmax())
-        if np.abs(phi[worst]) < 10 * _TOLERANCE * self.size:
+        if np.abs(phi[worst]) < 10 * _TOLERANCE * self.far(q):
             return OutOfReachError(
                 f"{self._loops_of(self._weakest(last.jacobian)[1])} can be closed at "
                 f"{self._at(target)}{sample}, but the branch does not lead straight there from "
                 f"{self._at(last.q_a)}: go around in between, or give a nearer guess"
             )
         loop = self._equations.names[self._equations.loop_of_row[worst]]
-        unit = self._unit(worst)
         return OutOfReachError(
             f"loop '{loop}' cannot be closed at {self._at(target)}{sample}: it stays "
-            f"{np.abs(phi[worst]):.3g} {unit} open; the last posture on the way that closes is at "
-            f"{self._at(last.q_a)}"
+            f"{self._gap(worst, np.abs(phi[worst]))} open; the last posture on the way that "
+            f"closes is at {self._at(last.q_a)}"
         )
 
     def _wrong_branch(self, what: str, posture: Posture) -> WrongBranchError:
@@ -276,8 +293,10 @@ class Branch:
             "posture's branch"
         )
 
-    def _unit(self, row: int) -> str:
-        return "m" if self._equations.is_translation[row] else "rad"
+    def _gap(self, row: int, share: float) -> str:
+        """How far an equation is open, in words."""
+        unit = "m" if self._equations.is_translation[row] else "rad"
+        return f"{share * self._equations.row_units[row]:.3g} {unit}"
 
     def _loops_of(self, rows: Indices) -> str:
         loops = sorted(set(self._equations.loop_of_row[self._structure.rows[rows]].tolist()))

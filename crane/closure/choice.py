@@ -53,9 +53,17 @@ def slides(model: pin.Model) -> NDArray[np.bool_]:
 
 
 def size(model: pin.Model) -> float:
-    """The size of a machine: the largest distance between neighbouring joints [m]."""
-    places = [np.abs(place.translation).max() for place in list(model.jointPlacements)[1:]]
-    return float(max(places, default=0.0)) or 1.0
+    """The size of a machine: the largest distance between neighbouring joints [m].
+
+    Where all joints are in one place, that of a link from its joint, or else the farthest limit of
+    a slide; 1 m for a machine without any length.
+    """
+    joints = (place.translation for place in list(model.jointPlacements)[1:])
+    links = (frame.placement.translation for frame in model.frames)
+    coordinates = Coordinates(model)
+    limits = np.abs(np.stack([coordinates.lower, coordinates.upper]))[:, coordinates.slides]
+    far = (float(np.abs(list(places)).max(initial=0.0)) for places in (joints, links))
+    return next(filter(None, far), float(limits[np.isfinite(limits)].max(initial=0.0))) or 1.0
 
 
 def units(model: pin.Model) -> Array:

@@ -57,6 +57,10 @@ class Closure:
         active: Columns of the active joints.
         passive: Columns of the passive joints.
         structure: Independent equations and the order in which they solve.
+        size: Of the machine [m], see `crane.closure.choice.size`.
+        units: (nv,) of the coordinates, to compare them: 1 rad, and the machine's size [m].
+        pace: Unit of time [s] of what moves by its weight, 1 s for a machine of 1 m: motions of
+            similar machines in the same gravity take times like the roots of their sizes (Froude).
         sought: How home was found where it did not follow from the guess, else None.
     """
 
@@ -79,6 +83,8 @@ class Closure:
     ):
         self.model = model
         self.equations = LoopEquations(model, loops, couplings)
+        self.size, self.units = self.equations.size, self.equations.units
+        self.pace = float(np.sqrt(self.size))
         self._local = threading.local()
         self.active_names = tuple(active)
         coordinates = self.equations.coordinates
@@ -105,7 +111,8 @@ class Closure:
             home = self.structure.home + 2 * np.pi * turns
             self.structure = dataclasses.replace(self.structure, home=home)
         span = (coordinates.upper - coordinates.lower)[self.active]
-        self._span = np.where(np.isfinite(span) & (span > 0), span, 1.0)
+        limited = np.isfinite(span) & (span > 0)
+        self._span = np.where(limited, span, self.equations.units[self.active])
         self._branch = Branch(
             self.equations, self.structure, self._names, self.active, self.passive, self._span
         )
@@ -125,7 +132,12 @@ class Closure:
         branch = self._branch
         try:
             return FastClosure(
-                self.equations, self.structure, self.active, self.passive, branch.home, branch.size
+                self.equations,
+                self.structure,
+                self.active,
+                self.passive,
+                branch.home,
+                branch.far(branch.home.q),
             )
         except TooLongError:
             return None
@@ -349,7 +361,8 @@ class Closure:
         """Choices of active joints for this machine at home, see `crane.closure.choice`."""
         followers = np.flatnonzero((self.equations.factors != 0).any(axis=0)).tolist()
         rows = self.structure.rows  # the others contradict them by the digits of a file
-        return proposals(self.model, self.equations.evaluate(self.home)[1][rows], followers)
+        jacobian = self.equations.evaluate(self.home)[1] / self.equations.row_units[:, None]
+        return proposals(self.model, jacobian[rows], followers)
 
     def motion(self, q: Array, v_a: Array) -> tuple[Array, Array, Array]:
         """gamma, v = gamma v_A and drift of one sample, at less cost than one by one.
@@ -361,17 +374,22 @@ class Closure:
         Returns:
             (nv, n), (nv,), (nv,).
         """
-        jacobian = self.equations.evaluate(q)[1][self.structure.rows]
-        gamma = self._fill(self._passive(jacobian, jacobian[:, self.active], q))
+        jacobian = self.equations.scaled(q)[1][self.structure.rows]
+        gamma = self._fill(self._gamma_rows(jacobian, q))
         v = gamma @ v_a
         return gamma, v, self._bend(jacobian, q, v)
 
     def _gamma(self, q: Array) -> Array:
-        jacobian = self.equations.evaluate(q)[1][self.structure.rows]
-        return self._fill(self._passive(jacobian, jacobian[:, self.active], q))
+        return self._fill(self._gamma_rows(self.equations.scaled(q)[1][self.structure.rows], q))
+
+    def _gamma_rows(self, jacobian: Array, q: Array) -> Array:
+        """(passive, n) of gamma, from a Jacobian in shares of the machine's size."""
+        rows = self._passive(jacobian, jacobian[:, self.active], q)
+        units = self.equations.units
+        return rows * units[self.passive, None] / units[self.active]
 
     def _drift(self, q: Array, v: Array) -> Array:
-        return self._bend(self.equations.evaluate(q)[1][self.structure.rows], q, v)
+        return self._bend(self.equations.scaled(q)[1][self.structure.rows], q, v)
 
     def _fill(self, passive: Array) -> Array:
         gamma = np.zeros((self.model.nv, len(self.active)))
@@ -381,12 +399,13 @@ class Closure:
 
     def _bend(self, jacobian: Array, q: Array, v: Array) -> Array:
         drift = np.zeros(self.model.nv)
-        second = self.equations.curvature(q, v)[self.structure.rows]
-        drift[self.passive] = self._passive(jacobian, second, q)
+        second = (self.equations.curvature(q, v) / self.equations.row_units)[self.structure.rows]
+        solved = self._passive(jacobian, second, q)
+        drift[self.passive] = solved * self.equations.units[self.passive]
         return drift
 
     def _passive(self, jacobian: Array, right: Array, q: Array) -> Array:
-        """-J_P^-1 right."""
+        """-J_P^-1 right, all in shares of the machine's size."""
         try:
             solved = solve(jacobian[:, self.passive], -right)
         except np.linalg.LinAlgError:

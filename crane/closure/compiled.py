@@ -1,6 +1,6 @@
 """Closing loops in machine code made for one machine."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from weakref import WeakValueDictionary
 
@@ -10,11 +10,19 @@ from crane.closure.branch import Posture
 from crane.closure.clusters import clusters_of
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import Indices, Structure
-from crane.closure.traced import Bodies, Constants, Loops, folded, geometry_of
+from crane.closure.traced import (
+    Bodies,
+    Constants,
+    Loops,
+    folded,
+    geometry_of,
+    largest_share,
+)
 from crane.codegen import Layout, Number, Program, Tape, largest, maximum
 from crane.codegen.scalar import minimum
 from crane.common.samples import Array
 
+# All in rad and shares of the machine's size, as `Branch` has them.
 _STEEP = 1e3  # an entry of gamma above this is looked at closely by `Branch`
 _NEAR = 1e-6  # residual of a guess that is as good as closed
 _EVALUATIONS = 8  # of Newton's method, which doubles its digits
@@ -66,7 +74,7 @@ class FastClosure:
         active: Columns of the active joints.
         passive: Columns of the others.
         home: The home posture, whose branch is followed.
-        size: Of the machine [m], to which tolerances refer.
+        far: How much larger than the machine's size is what rounds, see `Branch.far`.
 
     Attributes:
         geometry: What the formulas were traced from.
@@ -84,7 +92,7 @@ class FastClosure:
         active: Indices,
         passive: Indices,
         home: Posture,
-        size: float,
+        far: float,
     ):
         self.geometry = geometry_of(equations)
         self._equations, self._structure = equations, structure
@@ -104,7 +112,7 @@ class FastClosure:
         self.address = program.address("follow")
         self.close_address = program.address("close")
         self._home = home
-        self.bounds = np.array([1e-15 * size, 1e-13 * size, 1e-9 * min(1.0, size)])
+        self.bounds = np.array([1e-15 * far, 1e-13 * far, 1e-9])
 
     def _moving(self) -> tuple[Indices, Indices]:
         """Passive joints and active ones that move them: others of their cluster."""
@@ -231,11 +239,12 @@ class FastClosure:
         steepest is the largest entry of gamma, whose rows are those of passive joints; edge the
         least determinant of a block, with its sign on the home branch.
         """
-        q, _, loops = self.trace(Tape(), 0, 1)
+        q, posture, loops = self.trace(Tape(), 0, 1)
         steps = loops.correction
+        long = [not posture.geometry.revolute[joint] for joint in steps]
         corrected = [x + steps.get(i, 0.0) for i, x in enumerate(q, start=1)]
         rows = [loops.gamma[loops.passive_joints[row]][k] for row, k in self._pairs]
-        steepest = largest(rows)
+        steepest = self._steepest(rows, posture.per_size)
         worst = maximum(steepest - _STEEP, loops.surplus - self._structure.surplus.allowed)
         edge: Number = 1.0
         for sign, determinant in zip(signs, loops.determinants, strict=True):
@@ -248,7 +257,7 @@ class FastClosure:
             2,
             {
                 "residual": [loops.residual],
-                "change": [largest(steps.values())],
+                "change": [largest_share(list(steps.values()), long, posture.per_size)],
                 "regular": [-1.0 * worst],
                 "steepest": [steepest],
                 "edge": [edge],
@@ -256,6 +265,20 @@ class FastClosure:
                 "gamma": rows,
             },
         )
+
+    def _steepest(self, rows: Sequence[Number], per_size: Number) -> Number:
+        """The largest entry of gamma."""
+        turns = self.geometry.revolute
+        powers: dict[int, list[Number]] = {0: [], 1: [], -1: []}  # of a length in an entry
+        for (row, k), entry in zip(self._pairs, rows, strict=True):
+            one, two = turns[self._passive[row] + 1], turns[self._active[k] + 1]
+            powers[int(two) - int(one)].append(entry)
+        worst = largest(powers[0])
+        if powers[1]:
+            worst = maximum(worst, per_size * largest(powers[1]))
+        if powers[-1]:
+            worst = maximum(worst, largest(powers[-1]) / per_size)
+        return worst
 
     def _add_close(self, program: Program) -> None:
         """Newton's method in place: 1 where it closes the loops on the home branch, else 0.
@@ -299,7 +322,7 @@ class FastClosure:
             first = r.array("first", program.outputs("predict"))
             result = r.array("result", program.outputs("newton"))
             with r.loop(r.count) as i:
-                r.call("predict", r.at, r.targets.row(i, n), first)
+                r.call("predict", r.numbers, r.at, r.targets.row(i, n), first)
                 move = r.let(first["move"])
                 with r.when(~(move < 1.0)):
                     r.give(i)
@@ -307,7 +330,7 @@ class FastClosure:
                 closed = r.call("close", r.numbers, guess, result, r.bounds)
                 with r.when(closed < 1):
                     r.give(i)
-                r.call("distance", first, guess, verdict)
+                r.call("distance", r.numbers, first, guess, verdict)
                 with r.when(~(verdict["all"] <= move * 0.5 + 0.02)):
                     r.give(i)
                 r.copy(r.at, guess, nq)
@@ -346,19 +369,29 @@ class FastClosure:
         return np.array([np.linalg.slogdet(block)[0] for block in blocks])
 
     def _add_moves(self, program: Program) -> None:
-        """predict(at, target) -> q, largest move of a passive joint; distance(q, q')."""
+        """predict(numbers, at, target) -> q, largest move of a passive joint; distance likewise.
+
+        distance(numbers, q, q').
+        """
+        long = [not self.geometry.revolute[column + 1] for column in self._passive]
         tape = Tape()
-        q, n = tape.loads(0, 0, self._nq), self._n
-        target = tape.loads(1, 0, n)
+        q, n = tape.loads(1, 0, self._nq), self._n
+        target = tape.loads(2, 0, n)
         change = [target[k] - q[column] for k, column in enumerate(self._active)]
         moves: list[Number] = [0.0] * len(self._passive)
         for i, (row, k) in enumerate(self._pairs):
-            moves[row] = moves[row] + tape.load(0, self._nq + i) * change[k]
+            moves[row] = moves[row] + tape.load(1, self._nq + i) * change[k]
         for column, move in zip(self._passive, moves, strict=True):
             q[column] = q[column] + move
         for column, value in zip(self._active, target, strict=True):
             q[column] = value
-        program.add("predict", 2, {"q": q, "move": [largest(moves)]})
+        move = largest_share(moves, long, self.per_size(tape))
+        program.add("predict", 3, {"q": q, "move": [move]})
         tape = Tape()
-        one, two = tape.loads(0, 0, self._nq), tape.loads(1, 0, self._nq)
-        program.add("distance", 2, [largest(one[i] - two[i] for i in self._passive)])
+        one, two = tape.loads(1, 0, self._nq), tape.loads(2, 0, self._nq)
+        apart = [one[i] - two[i] for i in self._passive]
+        program.add("distance", 3, [largest_share(apart, long, self.per_size(tape))])
+
+    def per_size(self, tape: Tape) -> Number:
+        """One over the machine's size, from the numbers as the first argument."""
+        return Constants(tape, 0, self.geometry.numbers)[len(self.geometry.numbers) - 1]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import pinocchio as pin
 
+from crane.closure.choice import size
 from crane.closure.coordinates import Coordinates
 from crane.common.errors import MechanismError
 from crane.common.samples import Array
@@ -80,6 +81,9 @@ class LoopEquations:
         names: Of what the equations belong to: loops, then couplings.
         loop_of_row: (m,) index in `names` of every equation.
         is_translation: (m,) whether it is about a length.
+        size: Of the machine [m], see `crane.closure.choice.size`.
+        units: (nv,) of the coordinates, to compare them: 1 rad, and the machine's size [m].
+        row_units: (m,) of the equations, likewise.
     """
 
     def __init__(
@@ -124,6 +128,9 @@ class LoopEquations:
         own = len(self.loops) + np.arange(len(self.couplings), dtype=np.intp)
         self.loop_of_row = np.concatenate([self._loop, own])
         self.is_translation = np.concatenate([self._moves, np.array(lengths, dtype=bool)])
+        self.size = size(model)
+        self.units = np.where(self.coordinates.slides, self.size, 1.0)
+        self.row_units = np.where(self.is_translation, self.size, 1.0)
 
     @property
     def data(self) -> pin.Data:
@@ -175,6 +182,18 @@ class LoopEquations:
         if not self.couplings:
             return phi, slopes
         return np.concatenate([phi, coupled]), np.vstack([slopes, self.factors])
+
+    def scaled(self, q: Array) -> tuple[Array, Array]:
+        """`evaluate` in shares of the machine's size: the same whatever its scale.
+
+        Args:
+            q: (nq,) [m], [rad].
+
+        Returns:
+            E^-1 phi (m,) and E^-1 dphi/dq D (m, nv), E = diag(row_units), D = diag(units).
+        """
+        phi, jacobian = self.evaluate(q)
+        return phi / self.row_units, jacobian / self.row_units[:, None] * self.units
 
     def turned_over(self, q: Array) -> str | None:
         """Name of a loop whose axes are antiparallel, which also solves its equations."""

@@ -21,15 +21,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import qr
 
-from crane.closure.choice import Indices, choose, size, units
+from crane.closure.choice import Indices, choose
 from crane.closure.equations import LoopEquations
 from crane.closure.mobility import locked_up, surplus_along, surplus_open
 from crane.common.samples import Array
 
-CLOSED = 1e-9  # [m], [rad]
-DIGITS = 1e-4  # of the machine's size, or rad: what counts as digits
+# in rad and shares of the machine's size, so that these are the same machine at any scale
+CLOSED = 1e-9
+DIGITS = 1e-4  # what counts as digits
 _MEANT = 1e-3  # share of the largest singular value from which on one is meant
-_ROUNDING = 1e-12  # of surplus equations that hold to rounding, at the size of 1 m
+_ROUNDING = 1e-12  # of surplus equations that hold to rounding
 _OPEN = 1e-9  # of those that lock a machine up
 
 
@@ -38,9 +39,9 @@ class Surplus:
     """How far surplus equations may be open.
 
     Attributes:
-        allowed: What they may be open by [m], [rad].
+        allowed: What they may be open by [rad], [machine's size].
         row: The one that is open by most on the way that was looked at, -1 for exact ones.
-        gap: By how much it is [m], [rad].
+        gap: By how much it is, likewise.
     """
 
     allowed: float = CLOSED
@@ -48,7 +49,8 @@ class Surplus:
     gap: float = 0.0
 
 
-Lock = tuple[int, float] | None  # the row that stays open by most, and by how much [m], [rad]
+# the row that stays open by most, and by how much [rad], [machine's size]
+Lock = tuple[int, float] | None
 
 
 class Exact:
@@ -65,9 +67,8 @@ class Exact:
 
     def __init__(self, equations: LoopEquations):
         self._equations = equations
-        self._size = size(equations.model)
-        self._share = np.where(equations.is_translation, self._size, 1.0)
-        self.closed = np.full(len(self._share), CLOSED)
+        self._share, self._unit = equations.row_units, equations.units
+        self.closed = CLOSED * self._share
 
     def is_closed(self, q: Array) -> bool:
         """Whether all loops are closed."""
@@ -77,15 +78,15 @@ class Exact:
         """Close all loops by moving the free joints; the residual tells whether that worked."""
         q = q.copy()
         for _ in range(200):
-            phi, jacobian = self._equations.evaluate(q)
+            phi, jacobian = self._equations.scaled(q)
             if np.abs(phi).max(initial=0.0) < 1e-13:
                 break
-            q[free] += least_squares_step(jacobian[:, free], phi)
+            q[free] += least_squares_step(jacobian[:, free], phi) * self._unit[free]
         return q
 
     def jacobian(self, q: Array) -> Array:
-        """(m, nv) slopes of the equations as they were meant."""
-        return self._equations.evaluate(q)[1]
+        """(m, nv) slopes of the equations as they were meant, in shares of the machine's size."""
+        return self._equations.evaluate(q)[1] / self._share[:, None]
 
     def locked_up(self, q: Array, freedom: int, tolerance: float) -> Lock:
         """See `crane.closure.mobility.locked_up`."""
@@ -98,7 +99,7 @@ class Exact:
         self, home: Array, passive: Indices, rank: int, tolerance: float
     ) -> tuple[Indices, Indices] | None:
         """As many independent rows as the rank, and the others; None where J_P has a lower one."""
-        jacobian = self._equations.evaluate(home)[1][:, passive]
+        jacobian = self._equations.scaled(home)[1][:, passive]
         _, upper, pivots = qr(jacobian.T, mode="economic", pivoting=True)
         diagonal = np.abs(np.diag(upper))
         if (diagonal > tolerance * diagonal[0]).sum() < rank:
@@ -114,7 +115,7 @@ class Exact:
         Digits that are almost enough hold at home, and no longer half a turn away.
         """
         lock = surplus_open(self._equations, home, rows, redundant, active)
-        if lock is None or lock[1] <= _ROUNDING * max(1.0, self._size):
+        if lock is None or lock[1] <= _ROUNDING:
             return None, Surplus()
         if lock[1] > _OPEN:
             return lock, Surplus()
@@ -126,13 +127,12 @@ class Exact:
         if not len(redundant):
             return None, Surplus()
         widest, moves = surplus_along(self._equations, home, rows, redundant, active)
-        most = DIGITS * self._share[redundant]
-        worst = int((widest / most).argmax())
+        worst = int(widest.argmax())
         row, gap = int(redundant[worst]), float(widest[worst])
-        if gap > most[worst] or not moves:
+        if gap > DIGITS or not moves:
             return (row, gap), Surplus()
-        decade = 10.0 ** np.ceil(np.log10(max(2 * widest.max(), CLOSED)))  # code is shared by it
-        return None, Surplus(max(CLOSED, min(float(decade), float(most.max()))), row, gap)
+        decade = 10.0 ** np.ceil(np.log10(max(2 * gap, CLOSED)))  # code is shared by it
+        return None, Surplus(max(CLOSED, min(float(decade), DIGITS)), row, gap)
 
 
 class Rounded(Exact):
@@ -145,20 +145,20 @@ class Rounded(Exact):
     def __init__(self, equations: LoopEquations):
         super().__init__(equations)
         self.closed = DIGITS * self._share
-        self._unit = units(equations.model)
 
     def close(self, q: Array, free: Indices) -> Array:
         """Least squares; what the digits contradict is left open, and moves nothing."""
         q = q.copy()
         for _ in range(200):
-            phi, jacobian = self._equations.evaluate(q)
-            if (np.abs(phi) < 10 * self.closed).all():
+            phi, jacobian = self._equations.scaled(q)
+            if (np.abs(phi) < 10 * DIGITS).all():
                 break
-            q[free] += least_squares_step(jacobian[:, free], phi)
+            q[free] += least_squares_step(jacobian[:, free], phi) * self._unit[free]
         for _ in range(20):
-            phi, jacobian = self._equations.evaluate(q)
-            slope = (jacobian / self._share[:, None] * self._unit)[:, free]
-            step = np.linalg.lstsq(slope, -phi / self._share, rcond=_MEANT)[0]
+            phi, jacobian = self._equations.scaled(q)
+            if not np.isfinite(jacobian).all():  # beyond all numbers: not closed
+                break
+            step = np.linalg.lstsq(jacobian[:, free], -phi, rcond=_MEANT)[0]
             q[free] += step * self._unit[free]
             if not 1e-14 < np.abs(step).max(initial=0.0) < 1.0:
                 break
@@ -166,10 +166,10 @@ class Rounded(Exact):
 
     def jacobian(self, q: Array) -> Array:
         """(m, nv) slopes without the singular values that are digits."""
-        slope = super().jacobian(q) / self._share[:, None] * self._unit
+        slope = self._equations.scaled(q)[1]
         left, values, right = np.linalg.svd(slope, full_matrices=False)
         values[values < _MEANT * values[0]] = 0.0
-        return np.asarray((left * values @ right) * self._share[:, None] / self._unit)
+        return np.asarray((left * values @ right) / self._unit)
 
     def locked_up(self, q: Array, freedom: int, tolerance: float) -> Lock:
         """Left to `surplus`, which looks farther."""
@@ -179,7 +179,7 @@ class Rounded(Exact):
         self, home: Array, passive: Indices, rank: int, tolerance: float
     ) -> tuple[Indices, Indices] | None:
         """Rows of the largest volume, and the others; None where J_P has a lower rank."""
-        slope = (super().jacobian(home) / self._share[:, None] * self._unit)[:, passive]
+        slope = self._equations.scaled(home)[1][:, passive]
         left, values, _ = np.linalg.svd(slope, full_matrices=False)
         if rank != len(passive) or values[-1] < _MEANT * values[0]:
             return None
@@ -194,7 +194,7 @@ class Rounded(Exact):
 
 
 def least_squares_step(jacobian: Array, phi: Array) -> Array:
-    """A damped Gauss-Newton step towards phi = 0, at most 0.3 [m], [rad] in any joint."""
+    """A damped Gauss-Newton step towards phi = 0, at most 0.3 in any joint; all in shares."""
     gram = jacobian.T @ jacobian
     rounding = 1e-15 * float(gram.diagonal().max(initial=0.0))
     damping = 1e-12 + rounding + 1e-3 * float(phi @ phi)

@@ -9,8 +9,8 @@ Where the loops do not close from the guess, they are closed from anywhere
 
 So are they where the active joints are too few or too many where it closes, and where home as it
 closes from the guess is outside of limits or more than 0.5 rad (or half of the machine's size)
-from what the file says. Then home is kept where none that is found is nearer; far off, that is
-told where there are others.
+from what the file says. Then home is kept where none that is found is nearer, and told if it is
+far off.
 
 The first of these that closes counts, and of the postures that it finds the one that is nearest to
 the guess, see `Search.postures`.
@@ -20,6 +20,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from crane.closure.anywhere import Search
 from crane.closure.equations import LoopEquations
@@ -102,16 +103,22 @@ def settle(
             raise refused if isinstance(refused, ActiveError) else usable
     if first is None:
         raise refused
-    if not others or search.off_said(first.home)[1] <= _FAR:
+    if search.off_said(first.home)[1] <= _FAR:
         return first, None
     return first, _sought(search, reason, others + 1, first.home)
 
 
+def within(equations: LoopEquations, q: Array) -> NDArray[np.bool_]:
+    """(nv,) whether the joints of a posture (nq,) are within their limits, but for rounding."""
+    coordinates, slack = equations.coordinates, CLOSED * equations.units
+    kept: NDArray[np.bool_] = (q >= coordinates.lower - slack) & (q <= coordinates.upper + slack)
+    return kept
+
+
 def _doubt(search: Search, equations: LoopEquations, passive: Indices, home: Array) -> str:
     """What speaks against home as it closes from the guess, nothing where all is well."""
-    names, coordinates = equations.coordinates.names, equations.coordinates
-    out = (home < coordinates.lower - CLOSED) | (home > coordinates.upper + CLOSED)
-    columns = passive[out[passive]]
+    names = equations.coordinates.names
+    columns = passive[~within(equations, home)[passive]]
     if len(columns):
         return f"{names[int(columns[0])]} closes outside of its limits"
     joint, off = search.off_said(home)
@@ -122,9 +129,7 @@ def _nearer(
     search: Search, equations: LoopEquations, passive: Indices, found: list[Array], home: Array
 ) -> list[Array]:
     """Of some postures those that are nearer to what is said than home is, if it is in limits."""
-    coordinates = equations.coordinates
-    kept = (home >= coordinates.lower - CLOSED) & (home <= coordinates.upper + CLOSED)
-    if not kept[passive].all():
+    if not within(equations, home)[passive].all():
         return found
     return [q for q in found if search.away(q)[:2] < search.away(home)[:2]]
 
@@ -151,10 +156,8 @@ def _usable(
 
 def _beyond(equations: LoopEquations, q: Array, passive: Indices) -> str | None:
     """A passive joint that is outside of its limits, None where all are within."""
-    coordinates = equations.coordinates
-    out = (q < coordinates.lower - CLOSED) | (q > coordinates.upper + CLOSED)
-    columns = passive[out[passive]]
-    return coordinates.names[int(columns[0])] if len(columns) else None
+    columns = passive[~within(equations, q)[passive]]
+    return equations.coordinates.names[int(columns[0])] if len(columns) else None
 
 
 def _analysed(

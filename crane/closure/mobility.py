@@ -17,7 +17,8 @@ from crane.common.samples import Array, solve
 
 _STEP = 0.02  # of a joint's scale
 _MOVED = 0.05  # share of a step that a finite motion keeps at least
-_OPEN = 1e-9  # residual that counts as open
+_OPEN = 1e-9  # residual that counts as open [rad], [machine's size]
+_AGAIN = 2  # closings of each direction
 _DIRECTIONS = 3  # drawn, beside those of single joints
 _WALK = 16  # steps to the end of the range
 
@@ -31,7 +32,9 @@ def locked_up(
 ) -> tuple[int, float] | None:
     """Where a machine has less freedom than its equations promise at a closed posture.
 
-    Steps in drawn directions of the null space N are closed with all equations, the shortest way.
+    Steps in drawn directions of the null space N are closed with all equations, the shortest way,
+    and again from as far in the direction that was left: a finite motion far from the first one is
+    found that way, and of no motion rounding is left.
     Joints that N lets move and that stay in all the ways that remain are locked. A linkage in line
     that may go on in several ways (a bifurcation) has more columns of N than freedom, too, but all
     its joints move.
@@ -44,10 +47,11 @@ def locked_up(
         close: Closes all loops from a near posture.
 
     Returns:
-        The row that stays open by most, and by how much [m], [rad]; None where all is well.
+        The row that stays open by most, and by how much [rad], [machine's size]; None where all is
+        well.
     """
     scale = scales(equations.model)
-    jacobian = equations.evaluate(q)[1]
+    jacobian = equations.evaluate(q)[1] / equations.row_units[:, None]
     basis = motions(jacobian, scale, tolerance)
     if basis.shape[1] <= freedom:
         return None
@@ -55,9 +59,14 @@ def locked_up(
     moved = np.zeros(len(q))  # shares of the step
     for _ in range(2 * basis.shape[1]):
         way = basis @ random.normal(size=basis.shape[1])
-        near = close(q + _STEP * scale * way / np.linalg.norm(way))
-        if np.abs(equations.evaluate(near)[0]).max() < _OPEN:
-            moved = np.maximum(moved, np.abs(near - q) / scale / _STEP)
+        for _ in range(_AGAIN):
+            near = close(q + _STEP * scale * way / np.linalg.norm(way))
+            if not np.abs(equations.scaled(near)[0]).max() < _OPEN:
+                break
+            way = (near - q) / scale
+            moved = np.maximum(moved, np.abs(way) / _STEP)
+            if not way.any():
+                break
     promised = np.linalg.norm(basis, axis=1)
     if not ((promised > 1e-3) & (moved < _MOVED * promised)).any():
         return None
@@ -68,7 +77,7 @@ def locked_up(
         beside = _closed(equations, q + _STEP * scale * way, rows, basis / scale[:, None])
         if beside is None:
             continue
-        phi = np.abs(equations.evaluate(beside)[0])
+        phi = np.abs(equations.scaled(beside)[0])
         if phi.max() > size:
             worst, size = int(phi.argmax()), float(phi.max())
     return worst, size
@@ -77,7 +86,7 @@ def locked_up(
 def surplus_open(
     equations: LoopEquations, home: Array, rows: Indices, surplus: Indices, active: Indices
 ) -> tuple[int, float] | None:
-    """The surplus equation that holds least beside home, and how far it is open [m], [rad].
+    """The surplus equation that holds least beside home, and how far it is open, in shares.
 
     Active joints step one by one, and all together in drawn directions; the others follow by the
     independent rows. What is open far enough to tell ends the search.
@@ -92,7 +101,7 @@ def surplus_open(
         closed = (_closed(equations, q, rows, held) for q in starts)
         moved = next((q for q in closed if q is not None), None)
         if moved is not None:
-            phi = np.abs(equations.evaluate(moved)[0][surplus])
+            phi = np.abs(equations.scaled(moved)[0][surplus])
             worst = max(worst, (int(surplus[phi.argmax()]), float(phi.max())), key=lambda x: x[1])
         if worst[1] > _OPEN:
             break
@@ -102,7 +111,7 @@ def surplus_open(
 def surplus_along(
     equations: LoopEquations, home: Array, rows: Indices, surplus: Indices, active: Indices
 ) -> tuple[Array, bool]:
-    """How far each surplus equation opens all along the motions from home [m], [rad].
+    """How far each surplus equation opens all along the motions from home, in shares.
 
     Ways lead to the limits, at least 1 rad or the machine's size far; half a turn where there are
     none. They end where the branch does.
@@ -119,7 +128,7 @@ def surplus_along(
     reach = [
         np.where(np.isfinite(x), np.maximum(x, unit), np.where(turns, np.pi, unit)) for x in room
     ]
-    widest = np.abs(equations.evaluate(home)[0][surplus])
+    widest = np.abs(equations.scaled(home)[0][surplus])
     moves = np.zeros(len(active), dtype=bool)
     for held, way in _ways(model.nv, active):
         for side, far in zip((-1.0, 1.0), reach, strict=True):
@@ -130,7 +139,7 @@ def surplus_along(
                     break
                 q = near
                 moves |= way != 0
-                widest = np.maximum(widest, np.abs(equations.evaluate(q)[0][surplus]))
+                widest = np.maximum(widest, np.abs(equations.scaled(q)[0][surplus]))
     return widest, bool(moves.all())
 
 
@@ -149,14 +158,15 @@ def _closed(equations: LoopEquations, q: Array, rows: Indices, held: Array) -> A
     q = q.copy()
     none = np.zeros(held.shape[1])
     for _ in range(12):
-        phi, jacobian = equations.evaluate(q)
+        phi, jacobian = equations.scaled(q)
         if np.abs(phi[rows]).max(initial=0.0) < 1e-13:
             return q
+        ways = held.T * equations.units
         try:
-            change = solve(np.vstack([jacobian[rows], held.T]), np.concatenate([-phi[rows], none]))
+            change = solve(np.vstack([jacobian[rows], ways]), np.concatenate([-phi[rows], none]))
         except np.linalg.LinAlgError:
             return None
         if not np.abs(change).max() < 1.0:
             return None
-        q += change
+        q += change * equations.units
     return q if np.abs(phi[rows]).max(initial=0.0) < 1e-11 else None

@@ -18,7 +18,7 @@ Indices = NDArray[np.intp]
 
 _RANK = 1e-8  # relative size of a pivot that still counts
 _SINGULAR = 1e-5  # the same at home, which closing finds to the root of rounding if singular
-_NOTHING = 1e-9  # slope of an equation that no joint changes
+_NOTHING = 1e-9  # slope of an equation that no joint changes, all in shares of the machine's size
 
 
 class HomeError(MechanismError):
@@ -41,7 +41,7 @@ class ActiveError(MechanismError):
     Args:
         message: See `CraneError`.
         posture: (nq,) where the loops close; None where they leave no freedom.
-        jacobian: (m, nv) of all equations there.
+        jacobian: (m, nv) of all equations there, in shares of the machine's size.
         choices: Active joints that would do.
     """
 
@@ -136,19 +136,20 @@ def analyse(
     random = np.random.default_rng(0)
     postures = [somewhere]
     for _ in range(4):
-        moved = somewhere + random.uniform(-0.02, 0.02, model.nv)
+        moved = somewhere + random.uniform(-0.02, 0.02, model.nv) * equations.units
         near = exact.close(moved, everything)
         if exact.is_closed(near):
             postures.append(near)
     jacobians = [exact.jacobian(q) for q in postures]
+    units = equations.units
     for index, name in enumerate(equations.names):
         rows = equations.loop_of_row == index
-        if max(np.abs(jacobian[rows]).max() for jacobian in jacobians) < _NOTHING:
+        if max(np.abs(jacobian[rows] * units).max() for jacobian in jacobians) < _NOTHING:
             raise MechanismError(
                 f"loop '{name}' locks nothing that the joints do not lock already: remove it",
                 f"loop {name}",
             )
-    rank = max(_rank(jacobian) for jacobian in jacobians)
+    rank = max(_rank(jacobian * units) for jacobian in jacobians)
     freedom = model.nv - rank
     lock = exact.locked_up(somewhere, freedom, _SINGULAR)
     if lock is not None:
@@ -157,7 +158,7 @@ def analyse(
     def proposed(**choice: Sequence[int]) -> list[Choice]:
         return proposals(model, jacobians[0], followers, **choice)
 
-    if freedom != len(active) and _rank(jacobians[0], _SINGULAR) < rank:
+    if freedom != len(active) and _rank(jacobians[0] * units, _SINGULAR) < rank:
         raise HomeError(
             f"the home posture{given} is singular, where the linkage may go on in several ways: "
             "choose another under 'home'",
@@ -170,16 +171,16 @@ def analyse(
             _unnamed(freedom) + _listed("try ", found), somewhere, jacobians[0], found
         )
     if freedom != len(active):
-        stuck = _undetermined(jacobians, passive)
+        stuck = _undetermined(jacobians, units, passive)
         text, found = _miscounted(names, active, stuck, freedom), proposed()
         if 0 < freedom < len(active):
             text += _listed(", such as ", proposed(among=[int(i) for i in active]))
         elif freedom - len(active) < len(stuck):
             text += _listed(", such as ", proposed(kept=[int(i) for i in active]))
         raise ActiveError(text, somewhere if freedom else None, jacobians[0], found)
-    drivable = max(_rank(jacobian[:, passive]) for jacobian in jacobians)
+    drivable = max(_rank((jacobian * units)[:, passive]) for jacobian in jacobians)
     if drivable < rank:
-        stuck, found = _undetermined(jacobians, passive), proposed()
+        stuck, found = _undetermined(jacobians, units, passive), proposed()
         raise ActiveError(
             f"the active joints {_list(names, active)} cannot drive {_list(names, stuck)}: "
             f"choose others{_listed(', such as ', found)}",
@@ -207,7 +208,9 @@ def analyse(
     independent = exact.independent(home, passive, rank, _SINGULAR)
     if independent is None:
         other = ""
-        if _rank(exact.jacobian(home), _SINGULAR) == rank:  # a dead centre of these drives only
+        if (
+            _rank(exact.jacobian(home) * units, _SINGULAR) == rank
+        ):  # a dead centre of these drives only
             other = _listed(", or drive it by ", proposed())
         raise HomeError(
             f"the home posture ({_at(names, active, home)}) is at the edge of the assembly "
@@ -221,8 +224,8 @@ def analyse(
         raise _overconstrained(equations, *lock)
     incidence = np.zeros((rank, rank), dtype=bool)
     for _ in range(3):  # open postures: an entry that is zero only on closed ones must count
-        q = home + random.uniform(-0.3, 0.3, model.nv)
-        part = np.abs(equations.evaluate(q)[1][np.ix_(rows, passive)])
+        q = home + random.uniform(-0.3, 0.3, model.nv) * units
+        part = np.abs(equations.scaled(q)[1][np.ix_(rows, passive)])
         incidence |= part > 1e-10 * part.max(initial=1.0)
     blocks = block_triangular(incidence)
     assert blocks is not None, "independent equations have a matching"
@@ -247,7 +250,7 @@ def _rank(jacobian: Array, tolerance: float = _RANK) -> int:
 
 
 def _overconstrained(equations: LoopEquations, row: int, gap: float) -> MechanismError:
-    name = equations.names[equations.loop_of_row[row]]
+    name, gap = equations.names[equations.loop_of_row[row]], gap * equations.row_units[row]
     unit = "m" if equations.is_translation[row] else "rad"
     return MechanismError(
         f"loop '{name}' closes at home only: a small step beside it leaves it {gap:.2g} {unit} "
@@ -257,11 +260,11 @@ def _overconstrained(equations: LoopEquations, row: int, gap: float) -> Mechanis
     )
 
 
-def _undetermined(jacobians: Sequence[Array], passive: Indices) -> Indices:
+def _undetermined(jacobians: Sequence[Array], units: Array, passive: Indices) -> Indices:
     """Passive joints that the loops leave free at held active joints."""
     free = np.zeros(len(passive))
     for jacobian in jacobians:
-        _, values, right = np.linalg.svd(jacobian[:, passive])
+        _, values, right = np.linalg.svd((jacobian * units)[:, passive])
         rank = int((values > _RANK * values.max(initial=0.0)).sum())
         free = np.maximum(free, np.abs(right[rank:]).max(axis=0, initial=0.0))
     return passive[free > 1e-6]

@@ -18,6 +18,7 @@ from crane.codegen.scalar import (
     cross,
     dot,
     largest,
+    maximum,
     product,
     scale,
     solve,
@@ -44,8 +45,8 @@ class Geometry:
         revolute: (nb + 1,) whether the joint turns.
         flyers: First body of each free-flyer.
         turns: (nb + 1, 3, 3) from the body's directions here to those of Pinocchio's joint.
-        numbers: (12 (nb + frames),) rotation and origin of every joint frame in its parent body,
-            then of every loop frame in its body.
+        numbers: (12 (nb + frames) + 1,) rotation and origin of every joint frame in its parent
+            body, then of every loop frame in its body; one over the machine's size.
         frame_bodies: Body of each loop frame, predecessor and successor of each loop in turn.
     """
 
@@ -107,7 +108,7 @@ def geometry_of(equations: LoopEquations) -> Geometry:
         tuple(revolute),
         tuple(column + 1 for column in coordinates.floating),
         np.array([turn.rotation for turn in turns]),
-        np.concatenate(numbers) if numbers else np.zeros(0),
+        np.concatenate([*numbers, [1.0 / equations.size]]),
         tuple(last[body] for body, _ in frames),
     )
 
@@ -192,6 +193,11 @@ class Bodies:
                 (cross(origin, axis), axis) if geometry.revolute[i] else (axis, [0.0] * 3)
             )
 
+    @property
+    def per_size(self) -> Number:
+        """One over the machine's size."""
+        return self._constants[len(self.geometry.numbers) - 1]
+
     def axis(self, i: int) -> Vector:
         """Along or about which joint i moves."""
         flyers = self.geometry.flyers
@@ -251,6 +257,20 @@ def _coupled(factors: Array, offset: float, q: Sequence[Number]) -> Row:
     return Row((0, 0), False, still, still, (still, still), phi, slopes)
 
 
+def largest_share(values: Sequence[Number], long: Sequence[bool], per_size: Number) -> Number:
+    """The largest absolute value in rad and shares of the machine's size.
+
+    Args:
+        values: Angles and lengths.
+        long: Which are lengths.
+        per_size: One over the machine's size.
+    """
+    turns = [value for value, is_long in zip(values, long, strict=True) if not is_long]
+    lengths = [value for value, is_long in zip(values, long, strict=True) if is_long]
+    most = largest(turns)
+    return maximum(most, per_size * largest(lengths)) if lengths else most
+
+
 class Loops:
     """The independent loop equations at a traced posture.
 
@@ -272,7 +292,8 @@ class Loops:
         passive: Indices,
         posture: Bodies,
     ):
-        self._structure = structure
+        self._structure, self._posture = structure, posture
+        self._long = equations.is_translation
         self.active_joints = [int(column) + 1 for column in active]
         self.passive_joints = [int(column) + 1 for column in passive]
         self._frames = [posture.frame(i) for i in range(len(posture.geometry.frame_bodies))]
@@ -369,13 +390,17 @@ class Loops:
 
     @property
     def residual(self) -> Number:
-        """The largest absolute phi of the independent equations."""
-        return largest(row.phi for row in self.rows)
+        """The largest absolute phi of the independent equations, in shares of the size."""
+        return self._largest(self.rows, self._structure.rows)
 
     @property
     def surplus(self) -> Number:
-        """The largest absolute phi of the redundant equations."""
-        return largest(row.phi for row in self._others)
+        """The largest absolute phi of the redundant equations, likewise."""
+        return self._largest(self._others, self._structure.redundant)
+
+    def _largest(self, rows: Sequence[Row], indices: Indices) -> Number:
+        long = self._long[indices].tolist()
+        return largest_share([row.phi for row in rows], long, self._posture.per_size)
 
 
 class MovingBodies:

@@ -67,7 +67,7 @@ class Brief:
 
 
 # Between these lies every quantity of a machine in SI units but zero, and its square is a number.
-SMALLEST, LARGEST = 1e-15, 1e15
+SMALLEST, LARGEST = 1e-30, 1e30
 FARTHEST = 1e6  # coordinate [m], [rad] whose sine still has ten digits
 MOST_SEEDS = 2**64 - 1
 

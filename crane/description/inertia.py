@@ -5,7 +5,7 @@ import numpy as np
 # Inertias are printed with a few digits: a violation below this share of the largest principal
 # moment is rounding.
 _ROUNDING = 1e-4
-_NO_INERTIA = 1e-15  # [kg m2]
+_ATOM = 1e-10  # [m] radius of gyration that no body is below
 
 
 def inertia_problem(mass: float, tensor: np.ndarray) -> str | None:
@@ -18,7 +18,7 @@ def inertia_problem(mass: float, tensor: np.ndarray) -> str | None:
         return "a mass or an inertia beyond all numbers, give smaller ones"
     moments = np.linalg.eigvalsh(tensor)
     largest = float(np.abs(moments).max())
-    if largest < _NO_INERTIA:
+    if largest <= _ATOM**2 * mass:
         return "a mass but no inertia, give at least a small sphere's" if mass > 0 else None
     if moments[0] < -_ROUNDING * largest:
         return f"the negative principal moment of inertia {moments[0]:.4g} kg m2, correct it"

@@ -240,9 +240,11 @@ class Dynamics:
             weights[names.index(name)] = as_number(given, f"the share of '{name}'", "", above=0)
         reach = self._reach(q_a)
         tau_a = as_samples(tau_a, n, "tau_a", self.machine.active)
+        units = self.machine.closure.units[self.machine.closure.active]
+        reach = reach * units[:, None]  # virtual work per 1 rad and the machine's size: to compare
         shared = weights[:, None] * np.swapaxes(reach, -1, -2)
         inverse = np.linalg.pinv(reach @ shared, rcond=1e-12, hermitian=True)
-        forces: Array = np.einsum("...ij,...jk,...k->...i", shared, inverse, tau_a)
+        forces: Array = np.einsum("...ij,...jk,...k->...i", shared, inverse, tau_a * units)
         return forces
 
     def active_forces(self, q_a: ArrayLike, forces: ArrayLike) -> Array:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from crane.common.errors import MechanismError
 from crane.common.samples import Array, solve
 from crane.dynamics.joint_forces import JointForces
 from crane.machine import Machine
@@ -147,7 +148,15 @@ class TreeDynamics:
 
     def _forward(self, motion: ClosedState, tau_a: Array, friction: bool) -> Array:
         bias = self._project(motion, motion.drift, friction)
-        return solve(self._mass(motion), tau_a - bias)
+        mass = self._mass(motion)
+        try:
+            np.linalg.cholesky(mass)  # elimination would divide by what rounding leaves
+            return solve(mass, tau_a - bias)
+        except np.linalg.LinAlgError:
+            raise MechanismError(
+                "the mass matrix is not definite: some motion moves no mass that counts beside "
+                "the others', correct the masses and inertias"
+            ) from None
 
     def _energy(self, motion: ClosedState) -> Array:
         """Kinetic and potential."""

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Sequence
 
 from crane.closure import Closure
-from crane.closure.choice import size, slides
+from crane.closure.choice import slides
 from crane.closure.exactness import CLOSED
 from crane.common.errors import CraneWarning
 from crane.description import MachineSpec
@@ -54,8 +54,8 @@ def _digits(spec: MachineSpec, closure: Closure) -> str:
     loop = equations.names[equations.loop_of_row[surplus.row]]
     place = spec.where.get(f"loop {loop}", spec.path.name)
     length = bool(equations.is_translation[surplus.row])
-    gap = f"{surplus.gap:.2g} {'m' if length else 'rad'}"
-    share = f" ({surplus.gap / size(closure.model):.1g} of the machine's size)" if length else ""
+    gap = f"{surplus.gap * equations.row_units[surplus.row]:.2g} {'m' if length else 'rad'}"
+    share = f" ({surplus.gap:.1g} of the machine's size)" if length else ""
     return (
         f"{place}: loop '{loop}' closes but for digits: its surplus equations stay open by up to "
         f"{gap}{share}, while the others are closed; write axes, angles and pins with more digits"

@@ -37,7 +37,7 @@ from crane.description.tree import Tree
 from crane.hydraulics import Hydraulics
 from crane.machine.between import misplaced
 
-_LIMIT_SLACK = 1e-9  # [m], [rad] beyond a limit that counts as on it
+_LIMIT_SLACK = 1e-9  # [rad], [machine's size] beyond a limit that counts as on it
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,8 @@ class Machine:
             LimitError: A coordinate lies outside of its limits.
         """
         q_a = as_samples(q_a, len(self.active), what, self.active)
-        outside = (q_a < self.lower - _LIMIT_SLACK) | (q_a > self.upper + _LIMIT_SLACK)
+        slack = _LIMIT_SLACK * self.closure.units[self.closure.active]
+        outside = (q_a < self.lower - slack) | (q_a > self.upper + slack)
         if outside.any():
             index = tuple(int(i) for i in np.argwhere(outside)[0])
             joint = index[-1]
@@ -385,7 +386,8 @@ class Machine:
         mass = as_number(payload.mass, "the payload's mass", "kg")
         if mass < 0:
             raise InputError(f"the payload's mass is {mass:g} kg, it must not be negative")
-        if tensor.shape != (3, 3) or not np.allclose(tensor, tensor.T, rtol=1e-9, atol=1e-15):
+        asymmetry = np.abs(tensor - tensor.T).max() if tensor.shape == (3, 3) else np.inf
+        if asymmetry > 1e-9 * np.abs(tensor).max():
             raise InputError("the payload's inertia is not a symmetric (3, 3) matrix")
         problem = inertia_problem(mass, tensor)
         if not mass and tensor.any():

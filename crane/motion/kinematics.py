@@ -15,7 +15,9 @@ from crane.common.errors import ClosureError, InputError, UnreachableTipError
 from crane.common.samples import Array, as_sample, as_samples, per_sample
 from crane.machine import Machine
 
-_ACCURACY = 1e-11  # [m] per metre of machine
+# in shares of the machine's size, or of the distance of what is sought if that is farther
+_ACCURACY = 1e-11
+_ROUNDING = 1e-15
 _STRIDE = 16  # samples of a path between those that are searched for one by one
 _CHUNK = 1000  # samples of a stack at once
 _BESIDE = 0.02  # share of the strokes by which a sample may miss the curve through those
@@ -44,7 +46,8 @@ class Kinematics:
         self._frame = machine.frame(frame)
         span = machine.upper - machine.lower
         # free joints stay where they are
-        self._scale = np.where(np.isfinite(span), span, 1.0) * machine.driven
+        units = machine.closure.units[machine.closure.active]
+        self._scale = np.where(np.isfinite(span), span, units) * machine.driven
 
     def __repr__(self) -> str:
         """What moves, of what."""
@@ -208,6 +211,7 @@ class Kinematics:
             curve = make_interp_spline(knots, searched)(np.arange(len(targets)))
             q_a = curve = np.clip(curve, machine.lower, machine.upper)
             best, before = q_a, np.full(len(targets), np.inf)
+            far = self._far(targets)
             for _ in range(10):
                 rows = self._fast.rows(machine.closure.solve(q_a))
                 error = targets - rows[:, :3]
@@ -215,15 +219,19 @@ class Kinematics:
                 closer = distance < before
                 best = np.where(closer[:, None], q_a, best)
                 before = np.minimum(distance, before)
-                if not (closer & (distance > 1e-15)).any():  # [m] rounding
+                if not (closer & (distance > _ROUNDING * far)).any():
                     break
                 step = np.linalg.pinv(rows[:, 3:-3].reshape(-1, 3, n)) @ error[:, :, None]
                 q_a = np.clip(q_a + step[:, :, 0], machine.lower, machine.upper)
         except (ClosureError, np.linalg.LinAlgError):
             return None
         beside = np.abs(best - curve) <= _BESIDE * self._scale
-        tolerance = 1e-2 * _ACCURACY * max(1.0, float(np.abs(targets).max()))
+        tolerance = 1e-2 * _ACCURACY * far
         return best if beside.all() and before.max() <= tolerance else None
+
+    def _far(self, targets: Array) -> float:
+        """What distances to targets compare with [m]."""
+        return max(self.machine.closure.size, float(np.abs(targets).max()))
 
     def tree_jacobian(self, q: Array) -> Array:
         """Jacobian dx/dq (3, nv) of the spanning tree at one posture (nq,)."""
@@ -262,7 +270,7 @@ class Kinematics:
         best = (np.inf, self.machine.home)
         if start is not None:
             best = self._descend(target, closure.solve(start))
-        tolerance = _ACCURACY * max(1.0, float(np.abs(target).max()))
+        tolerance = _ACCURACY * self._far(target)
         if best[0] > tolerance:
             near = sorted(self._grid, key=lambda item: float(np.sum((item[1] - target) ** 2)))
             for q, _ in near[:5]:
@@ -288,9 +296,9 @@ class Kinematics:
         closure, machine = self.machine.closure, self.machine
         error = target - self.position_at(q)
         distance = float(np.linalg.norm(error))
-        damping = 1e-6
+        damping, far = 1e-6, self._far(target)
         for _ in range(100):
-            if distance < 1e-15:  # [m] rounding
+            if distance < _ROUNDING * far:
                 break
             q_a = q[closure.active]
             jacobian = self._jacobian(q) * self._scale
@@ -316,7 +324,7 @@ class Kinematics:
                 if stalled:
                     break
             else:
-                if distance < 1e-13 or damping > 1e6:
+                if distance < 100 * _ROUNDING * far or damping > 1e6:
                     break
                 damping = max(10 * damping, 1e-9)
         return distance, q

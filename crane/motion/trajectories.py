@@ -11,8 +11,13 @@ from crane.common.samples import Array, as_number, as_samples
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
 
-LIMIT_SLACK = 1e-6  # [m], [rad] by which a reference may pass a limit between its knots
+_LIMIT_SLACK = 1e-6  # [rad], [machine's size]
 _KNOTS_PER_SECOND = 100
+
+
+def limit_slack(machine: Machine) -> Array:
+    """(nv,) by how much a reference may pass limits between its knots [m], [rad]."""
+    return _LIMIT_SLACK * machine.closure.units
 
 
 class Trajectory:
@@ -220,21 +225,24 @@ def beyond_limits(machine: Machine, reference: Trajectory, until: float = np.inf
     least, most = reference.bounds()
     if least.shape != machine.lower.shape:
         return ""  # of another machine, which is told elsewhere
-    if (np.maximum(machine.lower - least, most - machine.upper) <= LIMIT_SLACK).all():
+    slack = limit_slack(machine)[machine.closure.active]
+    if (np.maximum(machine.lower - least, most - machine.upper) <= slack).all():
         return ""  # without a look where it turns
     times = np.unique(np.minimum(reference.turns(), until))
     q_a = reference.position(times)
     excess = np.maximum(machine.lower - q_a, q_a - machine.upper)
-    if not (excess > LIMIT_SLACK).any():
+    if not (excess > slack).any():
         return ""
     span = machine.upper - machine.lower
-    shares = excess / np.where(np.isfinite(span), span, 1.0)
+    shares = excess / np.where(
+        np.isfinite(span), span, machine.closure.units[machine.closure.active]
+    )
     k, i = np.unravel_index(int(shares.argmax()), shares.shape)
     joint, value = machine.active[i], q_a[k, i]
     limit = machine.lower[i] if value < machine.lower[i] else machine.upper[i]
     unit = machine.unit(joint)
     place = machine.tree.joints[joint].limits.where
-    others = int((excess > LIMIT_SLACK).any(axis=0).sum()) - 1
+    others = int((excess > slack).any(axis=0).sum()) - 1
     more = f" ({others} other joint{'s' * (others > 1)} likewise)" if others else ""
     return (
         f"the reference of '{joint}' goes to {value:.6g} {unit} at t = {times[k]:.4g} s, beyond "

@@ -36,9 +36,11 @@ from crane.recordings.timeseries import TIME, Table, check_unit, spellings
 
 _PRESSURE, _CHAMBER = "pressure_", re.compile("pressure_.+_[ab]")
 _TELLS = 1e-6  # least share of a joint's motion that others do not tell
-_SAME = 1e-6  # [m], [rad]
-_HELD = {"rad": 0.02, "m": 2e-3}  # by which a joint that is held may be off
-_AGREE = {"rad": 5e-3, "m": 5e-4}  # root mean square by which sensors of one joint may differ
+_SAME = 1e-6  # [rad], [machine's size]
+# by which a joint that is held may be off, and the root mean square by which sensors of one joint
+# may differ [rad], [m]; in a machine of less than a metre shares of its size
+_HELD = {"rad": 0.02, "m": 2e-3}
+_AGREE = {"rad": 5e-3, "m": 5e-4}
 _COMPARED = 2000  # samples at which they are compared
 _AT_ONCE = 1 << 16  # samples whose postures are held
 _SAMPLE = re.compile(r"\(sample (\d+)\)")  # of an error of the closure
@@ -148,13 +150,18 @@ def check_pressures(machine: Machine, table: Table) -> None:
             )
 
 
+def _most(allowed: Mapping[str, float], machine: Machine, unit: str) -> float:
+    return allowed[unit] * (min(machine.closure.size, 1.0) if unit == "m" else 1.0)
+
+
 def moved_locks(
     machine: Machine, columns: Mapping[str, Array], units: Mapping[str, str]
 ) -> list[str]:
     """What recorded columns (N,) say against locked joints, a text for each.
 
-    The middle 99 % of the samples have to lie within a fiftieth of a radian or two millimetres of
-    where the joint is locked, but for eight standard deviations of their noise.
+    The middle 99 % of the samples have to lie within a fiftieth of a radian or two millimetres (of
+    a machine smaller than a metre, as many thousandths of its size) of where the joint is locked,
+    but for eight standard deviations of their noise.
     """
     told = []
     for joint, place in machine.locks.items():
@@ -164,7 +171,7 @@ def moved_locks(
         x = columns[joint]
         noise = float(np.median(np.abs(np.diff(x)))) if len(x) > 1 else 0.0
         low, high = np.quantile(x, [0.005, 0.995])
-        if max(high - place, place - low) > _HELD[unit] + 8 * noise:
+        if max(high - place, place - low) > _most(_HELD, machine, unit) + 8 * noise:
             told.append(
                 f"'{joint}' is locked at {place:.4g} {unit}, but goes from {low:.4g} to "
                 f"{high:.4g} {unit} in the recording"
@@ -286,7 +293,7 @@ def tell_disagreement(machine: Machine, table: Table) -> None:
         if unit == "rad":
             off -= 2 * np.pi * np.round(np.median(off) / (2 * np.pi))
         noise = float(np.median(np.abs(np.diff(x, 2)))) if len(x) > 2 else 0.0
-        if np.sqrt(np.mean(off**2)) > max(_AGREE[unit], 2 * noise):
+        if np.sqrt(np.mean(off**2)) > max(_most(_AGREE, machine, unit), 2 * noise):
             factor, shown = (180 / np.pi, "deg") if unit == "rad" else (1e3, "mm")
             at = int(np.abs(off).argmax())
             told.append(

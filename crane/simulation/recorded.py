@@ -12,7 +12,7 @@ from crane.control import Controller, Free, Signals, ValveDrive, reference_of
 from crane.hydraulics.circuit import BALANCES
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
-from crane.motion.trajectories import LIMIT_SLACK, Trajectory
+from crane.motion.trajectories import Trajectory, limit_slack
 from crane.recordings.recording import Recording
 
 Column = tuple[str, Array, str]  # name, values, unit
@@ -120,15 +120,15 @@ def limits_passed(machine: Machine, time: Array, q: Array) -> str:
     beyond = np.maximum(lower - q, q - upper)
     farthest = beyond.max(axis=0)
     stopped = {stop.joint for stop in machine.end_stops}
-    passed = [
-        i for i in np.flatnonzero(farthest > LIMIT_SLACK) if machine.joints[i] not in stopped
-    ]
+    slack = limit_slack(machine)
+    passed = [i for i in np.flatnonzero(farthest > slack) if machine.joints[i] not in stopped]
     if not passed:
         return ""
-    passed.sort(key=lambda i: -farthest[i] / min(upper[i] - lower[i], FARTHEST))
+    units = machine.closure.units
+    passed.sort(key=lambda i: -farthest[i] / min(upper[i] - lower[i], FARTHEST * units[i]))
     words = []
     for i in passed[:_SHOWN]:
-        joint, first = machine.joints[i], int(np.argmax(beyond[:, i] > LIMIT_SLACK))
+        joint, first = machine.joints[i], int(np.argmax(beyond[:, i] > slack[i]))
         limit = lower[i] if q[first, i] < lower[i] else upper[i]
         unit = machine.unit(joint)
         words.append(

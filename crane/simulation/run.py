@@ -148,7 +148,8 @@ def integrate(
     machine, reference = dynamics.machine, reference_of(control)
     q_a, v_a = _start(machine, initial, reference)
     try:
-        posture = machine.closure.solve(q_a)
+        # from home, whatever was solved before: a run is the same to the last bit
+        posture = machine.closure.solve(q_a, guess=machine.home)
         own = _own_start(control, dynamics, posture)
     except ClosureError as error:
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None

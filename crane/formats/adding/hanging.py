@@ -15,6 +15,7 @@ from crane.formats.machine_file.write import Draft
 from crane.formats.parts import add_joint, add_link
 from crane.machine import Machine
 
+_SAME = 1e-6  # share of a cylinder's length that is none
 _PARALLEL = 1e-9  # sine of an angle that is none: what is less exact gets a universal joint
 _X, _Y, _Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
@@ -34,7 +35,7 @@ def hung(
     planar = normal is not None and bool(abs(way @ normal) <= steel.bore)
     if normal is not None and planar:
         offset = float(way @ normal)
-        if abs(offset) > 1e-6:
+        if abs(offset) > _SAME * steel.retracted:
             notes.append(f"the rod's eye moved {1e3 * abs(offset):.4g} mm along its pin, into the "
                          "plane of the barrel's")  # fmt: skip
         way = way - offset * normal

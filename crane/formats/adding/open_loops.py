@@ -22,8 +22,10 @@ from crane.formats.machine_file.open_loops import named_pairs
 
 _NEAR = 0.05  # share of the machine's size within which two ends meet
 _MEETING = 0.01  # the same where no plane tells that they belong together
-_AWAY = 1e-6  # [m] from the origin of a body from which on a frame is a place of its own
-_DUMMY = 1e-6  # [kg] that CAD exporters give frames
+_AWAY = 1e-6  # share of the size away from a body's origin where a frame is a place of its own
+_DUMMY = (
+    1e-6  # [kg] that CAD exporters give frames; of a light machine a share of its heaviest link
+)
 _PARALLEL = 1e-6  # sine of an angle that counts as none
 _RING = 3  # joints of the tree below which a loop would lock what it closes
 _BARREL = re.compile(r"barrel|tube|housing|cylinder|cyl", re.IGNORECASE)
@@ -88,6 +90,8 @@ class _Search:
         }
         points = np.array([place.translation for place in self.places.values()])
         self.size = float(np.linalg.norm(np.ptp(points, axis=0)))
+        given = (link.inertial for link in spec.tree.links.values())
+        self.heaviest = max((one.mass for one in given if one is not None), default=0.0)
         self.joined = {frozenset((loop.predecessor, loop.successor)) for loop in spec.loops}
 
     def _traced(self) -> tuple[dict[str, frozenset[str]], dict[str, str]]:
@@ -185,12 +189,12 @@ class _Search:
         if self.above[link].moves:
             return self.above[link].kind == "prismatic" and not self.below.get(link)
         inertial = self.spec.tree.links[link].inertial
-        return inertial is None or inertial.mass <= _DUMMY
+        return inertial is None or inertial.mass <= _DUMMY * min(1.0, self.heaviest)
 
     def _is_beside(self, link: str) -> bool:
         """Whether a frame is not just the origin of its body."""
         away = self.places[link].translation - self.places[self.bodies[link]].translation
-        return bool(np.abs(away).max() > _AWAY)
+        return bool(np.abs(away).max() > _AWAY * self.size)
 
     def _is_hung(self, link: str) -> bool:
         body = self.bodies[link]

@@ -8,6 +8,7 @@ import pinocchio as pin
 from crane.closure import Closure
 from crane.closure.equations import LoopEquations
 from crane.closure.exactness import least_squares_step
+from crane.closure.home import within
 from crane.common.errors import CraneWarning, MechanismError
 from crane.common.samples import Array
 from crane.description import MachineSpec
@@ -18,7 +19,7 @@ from crane.machine.assemble import assemble, closed, home_guess
 from crane.machine.between import check_elements
 from crane.machine.masses import check_masses
 
-_OPEN = 1e-6  # [m], [rad] from which on a loop is said to be open
+_OPEN = 1e-6  # [rad], [machine's size] from which on a loop is said to be open
 
 
 def check_mechanism(spec: MachineSpec, found: Findings) -> Closure | None:
@@ -79,9 +80,9 @@ def _gaps(spec: MachineSpec, model: pin.Model, guess: Array) -> dict[str, str]:
     for free in (every, np.setdiff1d(every, active)):
         q = guess.copy()
         for _ in range(200):
-            phi, jacobian = equations.evaluate(q)
-            q[free] += least_squares_step(jacobian[:, free], phi)
-        phi, _ = equations.evaluate(q)
+            phi, jacobian = equations.scaled(q)
+            q[free] += least_squares_step(jacobian[:, free], phi) * equations.units[free]
+        phi, _ = equations.scaled(q)
         if np.abs(phi).max() > _OPEN:
             break
     found = {}
@@ -91,9 +92,8 @@ def _gaps(spec: MachineSpec, model: pin.Model, guess: Array) -> dict[str, str]:
         # rows of rotations are cosines of angles that are right ones when closed
         sine = min(1.0, float(np.linalg.norm(phi[rows & ~equations.is_translation])))
         if max(length, sine) > _OPEN:
-            found[f"loop {loop.name}"] = (
-                f"{_length(length)} apart and {np.degrees(np.arcsin(sine)):.3g} deg askew"
-            )
+            askew = f"{np.degrees(np.arcsin(sine)):.3g} deg askew"
+            found[f"loop {loop.name}"] = f"{_length(length * equations.size)} apart and {askew}"
     return found
 
 
@@ -104,11 +104,12 @@ def _length(metres: float) -> str:
 def _warn_of_limits(spec: MachineSpec, closure: Closure) -> None:
     """Warn of passive joints that are outside of their limits at home."""
     coordinates = closure.equations.coordinates
+    kept = within(closure.equations, closure.home)
     for column in closure.passive:
         name = coordinates.names[int(column)]
         lower, upper = coordinates.lower[column], coordinates.upper[column]
         q = closure.home[column]
-        if not lower - 1e-9 <= q <= upper + 1e-9:
+        if not kept[column]:
             place = spec.tree.joints[name].where
             warnings.warn(
                 f"{place}: passive joint '{name}' is at {q:.4g} with the loops closed at home, "

@@ -15,7 +15,7 @@ from crane.machine import Machine
 _RANK = 1e-8  # of a column's norm, what of it must be new
 _ALIKE = 1e12  # condition number of columns of length one that depend on each other
 _NOTHING = 1e-10  # of the largest norm, below which a column is zero
-_SPAN = 1.0  # [m], [rad] of joints without limits
+_SPAN = 1.0  # [rad], [machine's size] of joints without limits
 # Preferred as base parameters, first: what is told from one axis before what needs many.
 _ORDER = {
     "Izz": 0,
@@ -40,12 +40,15 @@ class Base(Brief):
         independent: (r,) columns of W that carry the base parameters.
         grouping: K (r, p): base parameters are K beta; identity in the independent columns.
         unobservable: Names of parameters without any effect.
+        units: (p,) to compare parameters with: of a body of 1 kg in a machine of size l 1, l and
+            l^2; of friction and the like what makes as much force at most.
     """
 
     names: tuple[str, ...]
     independent: Indices
     grouping: Array
     unobservable: tuple[str, ...]
+    units: Array
 
     @property
     def rank(self) -> int:
@@ -55,15 +58,17 @@ class Base(Brief):
     def narrowed(self, rows: Array) -> "Base":
         """What of the base parameters a motion tells, rows (m, r) of their columns."""
         names, tolerance = [self.names[i] for i in self.independent], _RANK
-        told = group(names, rows)
+        units = self.units[self.independent]
+        told = group(names, rows, units)
         # many columns, each of them new by a little, may together hold nothing new
         while _dependent(rows[:, told.independent]) and tolerance < 1e-2:
             tolerance *= 10
-            told = group(names, rows, tolerance=tolerance)
+            told = group(names, rows, units, tolerance=tolerance)
         if told.rank == self.rank:
             return self
         independent = self.independent[told.independent]
-        return Base(self.names, independent, told.grouping @ self.grouping, self.unobservable)
+        grouping = told.grouping @ self.grouping
+        return Base(self.names, independent, grouping, self.unobservable, self.units)
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -107,8 +112,10 @@ def random_samples(model: Model, count: int, seed: int = 0) -> Samples:
             "within its limits, narrow the limits"
         )
     # joints that move little per coordinate are moved faster, so that all columns are alike
-    span = upper - lower
-    v_a, a_a = (size * span * rng.normal(size=(count, len(lower))) for size in (1.0, 3.0))
+    span, pace = upper - lower, machine.closure.pace
+    v_a, a_a = (
+        size * span * rng.normal(size=(count, len(lower))) for size in (1.0 / pace, 3.0 / pace**2)
+    )
     return model.samples(np.array(q_a), v_a, a_a)
 
 
@@ -116,10 +123,10 @@ def strokes(machine: Machine) -> tuple[Array, Array]:
     """Limits of the active joints; those without are taken around home."""
     home = machine.home[machine.closure.active]
     span = machine.upper - machine.lower
-    endless = ~np.isfinite(span)
+    endless, around = ~np.isfinite(span), _SPAN * machine.closure.units[machine.closure.active]
     return (
-        np.where(endless, home - _SPAN, machine.lower),
-        np.where(endless, home + _SPAN, machine.upper),
+        np.where(endless, home - around, machine.lower),
+        np.where(endless, home + around, machine.upper),
     )
 
 
@@ -140,22 +147,31 @@ def base_parameters(model: Model, samples: Samples | None = None, seed: int = 0)
     p, n = len(model.names), len(model.machine.active)
     if samples is None:
         samples = random_samples(model, max(60, 4 * p // n), seed)
-    rows = model.regressor(samples).reshape(-1, p)
-    return group(model.names, rows, lambda column: _preference(model, column))
+    closure, bodies = model.machine.closure, 10 * len(model.bodies)
+    # forces as virtual work per 1 rad and the machine's size, so that drives compare
+    rows = (model.regressor(samples) * closure.units[closure.active, None]).reshape(-1, p)
+    units = np.ones(p)
+    body = [1.0, *[closure.size] * 3, *[closure.size**2] * 6]
+    units[:bodies] = np.tile(body, len(model.bodies))
+    norms = np.linalg.norm(rows, axis=0) * units
+    if norms[bodies:].any():  # friction and the like compare among themselves
+        units[bodies:] = norms[:bodies].max(initial=0.0) / norms[bodies:].max() or 1.0
+    return group(model.names, rows, units, lambda column: _preference(model, column))
 
 
 def group(
     names: Sequence[str],
     rows: Array,
+    units: Array,
     preference: Callable[[int], Any] = lambda column: column,
     tolerance: float = _RANK,
 ) -> Base:
-    """Base parameters of a regressor (m, p), columns of small preference first.
+    """Base parameters of a regressor (m, p) and units (p,), columns of small preference first.
 
     A column counts if what is new of it exceeds the tolerance of its norm.
     """
     norms = np.linalg.norm(rows, axis=0)
-    zero = norms <= _NOTHING * norms.max(initial=0.0)
+    zero = norms * units <= _NOTHING * (norms * units).max(initial=0.0)
     scaled = rows / np.where(zero, 1.0, norms)
     chosen: list[int] = []
     directions = np.empty((len(rows), 0))
@@ -174,7 +190,7 @@ def group(
     grouping = share * np.where(zero, 0.0, norms) / norms[independent][:, None]
     grouping[:, independent] = np.eye(len(independent))
     gone = tuple(name for name, nothing in zip(names, zero, strict=True) if nothing)
-    return Base(tuple(names), independent, grouping, gone)
+    return Base(tuple(names), independent, grouping, gone, units)
 
 
 def _dependent(columns: Array) -> bool:

@@ -21,7 +21,7 @@ from crane.motion.workspaces.result import StrokeMap, Workspace
 from crane.motion.workspaces.section import section_of, slewing
 
 _MOST = 1_000_000  # postures
-_MOVES = 1e-9  # slope of a tip that a joint moves [m per joint's scale]
+_MOVES = 1e-9  # slope of a tip that a joint moves, in shares of the machine's size
 _FULL = 3  # joints that a regular grid is made of
 _MAP = 81  # values of each stroke of the map
 _SLICES = 9  # values of the third of three strokes
@@ -132,7 +132,8 @@ def workspace(
 def _limits(machine: Machine) -> tuple[Array, Array]:
     """Limits of the active joints; half a turn, or the joint's scale, from home without."""
     home = machine.home[machine.closure.active]
-    half = np.array([np.pi if machine.unit(joint) == "rad" else 1.0 for joint in machine.active])
+    units = machine.closure.units[machine.closure.active]
+    half = np.where(machine.coordinates.slides[machine.closure.active], units, np.pi)
     return (
         np.where(np.isfinite(machine.lower), machine.lower, home - half),
         np.where(np.isfinite(machine.upper), machine.upper, home + half),
@@ -153,9 +154,10 @@ def _strokes(
     for _ in range(8):
         postures.append(last_closed(machine, machine.home, random.uniform(low, high))[0])
     moves = np.zeros(len(machine.active))
+    units = closure.units[closure.active] / closure.size
     for q in postures:
         gamma = closure.gamma(q)
-        slopes = np.abs(kinematics.tree_jacobian(q) @ gamma).max(axis=0)
+        slopes = np.abs(kinematics.tree_jacobian(q) @ gamma * units).max(axis=0)
         moves = np.maximum(moves, slopes)
     coupled = np.abs(closure.gamma(machine.home)[closure.passive]).max(axis=0, initial=0.0) > 0
     linked = [i for i in range(len(moves)) if moves[i] > _MOVES or coupled[i]]

@@ -15,8 +15,9 @@ from crane.motion.workspaces.result import Curve, Extreme
 
 Goal = Callable[[Array], tuple[float, Array]]
 
-_STEP = 1e-6  # of the differences that give the slope of a determinant [m], [rad]
-_OPEN = 1e-9  # residual of the loops up to which an extreme is one [m], [rad]
+# in rad and shares of the machine's size
+_STEP = 1e-6  # of the differences that give the slope of a determinant
+_OPEN = 1e-9  # residual of the loops up to which an extreme is one
 _WAY, _ITERATIONS = 8, 6  # points of the way to a singular posture, steps of Newton's method
 _BESIDE = 0.3  # of the length of that way, how far it may be from a straight one
 
@@ -84,10 +85,10 @@ def farthest(
     moving = closure.active[list(strokes)]
     free = np.concatenate([moving, closure.passive])
     low, span = ends[0][list(strokes)], (ends[1] - ends[0])[list(strokes)]
-    unit = np.concatenate([span, np.ones(len(closure.passive))])
+    unit = np.concatenate([span, closure.units[closure.passive]])
     first = goal(q)[0]
     equations, rows = closure.equations, closure.structure.rows
-    size = max(abs(first), 1e-3)  # so that the accuracy asked for is a relative one
+    size = max(abs(first), 1e-3 * closure.size)  # so that the accuracy asked for is a relative one
 
     def posture(x: Array) -> Array:
         out = q.copy()
@@ -100,8 +101,8 @@ def farthest(
 
     closed: Any = {
         "type": "eq",
-        "fun": lambda x: equations.evaluate(posture(x))[0][rows],
-        "jac": lambda x: equations.evaluate(posture(x))[1][rows][:, free] * unit,
+        "fun": lambda x: equations.scaled(posture(x))[0][rows],
+        "jac": lambda x: (equations.scaled(posture(x))[1][rows] / closure.units)[:, free] * unit,
     }
     branch: Any = {
         "type": "ineq",
@@ -135,16 +136,17 @@ def _leads(machine: Machine, q: Array, target: Array, free: Array) -> bool:
     being free: unlike the strokes alone, these determine the posture where the branch ends.
     """
     equations, rows = machine.closure.equations, machine.closure.structure.rows
-    way = float(np.abs(target - q).max())
+    units = machine.closure.units
+    way = float(np.abs((target - q) / units).max())
     for share in np.linspace(0, 1, _WAY + 1)[1:]:
         chord = q + share * (target - q)
         at = chord.copy()
         for _ in range(_ITERATIONS):
-            phi, jacobian = equations.evaluate(at)
-            at[free] -= np.linalg.lstsq(jacobian[rows][:, free], phi[rows])[0]
-        if np.abs(at - chord).max() > _BESIDE * way + _OPEN:
+            phi, jacobian = equations.scaled(at)
+            at[free] -= units[free] * np.linalg.lstsq(jacobian[rows][:, free], phi[rows])[0]
+        if np.abs((at - chord) / units).max() > _BESIDE * way + _OPEN:
             return False
-        if not (np.abs(equations.evaluate(at)[0]) < _OPEN).all():
+        if not (np.abs(equations.scaled(at)[0]) < _OPEN).all():
             return False
         if (_determinants(machine, at) < -_OPEN).any():
             return False
@@ -158,7 +160,7 @@ def _determinants(machine: Machine, q: Array) -> Array:
 
 def _blocks(machine: Machine, q: Array) -> Array:
     closure = machine.closure
-    jacobian = closure.equations.evaluate(q)[1][closure.structure.rows][:, closure.passive]
+    jacobian = closure.equations.scaled(q)[1][closure.structure.rows][:, closure.passive]
     return np.array(
         [np.linalg.det(jacobian[np.ix_(*block)]) for block in closure.structure.blocks]
     )
@@ -169,7 +171,7 @@ def _slopes(machine: Machine, q: Array, columns: Array) -> Array:
     out = []
     for column in columns:
         step = np.zeros(len(q))
-        step[column] = _STEP
+        step[column] = _STEP * machine.closure.units[column]
         ahead, behind = (_blocks(machine, q + sign * step) for sign in (1, -1))
-        out.append((ahead - behind) / (2 * _STEP))
+        out.append((ahead - behind) / (2 * step[column]))
     return np.array(out).T / _blocks(machine, machine.home)[:, None]

@@ -23,7 +23,7 @@ class Raster:
 
     def __init__(self, points: Array):
         low, high = points.min(axis=0), points.max(axis=0)
-        self.size = max(float((high - low).max()), 1e-9) / _PIXELS
+        self.size = (float((high - low).max()) or 1.0) / _PIXELS  # any of a single point
         count = np.ceil((high - low) / self.size).astype(int) + 3
         self.u = low[0] + self.size * (np.arange(count[0]) - 0.5)
         self.w = low[1] + self.size * (np.arange(count[1]) - 0.5)

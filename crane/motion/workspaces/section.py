@@ -102,7 +102,7 @@ def section_of(machine: Machine, frame: str, tips: Array, home: Array) -> Sectio
     up, slew = upwards(machine), slewing(machine, frame)
     away = tips - tips.mean(axis=0)
     _, extents, directions = np.linalg.svd(away, full_matrices=False)
-    small = _FLAT * max(float(extents[0]), 1e-9)
+    small = _FLAT * max(float(extents[0]), 1e-9 * machine.closure.size)
     normal = directions[2]
     if extents[1] <= small:  # a line: any plane through it, upright if it can be
         normal = np.cross(directions[0], up)

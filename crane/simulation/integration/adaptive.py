@@ -12,9 +12,10 @@ from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.stepwise import Progress, PythonStepper
 
-_FASTEST = (
-    300.0  # [rad/s], [m/s] of a passive joint: where the branch ends they grow beyond bounds
-)
+# of a passive joint in rad and shares of the machine's size per `Closure.pace`: where the branch
+# ends they grow beyond bounds
+_FASTEST = 300.0
+_ACCURACY = 1e-11  # that matters, likewise; of all else in SI units
 ADAPTIVE = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 
 
@@ -38,7 +39,7 @@ class AdaptiveSteps:
 
     def __init__(self, chart: Chart, control: Controller, own: int, method: str):
         self.slow = PythonStepper(chart, control, own)
-        self._closure, self._method = chart.machine.closure, method
+        self._chart, self._closure, self._method = chart, chart.machine.closure, method
 
     def limit(self, limits: Array) -> None:
         """See `Steps.limit`."""
@@ -63,6 +64,7 @@ class AdaptiveSteps:
         from scipy.integrate import solve_ivp
 
         closure, end = self._closure, times[0] + step * len(times)
+        units, pace = closure.units, closure.pace
         view = self.slow.layout.view
 
         def rate(time: float, state: Array) -> Array:
@@ -80,26 +82,27 @@ class AdaptiveSteps:
                 gamma = closure.gamma(at.q)[closure.passive]
             except ClosureError:
                 return -_FASTEST
-            return _FASTEST - float(np.abs(gamma @ at.v_a).max(initial=0.0))
+            rates = gamma @ at.v_a / units[closure.passive]
+            return _FASTEST - pace * float(np.abs(rates).max(initial=0.0))
 
         def gentle(time: float, state: Array) -> float:
-            try:
-                gamma = closure.gamma(view(state).q)[closure.passive]
-            except ClosureError:
-                return -1.0
-            return 1.0 - float(np.abs(gamma).max(initial=0.0)) / self.slow.limits[0]
+            return min(self.slow.limits[0] - self._chart.steepest(view(state).q), 1.0)
 
+        enough = np.full(len(state), _ACCURACY)
+        view(enough).q[:] *= units
+        view(enough).v_a[:] *= units[closure.active] / pace
         calm.terminal = gentle.terminal = True  # type: ignore[attr-defined]
         gentle.direction = -1.0  # type: ignore[attr-defined]
         self.done = self.reached = 0
         method: Any = self._method
         result: Any = solve_ivp(
             rate, (times[0], end), state, method=method, t_eval=[*times, end],
-            rtol=1e-9, atol=1e-11, events=(calm, gentle),
+            rtol=1e-9, atol=enough, events=(calm, gentle),
         )  # fmt: skip
         if result.status == 1 and len(result.t_events[0]):
             q_a = self.slow.here(result.y_events[0][0])
-            what = f" the motion explodes (a passive joint exceeds {_FASTEST:g} m/s or rad/s)"
+            fastest = f"{_FASTEST / pace:.3g} rad/s or {_FASTEST * closure.size / pace:.3g} m/s"
+            what = f" the motion explodes (a passive joint exceeds {fastest})"
             raise HaltedError(result.t_events[0][0], q_a, what, ": look at its forces and gains")
         if not result.success:
             last = float(result.t[-1]) if len(result.t) else 0.0

@@ -6,7 +6,6 @@ from typing import Protocol
 
 import numpy as np
 
-from crane.closure.choice import units
 from crane.codegen import Number, Tape
 from crane.common.samples import Array
 from crane.control import At, Controller, TracedController, ValveDrive
@@ -221,7 +220,7 @@ class ChartedSteps:
             return None
         left = here / (there - here) * (now - before)
         v = closure.gamma(at.q) @ at.v_a
-        speed = float(np.abs(v / units(chart.machine.model)).max())
+        speed = float(np.abs(v / closure.units).max())
         home = self._made[0][0].machine
         flat = rank(chart.machine, at.q + left * v) < CROSSING * rank(home, home.home)
         return (now + left, speed) if flat and left * speed < 3.0 * FINE else None

@@ -16,11 +16,11 @@ from functools import cached_property
 
 import numpy as np
 
-from crane.closure.choice import choose, motions, scales, units
+from crane.closure.choice import choose, motions, scales
 from crane.closure.structure import Indices
 from crane.closure.traced import folded
 from crane.codegen.scalar import Number, dot
-from crane.common.errors import MechanismError
+from crane.common.errors import ClosureError, MechanismError
 from crane.common.samples import Array
 from crane.dynamics import Dynamics
 from crane.machine import Machine
@@ -87,19 +87,20 @@ class Chart:
 
     @cached_property
     def limits(self) -> Array:
-        """(2,) an entry of gamma that is large, in any unit, and a determinant that is small."""
+        """(2,) what is much for `steepest`, and a determinant that is little."""
         closure = self.machine.closure
         least = closure.fast.edge(closure.home) if closure.compiled else 0.0
-        return np.array([self._steep, _EDGE * least])
+        return np.array([max(STEEP, 2.0 * self.steepest(closure.home)), _EDGE * least])
 
-    @property
-    def _steep(self) -> float:
+    def steepest(self, q: Array) -> float:
+        """The largest entry of gamma at a closed posture (nq,), in rad and the machine's size."""
         closure = self.machine.closure
-        unit = units(self.machine.model)
-        passive = unit[closure.passive]
-        ratio = passive.max(initial=1.0) / unit[closure.active].min(initial=1.0)
-        at_home = np.abs(closure.gamma(closure.home)[closure.passive]).max(initial=0.0)
-        return max(STEEP * float(ratio), 2.0 * float(at_home))
+        try:
+            gamma = closure.gamma(q)
+        except ClosureError:
+            return np.inf
+        shares = gamma / closure.units[:, None] * closure.units[closure.active]
+        return float(np.abs(shares[closure.passive]).max(initial=0.0))
 
     def other(self, q: Array, better: float = _BETTER) -> "Chart | None":
         """A chart around a closed posture (nq,) whose condition is that many times smaller.
@@ -143,4 +144,5 @@ class Chart:
             machine = self.machine.seen_from(q, names)
         except MechanismError:
             return None
-        return Chart(Dynamics(machine, backend=self.dynamics.backend), self.seen)
+        dynamics = Dynamics(machine, self.dynamics.formulation, self.dynamics.backend)
+        return Chart(dynamics, self.seen)

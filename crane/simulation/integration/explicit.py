@@ -7,7 +7,8 @@ II.5 and II.6; the coefficients are scipy's).
 
 import numpy as np
 
-from crane.codegen import Number, Program, Tape, Value, largest, select
+from crane.closure.traced import largest_share
+from crane.codegen import Number, Program, Tape, Value, select
 from crane.codegen.representation import Array as Place
 from crane.codegen.scalar import add, apply, dot, maximum, minimum, scale, subtract
 from crane.common.samples import Array
@@ -26,8 +27,8 @@ from crane.simulation.integration.traced import (
 
 STAGES, MORE = 12, 3  # of a step, and for what is between its ends
 TOLERANCE = 1e-11  # error of a step, per size of the state
-_LEAST = 0.1  # size of a state that is taken for no smaller [m], [rad], and per second
-_FOLLOWED = 0.02  # way of a step beyond whose end the loops may not close [m], [rad]
+_LEAST = 0.1  # what is taken for no smaller: rad, machine's size, per `Closure.pace`
+_FOLLOWED = 0.02  # way of a step beyond whose end the loops may not close, likewise
 SPACING = 5e-4  # [s] between the instants that references are known at, at most
 _ROWS = 2000  # of references of a call
 _FASTER, _SLOWER, _SAFETY = 5.0, 0.2, 0.9  # change of the step's length from one to the next
@@ -46,7 +47,8 @@ class ExplicitStepper:
 
     Attributes:
         bounds: See `FastClosure`, and the entry of gamma from which other coordinates are better.
-        tolerance: (1,) error of a step, per size of the state.
+        tolerance: (k + 1,) least error that matters of coordinates, velocities and the
+            controller's states; error of a step, per size of the state.
 
     Raises:
         TooLongError: It would take too long to compile.
@@ -63,7 +65,10 @@ class ExplicitStepper:
         self._columns = columns_of(control)
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
         n = self._state.parts["v_a"]
-        self.tolerance = np.array([tolerance])
+        closure = machine.closure
+        rates = closure.units[closure.active] / closure.pace
+        least = _LEAST * np.concatenate([closure.units, rates, np.ones(states), [1.0 / _LEAST]])
+        self.tolerance = tolerance * least
         form = form_of(control, self._columns, n, states, fold=False)
         key = "explicit", form, states, *chart.formulas
         if key not in self._fast.programs:
@@ -144,13 +149,13 @@ class ExplicitStepper:
         self._add_run(program)
 
     def _add_sums(self, program: Program) -> None:
-        """stage1(s, k, h) to stage11, more0 to more2; finish, dense, interpolate."""
+        """stage1(s, k, h) to stage11, more0 to more2; finish(numbers, s, k, h, tol); dense; ..."""
         size, method = self._state.size, self._method
 
-        def mixed(tape: Tape, weights: Array) -> list[Number]:
+        def mixed(tape: Tape, weights: Array, array: int = 1) -> list[Number]:
             out: list[Number] = [0.0] * size
             for j in np.flatnonzero(weights).tolist():
-                out = add(out, scale(float(weights[j]), tape.loads(1, j * size, size)))
+                out = add(out, scale(float(weights[j]), tape.loads(array, j * size, size)))
             return out
 
         stages = {f"stage{i}": method.A[i] for i in range(1, STAGES)}
@@ -160,17 +165,17 @@ class ExplicitStepper:
             moved = scale(tape.load(2, 0), mixed(tape, weights))
             program.add(name, 3, add(tape.loads(0, 0, size), moved))
         tape = Tape()
-        state, h = tape.loads(0, 0, size), tape.load(2, 0)
-        after = add(state, scale(h, mixed(tape, method.B)))
+        state, h = tape.loads(1, 0, size), tape.load(3, 0)
+        after = add(state, scale(h, mixed(tape, method.B, 2)))
         used = self._state.start("own") + self._state.parts["own"]
         fifth: Number = 0.0
         third: Number = 0.0
-        gaps = mixed(tape, method.E5), mixed(tape, method.E3)
+        gaps = mixed(tape, method.E5, 2), mixed(tape, method.E3, 2)
         for i, (one, other) in enumerate(zip(*gaps, strict=True)):
             if i >= used:
                 break
             size_of = maximum(apply("abs", state[i]), apply("abs", after[i]))
-            share = 1.0 / (tape.load(3, 0) * maximum(size_of, _LEAST))
+            share = 1.0 / maximum(tape.load(4, i), tape.load(4, used) * size_of)
             fifth = fifth + one * share * (one * share)
             third = third + other * share * (other * share)
         below = maximum(fifth + 0.01 * third, 1e-300)
@@ -178,9 +183,11 @@ class ExplicitStepper:
         usable = minimum(maximum(error, 1e-9), 1e9)
         change = _SAFETY * apply("exp", (-1.0 / 8.0) * apply("log", usable))
         change = minimum(maximum(change, _SLOWER), _FASTER)
-        move = h * largest(tape.loads(1, 0, self._state.parts["q"]))
+        long = [not turns for turns in self._fast.geometry.revolute[1:]]
+        rates = tape.loads(2, 0, self._state.parts["q"])
+        move = h * largest_share(rates, long, self._fast.per_size(tape))
         outputs = {"state": after, "error": [error], "change": [change], "move": [move]}
-        program.add("finish", 4, outputs)
+        program.add("finish", 5, outputs)
         tape = Tape()
         program.add("wrap", 1, wrapped(self._chart, tape.loads(0, 0, size)))
         # between the ends: state, slopes there, behind it
@@ -266,7 +273,7 @@ class ExplicitStepper:
                 for i in range(1, STAGES):
                     r.call(f"stage{i}", r.state, k, part, stage)
                     call("rate", t + length * float(method.C[i]), stage, k.at(i * size))
-                r.call("finish", r.state, k, part, r.tol, following)
+                r.call("finish", r.geometry, r.state, k, part, r.tol, following)
                 change = following["change"]
                 wanted = r.let(length * select(change > 0.0, change, _SLOWER))  # NaN: slower
                 with r.when(following["error"] <= 1.0):

@@ -5,7 +5,7 @@ import numpy as np
 from crane.common.errors import SimulationError
 from crane.common.samples import Array
 from crane.machine import Machine
-from crane.motion.trajectories import LIMIT_SLACK, Trajectory
+from crane.motion.trajectories import Trajectory, limit_slack
 
 
 class HaltedError(SimulationError):
@@ -69,15 +69,17 @@ def _passed(
     """The active joint that is farthest beyond its limit, and since when; perhaps nothing."""
     lower, upper = machine.lower, machine.upper
     excess = np.maximum(lower - halt.q_a, halt.q_a - upper)
-    span = np.where(np.isfinite(upper - lower), upper - lower, 1.0)
+    active = machine.closure.active
+    span = np.where(np.isfinite(upper - lower), upper - lower, machine.closure.units[active])
     i = int(np.argmax(excess / span))
-    if not excess[i] > LIMIT_SLACK:
+    slack = limit_slack(machine)[active[i]]
+    if not excess[i] > slack:
         return ""
     joint, unit, value = machine.active[i], machine.unit(machine.active[i]), halt.q_a[i]
     limit = lower[i] if value < lower[i] else upper[i]
     text = f"; '{joint}' is at {value:.6g} {unit}, beyond its limit {limit:.6g} {unit}"
     if len(times):
-        outside = (q_a[:, i] < lower[i] - LIMIT_SLACK) | (q_a[:, i] > upper[i] + LIMIT_SLACK)
+        outside = (q_a[:, i] < lower[i] - slack) | (q_a[:, i] > upper[i] + slack)
         inside = np.flatnonzero(~outside)
         first = int(inside[-1]) + 1 if len(inside) else 0
         since = times[first] if first < len(times) else halt.time
@@ -86,6 +88,6 @@ def _passed(
     remedy = "stiffen its end stop" if stopped else "give it an end stop"
     if reference is not None:
         wanted = float(reference.position(halt.time)[i])
-        if not lower[i] - LIMIT_SLACK <= wanted <= upper[i] + LIMIT_SLACK:
+        if not lower[i] - slack <= wanted <= upper[i] + slack:
             remedy = f"keep its reference ({wanted:.6g} {unit}) within the limits, or {remedy}"
     return f"{text}: {remedy}"

@@ -42,7 +42,8 @@ EMBEDDED = np.array([3.7810903145819369e-01, -9.6042292212423178e-02, 0.5, 2.179
 STAGES = len(WEIGHTS)
 
 _RELATIVE = 1e-8  # accuracy of a step, per size of the state
-_COORDINATE, _VELOCITY = 1e-11, 1e-9  # accuracy that matters [m], [rad], and per second
+# accuracy that matters [rad], [machine's size], and that per `Closure.pace`
+_COORDINATE, _VELOCITY = 1e-11, 1e-9
 _FASTER, _SLOWER, _SAFETY = 6.0, 0.2, 0.9  # change of the step's length from one to the next
 _SHORTEST = 1e-9  # part of a recorded step that is given up on
 _NEARLY = 1.0 - 2.0**-41  # of what is left of a recorded step: all of it
@@ -83,10 +84,11 @@ class StiffStepper:
         if key not in self._fast.programs:
             self._fast.programs[key] = program_of(control, self._fast, key, self._build)
         self._program = self._fast.programs[key]
+        units, pace = machine.closure.units, machine.closure.pace
         self._scales = np.concatenate(
             [
-                np.full(self._state.parts["q"], 1.0 / _COORDINATE),
-                np.full(self._state.parts["v_a"], 1.0 / _VELOCITY),
+                1.0 / (_COORDINATE * units),
+                pace / (_VELOCITY * units[machine.closure.active]),
                 1.0 / control.scales,
             ]
         )

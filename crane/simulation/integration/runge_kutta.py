@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from crane.codegen import Program, Tape, largest
+from crane.closure.traced import largest_share
+from crane.codegen import Program, Tape, largest, maximum
 from crane.codegen.scalar import add, scale
 from crane.common.samples import Array
 from crane.control import TracedController
@@ -87,7 +88,7 @@ class CompiledStepper:
                 r.call("rate", *machine, middle, following, k3)
                 r.call("blend", r.state, k3, r.h, following)
                 r.call("rate", *machine, last, following, k4)
-                r.call("finish", r.state, k1, k2, k3, k4, r.h, following)
+                r.call("finish", r.geometry, r.state, k1, k2, k3, k4, r.h, following)
                 with r.when(~(following["move"] < 1.0)):
                     r.give(i)
                 closed = r.call("close", r.geometry, following, result, r.bounds)
@@ -135,19 +136,23 @@ class CompiledStepper:
         return seen
 
     def _add_sums(self, program: Program) -> None:
-        """blend(s, k, h) = s + h k; finish(s, k1, k2, k3, k4, h) = s + h/6 (...), largest move."""
+        """blend(s, k, h) = s + h k; finish(geometry, s, k1, k2, k3, k4, h) = s + h/6 (...).
+
+        With the largest move [rad], [machine's size].
+        """
         size, coordinates = self._state.size, self._state["q"]
         tape = Tape()
         state, rate = tape.loads(0, 0, size), tape.loads(1, 0, size)
         program.add("blend", 3, add(state, scale(tape.load(2, 0), rate)))
         tape = Tape()
-        state = tape.loads(0, 0, size)
-        k1, k2, k3, k4 = (tape.loads(array, 0, size) for array in range(1, 5))
-        h = tape.load(5, 0)
+        state = tape.loads(1, 0, size)
+        k1, k2, k3, k4 = (tape.loads(array, 0, size) for array in range(2, 6))
+        h = tape.load(6, 0)
         mean = add(k1, scale(2.0, add(k2, k3)), k4)
         after = wrapped(self._chart, add(state, scale(h * (1.0 / 6.0), mean)))
-        # the largest of all changes, so that NaN and infinity anywhere show
-        move = h * largest(
-            [*k1[coordinates], *k2[coordinates], *k3[coordinates], *scale(1e-9, mean)]
-        )
-        program.add("finish", 6, {"state": after, "move": [move]})
+        rates = [*k1[coordinates], *k2[coordinates], *k3[coordinates]]
+        long = 3 * [not turns for turns in self._fast.geometry.revolute[1:]]
+        share = largest_share(rates, long, self._fast.per_size(tape))
+        # the others count only so far as that NaN and infinity anywhere show
+        move = h * maximum(share, largest(scale(1e-30, mean)))
+        program.add("finish", 7, {"state": after, "move": [move]})

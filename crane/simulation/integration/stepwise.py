@@ -39,11 +39,7 @@ class PythonStepper:
     def steep(self, state: Array) -> bool:
         """Whether a state is beyond the limits."""
         closure, q = self._chart.machine.closure, self.layout.view(state).q
-        try:
-            gamma = closure.gamma(q)
-        except ClosureError:
-            return True
-        if np.abs(gamma[closure.passive]).max(initial=0.0) > self.limits[0]:
+        if self._chart.steepest(q) > self.limits[0]:
             return True
         return closure.compiled and closure.fast.edge(q) < self.limits[1]
 
@@ -75,9 +71,11 @@ class PythonStepper:
             HaltedError: The motion explodes, or the loops cannot be closed any more.
         """
         total = rate = first
+        units = self._dynamics.machine.closure.units
         for share, weight in ((0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
-            if not np.abs(self.layout.view(rate).q).max() * step < 1:  # also NaN
-                what = f" the motion explodes (over 1 m or rad in a step of {step:g} s)"
+            if not np.abs(self.layout.view(rate).q / units).max() * step < 1:  # also NaN
+                size = self._dynamics.machine.closure.size
+                what = f" the motion explodes (over 1 rad or {size:.3g} m in a step of {step:g} s)"
                 otherwise = ", and with shorter steps, too: look at its forces and gains"
                 raise HaltedError(time, self.here(state), what, otherwise)
             rate, _ = self._rate(time + share * step, state + share * step * rate)

@@ -232,12 +232,15 @@ class Session:
         )
 
     def _condition(self, q: Array) -> tuple[float, str]:
-        """Condition number of J_P, and the loop that a force of least effect belongs to."""
+        """Condition number of J_P, and the loop that a force of least effect belongs to.
+
+        In shares of the machine's size, so that metres and radians compare.
+        """
         closure = self.machine.closure
         equations, rows = closure.equations, closure.structure.rows
         if not len(rows):
             return 1.0, ""
-        left, values, _ = np.linalg.svd(equations.evaluate(q)[1][rows][:, closure.passive])
+        left, values, _ = np.linalg.svd(equations.scaled(q)[1][rows][:, closure.passive])
         shares = np.bincount(equations.loop_of_row[rows], left[:, -1] ** 2)
         condition = values[0] / values[-1] if values[-1] > 0 else np.inf
         return float(condition), equations.names[int(shares.argmax())]

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from crane.recordings.recording import Recording
 
 _LOOKED_AT = 300  # frames that tell how large the scene is
+_FLAT = 1e-3  # share of a scene's size that each side has at least
 _SMALLEST = 1e-3  # [m], of a scene in which everything is a point
 
 
@@ -150,4 +151,5 @@ def _bounds(visuals: Sequence[Visual], poses: Mapping[str, Array]) -> tuple[Arra
         points.append(moved.reshape(-1, 3))
     everything = np.concatenate(points)
     lower, upper = everything.min(axis=0), everything.max(axis=0)
-    return lower, np.maximum(upper, lower + _SMALLEST)
+    size = float((upper - lower).max())
+    return lower, np.maximum(upper, lower + (_FLAT * size or _SMALLEST))

@@ -19,7 +19,7 @@ from crane.view.plots.recording import STYLE, write_figure
 from crane.view.plots.text import plain
 from crane.view.sketch.canvas import CENTRE, DOT, JOINT, QUARTERS, RING, Canvas, hull, mark
 from crane.view.sketch.labels import Label, clear_spot, place_labels
-from crane.view.sketch.mechanism import project
+from crane.view.sketch.mechanism import SAME, project
 from crane.view.sketch.parts import Body, Mechanism, Pin, Slide
 from crane.view.sketch.plane import find_plane
 from crane.view.sketch.sheet import lay_out, symbol
@@ -171,9 +171,10 @@ def _number_regions(canvas: Canvas, mechanism: Mechanism) -> None:
 
 def _gap(mechanism: Mechanism, at: Array, down: Array) -> float | None:
     """How far below a point the ground is [points]; None for a pin, which has a support."""
-    if any(np.abs(shown.at - at).max() < 1e-9 for shown in mechanism.pins):
+    same = SAME * mechanism.size
+    if any(np.abs(shown.at - at).max() < same for shown in mechanism.pins):
         return None
-    beside = any(np.abs(item.at - at).max() < 1e-9 for item in mechanism.collars)
+    beside = any(np.abs(item.at - at).max() < same for item in mechanism.collars)
     return 7.0 if beside else 0.0
 
 

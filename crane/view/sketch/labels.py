@@ -102,7 +102,9 @@ def _cost(canvas: Canvas, label: Label, boxes: Array, gaps: Array) -> Array:
     for centre, radius in canvas.discs:
         distance = np.linalg.norm(np.clip(centre, low, high) - centre, axis=1) / point
         cost = cost + np.where(distance < radius, 60.0, 0)
-        if np.abs(centre - label.at).max() > 1e-9:  # nearer to another symbol than to its own
+        if (
+            np.abs(centre - label.at).max() > 1e-6 * point
+        ):  # nearer to another symbol than to its own
             cost = cost + np.where(distance - radius < gaps + 2.0, 5.0, 0)
     limits = np.array([canvas.axes.get_xlim(), canvas.axes.get_ylim()])
     outside = (low < limits[:, 0]).any(axis=1) | (high > limits[:, 1]).any(axis=1)

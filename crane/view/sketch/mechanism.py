@@ -10,6 +10,7 @@ from crane.machine import Machine
 from crane.view.sketch.parts import Body, Collar, Mechanism, Pin, Slide
 from crane.view.sketch.plane import Plane, joint_axes
 
+SAME = 1e-9  # share of the drawing's size that is none
 _NEAR = 0.04  # share of the drawing's size within which a collar would hide beside a pin
 _BARREL = 0.82  # length of a barrel, as a share of the cylinder's shortest length
 _STEEP = 0.7  # cosine to the plane's normal above which an axis is drawn as a pin
@@ -61,13 +62,13 @@ class _Projection:
             self.points[self.tip_body].append(self.tip)
         slides = [self._slide(i) for i, turns in enumerate(self.turns) if i and not turns]
         bodies = [self._body(i) for i in range(1, len(self.parents))]
-        ground = [(at, np.array([0.0, -1.0])) for at in _distinct(self.points[0])]
+        ground = [(at, np.array([0.0, -1.0])) for at in _distinct(self.points[0], self.size)]
         if self._has_base():
             base, collar = self.outer[0][0], collars[0]
             ground = [item for item in ground if np.abs(item[0] - collar.at).max() > 0]
             away = collar.along @ (self._far(1) - base)
             ground.append((base, -np.sign(away or 1.0) * collar.along))
-            if len(column := _distinct([base, collar.at])) > 1:
+            if len(column := _distinct([base, collar.at], self.size)) > 1:
                 bodies.append(Body(column, -1, False, base))
         return Mechanism(
             pins, collars, slides, bodies, ground, self._regions(), self.tip, self.size
@@ -99,7 +100,9 @@ class _Projection:
         first = self.origins[1]
         along = self.axes[1]
         across = first - (first @ along) * along
-        return bool(self.steep[1] < _STEEP and np.linalg.norm(across) < 1e-9)
+        return bool(
+            self.steep[1] < _STEEP and np.linalg.norm(across) < SAME * self.machine.closure.size
+        )
 
     def _revolute(self) -> tuple[list[Pin], list[Collar]]:
         pins, collars = [], []
@@ -177,7 +180,7 @@ class _Projection:
     def _body(self, joint: int) -> Body:
         lever = self.data.oMi[joint].act(self.model.inertias[joint].lever)
         return Body(
-            _distinct(self.points[joint]),
+            _distinct(self.points[joint], self.size),
             self.chains[joint],
             joint in self.carrying,
             self.plane.project(lever),
@@ -195,16 +198,16 @@ class _Projection:
                 path = [j for j in reversed(list(self.model.supports[body])) if j not in shared]
                 planar &= all(self.steep[j] > 0.99 for j in path if self.turns[j])
                 ways.append([self.origins[j] for j in path if self.turns[j]])
-            corners = _distinct([at, *ways[0], *reversed(ways[1])])
+            corners = _distinct([at, *ways[0], *reversed(ways[1])], self.size)
             if planar and len(corners) > 2:
                 regions[number] = corners
         return regions
 
 
-def _distinct(points: Sequence[Array]) -> Array:
-    """Points (k, 2) without those that repeat an earlier one."""
+def _distinct(points: Sequence[Array], size: float) -> Array:
+    """Points (k, 2) of a mechanism of some size without those that repeat an earlier one."""
     kept: list[Array] = []
     for point in points:
-        if not any(np.abs(point - other).max() < 1e-9 for other in kept):
+        if not any(np.abs(point - other).max() < SAME * size for other in kept):
             kept.append(point)
     return np.array(kept).reshape(-1, 2)
