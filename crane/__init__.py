@@ -45,7 +45,14 @@ if TYPE_CHECKING:
     from crane.motion.workspaces import Workspace, workspace
     from crane.recordings import Recording
     from crane.recordings.measured import read_measured
-    from crane.simulation import Batch, Comparison, replay, simulate, simulate_batch
+    from crane.simulation import (
+        Batch,
+        Comparison,
+        InterruptedRun,
+        replay,
+        simulate,
+        simulate_batch,
+    )
     from crane.studies import Study, study
     from crane.view.page import report
     from crane.view.sketch import sketch
@@ -77,7 +84,7 @@ _HOMES = {
     "crane.motion.workspaces": "Workspace workspace",
     "crane.recordings": "Recording",
     "crane.recordings.measured": "read_measured",
-    "crane.simulation": "Batch Comparison replay simulate simulate_batch",
+    "crane.simulation": "Batch Comparison InterruptedRun replay simulate simulate_batch",
     "crane.studies": "Study study",
     "crane.view.page": "report",
     "crane.view.sketch": "sketch",
@@ -86,7 +93,8 @@ _HOMES = {
 __all__ = [
     "PI", "Batch", "Closure", "Command", "Comparison", "ComputedTorque", "Controller",
     "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation", "ForceElement", "Friction",
-    "GasSpring", "Identification", "Kinematics", "Law", "Machine", "PDGains", "PIGains",
+    "GasSpring", "Identification", "InterruptedRun", "Kinematics", "Law", "Machine", "PDGains",
+    "PIGains",
     "Payload", "Recording", "Rope", "Sampled", "Signals", "Study", "TipVelocity", "Trajectory",
     "ValveDrive", "ValvePD", "Workspace", "add_cylinder", "add_loops", "check", "excite",
     "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from broken import MINI, copy_machine
 from typed import MAIN, typed
@@ -117,6 +118,39 @@ def test_interrupt_is_one_line_and_leaves_nothing(tmp_path, delay):
     assert (process.returncode, out) == (130, "")
     assert rest == "error: interrupted, nothing was written\n"
     assert set(tmp_path.rglob("*")) == before
+
+
+CUT = """
+import contextlib
+import crane.cli.simulate
+
+
+@contextlib.contextmanager
+def progress_bar(what):
+    def report(share):
+        if share > 0.5:
+            raise KeyboardInterrupt
+    yield report
+
+
+crane.cli.simulate.progress_bar = progress_bar
+"""
+
+
+def test_an_interrupted_run_leaves_what_it_has(tmp_path):
+    out, machine = tmp_path / "run", Path(__file__).parent / "data" / "four_bar.yaml"
+    command = [sys.executable, "-c", CUT + MAIN, "simulate", str(machine), "--duration", "40"]
+    done = subprocess.run([*command, "--out", str(out)], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (130, "")
+    line = done.stderr.splitlines()[-1]
+    assert line.startswith("interrupted at t = ") and str(out) in line
+    recording = crane.Recording.from_csv(out / "recording.csv")
+    last = recording.time[-1]
+    assert 20 < last < 40 and line.startswith(f"interrupted at t = {last:g} s")
+    assert recording.task == f"free motion (cut at {last:g} s of 40 s)"
+    assert "cut at" in (out / "summary.md").read_text().splitlines()[0]
+    whole = crane.simulate(machine, duration=0.5)
+    np.testing.assert_allclose(recording.q[: len(whole.time)], whole.q, rtol=0, atol=1e-12)
 
 
 def test_check_tells_warnings_by_its_status(tmp_path):

@@ -1,5 +1,6 @@
 """The command that simulates a machine."""
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,12 +20,15 @@ from crane.cli.shared import (
     app,
     load,
     progress_bar,
+    say,
 )
 from crane.common.errors import InputError, known
 
 if TYPE_CHECKING:
     from crane.control import Command, Controller
     from crane.machine import Machine
+
+_INTERRUPTED = 130
 
 
 @app.command()
@@ -68,6 +72,7 @@ def simulate(
 ) -> None:
     """Simulate a task, measured inputs, or the motion from the home posture on its own."""
     from crane.cli.runs import check_folder, write_run
+    from crane.simulation import InterruptedRun
     from crane.simulation import simulate as run
 
     check_folder(out, force)
@@ -90,11 +95,16 @@ def simulate(
     if duration is None and task is not None:
         duration = loaded.tasks[task].duration
     label = task or ("hold" if control else "free motion")
-    with progress_bar("simulating") as progress:
-        recording = run(
-            loaded, control, duration=duration, step=step, label=label, method=method,
-            progress=progress,
-        )  # fmt: skip
+    try:
+        with progress_bar("simulating") as progress:
+            recording = run(
+                loaded, control, duration=duration, step=step, label=label, method=method,
+                progress=progress,
+            )  # fmt: skip
+    except InterruptedRun as cut:
+        write_run(out, cut.recording)
+        say(f"{cut}: what there is of it is in {out}, whose summary says where it was cut")
+        sys.exit(_INTERRUPTED)
     print(write_run(out, recording), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")
 

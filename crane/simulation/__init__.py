@@ -3,9 +3,9 @@
 from crane.simulation.batch import Batch, simulate_batch
 from crane.simulation.recorded import imbalance
 from crane.simulation.replays import Comparison, replay
-from crane.simulation.run import Force, Progress, integrate, simulate
+from crane.simulation.run import Force, InterruptedRun, Progress, integrate, simulate
 
 __all__ = [
-    "Batch", "Comparison", "Force", "Progress", "imbalance", "replay", "simulate",
-    "simulate_batch", "integrate",
+    "Batch", "Comparison", "Force", "InterruptedRun", "Progress", "imbalance", "integrate",
+    "replay", "simulate", "simulate_batch",
 ]  # fmt: skip

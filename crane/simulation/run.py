@@ -44,6 +44,18 @@ Force = Callable[[float, Array, Array], Array]
 Progress = Callable[[float], None]
 
 
+class InterruptedRun(KeyboardInterrupt):
+    """A run that was interrupted.
+
+    Attributes:
+        recording: What there is of it; its `task` says where it was cut.
+    """
+
+    def __init__(self, recording: Recording):
+        super().__init__(f"interrupted at t = {recording.time[-1]:g} s")
+        self.recording = recording
+
+
 def simulate(
     machine: Machine | str | Path,
     controller: Controller | Command | Force | None = None,
@@ -98,6 +110,7 @@ def simulate(
         SimulationError: The machine cannot go on: the loops do not close any more, or the motion
             explodes. Names the time, and the joint beyond its limit or a step that is short
             enough.
+        InterruptedRun: It was interrupted; a `KeyboardInterrupt` with what there is of it.
 
     A reference that leaves the limits of a joint is a warning before the first step: with an end
     stop it can be meant.
@@ -114,6 +127,9 @@ def simulate(
     time, rows, notes = integrate(dynamics, control, initial, steps, step, method, progress)
     for note in notes:
         warnings.warn(note, CraneWarning, stacklevel=2)
+    if len(time) <= steps:
+        cut = f"cut at {time[-1]:g} s of {steps * step:g} s"
+        raise InterruptedRun(recorded(machine, control, time, rows, f"{label} ({cut})".lstrip()))
     # the energies are integrated with the motion, so they tell when the step is too long
     text = imbalance(rows, step)
     if text and formulation == "exact":
@@ -143,7 +159,7 @@ def integrate(
 
     Returns:
         Times (N,), what `crane.simulation.integration.row_layout` names, (N, .) each, and what is
-        to be said of the motion.
+        to be said of the motion. N is smaller than there are steps where it was interrupted.
     """
     machine, reference = dynamics.machine, reference_of(control)
     q_a, v_a = _start(machine, initial, reference)
@@ -171,6 +187,11 @@ def integrate(
         finer, done = integration.finer(times[:-1], rows, step), integration.done
         q_a = layout.view(rows[:done]).q[:, machine.closure.active]
         raise explained(machine, halt, times[:done], q_a, reference, finer) from None
+    except KeyboardInterrupt:
+        done = integration.done
+        if not done:
+            raise
+        return times[:done], layout.view(rows[:done]), integration.notes
     if progress is not None:
         progress(1.0)
     return times, layout.view(rows), integration.notes

@@ -97,13 +97,16 @@ class ChartedSteps:
         i = self.done = 0
         while i < len(times) or self._way.offset < 0:
             self._first, halt = i, None
+            made = self._way.done = 0
             try:
                 made = self._way.run(times[i:], state, step, rows[i:], self._from(i, progress))
             except HaltedError as error:
                 made, halt = self._way.reached, error
-            self.done = i + self._way.done
-            self._recent = np.vstack([self._recent, rows[i : i + made, : len(state)]])[-_RECENT:]
-            self._seen(times[i : self.done], rows[i : self.done])
+            finally:  # also where it is interrupted
+                self.done = i + self._way.done
+                self._recent = np.vstack([self._recent, rows[i : i + made, : len(state)]])
+                self._recent = self._recent[-_RECENT:]
+                self._seen(times[i : self.done], rows[i : self.done])
             i += made
             if i == len(times) and not self._way.offset < 0:
                 continue
