@@ -14,13 +14,10 @@ from crane.codegen.scalar import add, apply, dot, maximum, minimum, scale, subtr
 from crane.common.samples import Array
 from crane.control import TracedController
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.state import seen_layout, state_layout
 from crane.simulation.integration.traced import (
+    Stepper,
     beyond,
-    columns_of,
-    form_of,
     machine_at,
-    program_of,
     settings_of,
     wrapped,
 )
@@ -36,7 +33,7 @@ _SHORTEST = 1e-9  # part of a recorded step that is given up on
 _NEARLY = 1.0 - 2.0**-41  # of what is left: all of it
 
 
-class ExplicitStepper:
+class ExplicitStepper(Stepper):
     """Many steps at once in machine code, with references and recorded instants within them.
 
     Args:
@@ -46,7 +43,6 @@ class ExplicitStepper:
         tolerance: Error of a step, per size of the state.
 
     Attributes:
-        bounds: See `FastClosure`, and the entry of gamma from which other coordinates are better.
         tolerance: (k + 1,) least error that matters of coordinates, velocities and the
             controller's states; error of a step, per size of the state.
 
@@ -57,23 +53,12 @@ class ExplicitStepper:
     def __init__(self, chart: Chart, control: TracedController, states: int, tolerance: float):
         from scipy.integrate import DOP853
 
-        machine, dynamics = chart.machine, chart.dynamics
         self._method = DOP853
-        self._fast, self._numbers = machine.closure.fast, dynamics.numbers
-        self._chart, self._control = chart, control
-        self.bounds = np.append(self._fast.bounds, chart.limits)
-        self._columns = columns_of(control)
-        self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
-        n = self._state.parts["v_a"]
-        closure = machine.closure
+        super().__init__(chart, control, states, ("explicit",), fold=False)
+        closure = chart.machine.closure
         rates = closure.units[closure.active] / closure.pace
         least = _LEAST * np.concatenate([closure.units, rates, np.ones(states), [1.0 / _LEAST]])
         self.tolerance = tolerance * least
-        form = form_of(control, self._columns, n, states, fold=False)
-        key = "explicit", form, states, *chart.formulas
-        if key not in self._fast.programs:
-            self._fast.programs[key] = program_of(control, self._fast, key, self._build)
-        self._program = self._fast.programs[key]
         self._lengths = np.zeros(5)
 
     def run(
@@ -95,8 +80,6 @@ class ExplicitStepper:
         lengths, parts = self._lengths, 2 * max(1, int(np.ceil(0.5 * step / SPACING)))
         if lengths[0] != step:
             lengths[:2] = step, 0.01 * min(step, SPACING)
-        settings = np.ascontiguousarray(self._control.settings)
-        machine = self._fast.geometry.numbers, self._numbers
         length, done = max(1, _ROWS // parts), 0
         out = np.empty((min(length, len(rows)), rows.shape[1]))
         while done < len(rows) or offset < 0:
@@ -107,7 +90,7 @@ class ExplicitStepper:
             references = np.ascontiguousarray(self._control.references(grid))
             lengths[2:] = offset, 2.0 * step / parts, count * step
             made = self._program.call(
-                "run", count, self._fast.close_address, *machine, settings, references, state,
+                "run", count, self._fast.close_address, *self._arguments, references, state,
                 out, lengths, self.bounds, self.tolerance,
             )  # fmt: skip
             rows[done : done + made] = out[:made]
@@ -116,15 +99,6 @@ class ExplicitStepper:
                 lengths[0] = 0.0  # it may have got as short as can be
                 break
         return done, offset
-
-    def observe(self, time: float, state: Array) -> Array:
-        """What is seen (.,) at a time [s] and a state."""
-        settings = np.ascontiguousarray(self._control.settings)
-        reference = np.ascontiguousarray(self._control.references(np.array([time])))
-        out = np.empty(self._seen.size)
-        machine = self._fast.geometry.numbers, self._numbers
-        self._program.call("observe", *machine, settings, reference, state, out)
-        return out
 
     def _build(self, program: Program) -> None:
         control = self._control
@@ -135,9 +109,10 @@ class ExplicitStepper:
             tau, own_rate = control.trace(machine.seen(settings, tape.loads(3, 0, self._columns)))
             sweep = machine.sweep
             if name == "observe":
-                out = [*tau, *sweep.friction, sweep.kinetic, sweep.potential]
+                out = {"seen": [*tau, *sweep.friction, sweep.kinetic, sweep.potential]}
             else:
-                out = [*sweep.slopes, *machine.forward(tau), *own_rate, *machine.powers(tau)]
+                a_a, powers = machine.forward(tau), machine.powers(tau)
+                out = {"rate": [*sweep.slopes, *a_a, *own_rate, *powers]}
             program.add(name, 5, out)
         # the parabola through rows at 0, 1/2, 1
         tape = Tape()

@@ -10,14 +10,11 @@ from crane.common.samples import Array
 from crane.control import At, ValveDrive
 from crane.simulation.integration.blocks import in_blocks
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.state import seen_layout, state_layout
 from crane.simulation.integration.traced import (
+    Stepper,
     Traced,
     beyond,
-    columns_of,
-    form_of,
     machine_at,
-    program_of,
     settings_of,
     wrapped,
 )
@@ -49,7 +46,7 @@ _SHORTEST = 1e-9  # part of a recorded step that is given up on
 _NEARLY = 1.0 - 2.0**-41  # of what is left of a recorded step: all of it
 
 
-class StiffStepper:
+class StiffStepper(Stepper):
     """Many steps at once in machine code, by a method that stiff circuits do not shorten.
 
     y' = f(y) is stepped by ROS34PW2 with its own choice of length within each recorded step. The
@@ -70,20 +67,12 @@ class StiffStepper:
         TooLongError: It would take too long to compile.
     """
 
+    _control: ValveDrive
+
     def __init__(self, chart: Chart, control: ValveDrive):
-        machine, dynamics = chart.machine, chart.dynamics
-        self._fast, self._numbers = machine.closure.fast, dynamics.numbers
-        self._chart, self._control = chart, control
-        self.bounds = np.append(self._fast.bounds, chart.limits)
-        self._columns = columns_of(control)
-        self._state = state_layout(machine, len(control.scales))
-        self._seen = seen_layout(machine, control)
         self._stiff = int(np.isfinite(control.scales).sum())
-        form = form_of(control, self._columns, len(machine.active), len(control.scales), fold=True)
-        key = "stiff", form, self._stiff, *chart.formulas
-        if key not in self._fast.programs:
-            self._fast.programs[key] = program_of(control, self._fast, key, self._build)
-        self._program = self._fast.programs[key]
+        super().__init__(chart, control, len(control.scales), ("stiff", self._stiff), fold=True)
+        machine = chart.machine
         units, pace = machine.closure.units, machine.closure.pace
         self._scales = np.concatenate(
             [
@@ -96,27 +85,17 @@ class StiffStepper:
 
     def run(self, times: Array, state: Array, step: float, rows: Array) -> int:
         """See `CompiledStepper.run`."""
-        machine = self._fast.geometry.numbers, self._numbers
-        settings = np.ascontiguousarray(self._control.settings)
+        arguments = self._arguments
         if self._lengths[0] != step:
             self._lengths[:] = step, 0.01 * step
 
         def call(count: int, references: Array, out: Array) -> int:
             return self._program.call(
-                "run", count, self._fast.close_address, *machine, settings, references, state,
+                "run", count, self._fast.close_address, *arguments, references, state,
                 out, self._lengths, self.bounds, self._scales,
             )  # fmt: skip
 
         return in_blocks(call, self._control, times, step, rows)
-
-    def observe(self, time: float, state: Array) -> Array:
-        """See `CompiledStepper.observe`."""
-        settings = np.ascontiguousarray(self._control.settings)
-        reference = np.ascontiguousarray(self._control.references(np.array([time])))
-        seen = np.empty(self._seen.size)
-        machine = self._fast.geometry.numbers, self._numbers
-        self._program.call("observe", *machine, settings, reference, state, seen)
-        return seen
 
     def _trace(self, tape: Tape, state: int, theta: int | None) -> tuple[Traced, At]:
         """The machine at a state, its references between three rows or in one."""
@@ -144,7 +123,7 @@ class StiffStepper:
         sweep = machine.sweep
         tau, _ = control.trace(at)
         seen = [*tau, *sweep.friction, sweep.kinetic, sweep.potential, *control.look(at)]
-        program.add("observe", 5, seen)
+        program.add("observe", 5, {"seen": seen})
         factors, mass = self._add_prepare(program)
         self._add_sums(program, factors, mass)
         self._add_run(program)

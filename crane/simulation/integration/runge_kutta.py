@@ -9,19 +9,16 @@ from crane.common.samples import Array
 from crane.control import TracedController
 from crane.simulation.integration.blocks import in_blocks
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.state import seen_layout, state_layout
 from crane.simulation.integration.traced import (
+    Stepper,
     beyond,
-    columns_of,
-    form_of,
     machine_at,
-    program_of,
     settings_of,
     wrapped,
 )
 
 
-class CompiledStepper:
+class CompiledStepper(Stepper):
     """Many steps at once in machine code, with a controller that is traced along.
 
     Args:
@@ -34,21 +31,7 @@ class CompiledStepper:
     """
 
     def __init__(self, chart: Chart, control: TracedController, states: int):
-        machine, dynamics = chart.machine, chart.dynamics
-        self._fast, self._numbers = machine.closure.fast, dynamics.numbers
-        self._chart, self._control = chart, control
-        self.bounds = np.append(self._fast.bounds, chart.limits)
-        self._columns = columns_of(control)
-        self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
-        form = form_of(control, self._columns, len(machine.active), states, fold=False)
-        key = "rk4", form, states, *chart.formulas
-        self._key = key
-        if key not in self._fast.programs:
-            self._fast.programs[key] = self._compile()
-        self._program = self._fast.programs[key]
-
-    def _compile(self) -> Program:
-        return program_of(self._control, self._fast, self._key, self._build)
+        super().__init__(chart, control, states, ("rk4",), fold=False)
 
     def _build(self, program: Program) -> None:
         control = self._control
@@ -112,28 +95,16 @@ class CompiledStepper:
             How many steps were done; the one after them needs a closer look, or other
             coordinates.
         """
-        machine = self._fast.geometry.numbers, self._numbers
-        settings = np.ascontiguousarray(self._control.settings)
+        arguments = self._arguments
         steps = np.array([step, 0.5 * step])
 
         def call(count: int, references: Array, out: Array) -> int:
             return self._program.call(
-                "run", count, self._fast.close_address, *machine, settings, references, state,
+                "run", count, self._fast.close_address, *arguments, references, state,
                 out, steps, self.bounds,
             )  # fmt: skip
 
         return in_blocks(call, self._control, times, step, rows)
-
-    def observe(self, time: float, state: Array) -> Array:
-        """What is seen (.,) at a time [s] and a state."""
-        settings = np.ascontiguousarray(self._control.settings)
-        reference = np.ascontiguousarray(self._control.references(np.array([time])))
-        layout = self._program.outputs("observe")
-        out = np.empty(layout.size)
-        machine = self._fast.geometry.numbers, self._numbers
-        self._program.call("observe", *machine, settings, reference, state, out)
-        seen: Array = out[layout["seen"]]
-        return seen
 
     def _add_sums(self, program: Program) -> None:
         """blend(s, k, h) = s + h k; finish(geometry, s, k1, k2, k3, k4, h) = s + h/6 (...).

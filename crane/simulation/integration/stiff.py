@@ -1,50 +1,31 @@
 """Recorded steps of stiff circuits, which choose their own length within."""
 
-import numpy as np
-
 from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
 from crane.control import ValveDrive
 from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.chosen import ChosenSteps
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.rosenbrock import StiffStepper
-from crane.simulation.integration.stepwise import Progress, PythonStepper
+from crane.simulation.integration.stepwise import Progress
 
 _CHUNK = 1000  # steps between reports of progress
 
 
-class StiffSteps:
+class StiffSteps(ChosenSteps[StiffStepper]):
     """The Rosenbrock method of `StiffStepper`, with a program of the valves where there is one.
 
     Args:
         chart: The machine.
         control: Its controller.
 
-    Attributes:
-        slow: Observes.
-        done: Number of instants that have their row, after a run or where it halted.
-        reached: Index of the instant of the state.
-
     Raises:
         TooLongError: It would take too long to compile.
     """
 
-    offset = 0.0
-
     def __init__(self, chart: Chart, control: ValveDrive):
+        super().__init__(chart, control, len(control.scales), StiffStepper(chart, control))
         self._chart, self._control = chart, control
-        self._fast = StiffStepper(chart, control)
-        self.slow = PythonStepper(chart, control, len(control.scales))
-        self.done = 0
-
-    @property
-    def reached(self) -> int:
-        """See `Steps`."""
-        return self.done
-
-    def limit(self, limits: Array) -> None:
-        """See `Steps.limit`."""
-        self.slow.limits = self._fast.bounds[-2:] = limits
 
     def run(
         self, times: Array, state: Array, step: float, rows: Array, progress: Progress = None
@@ -80,14 +61,6 @@ class StiffSteps:
             if progress is not None:
                 progress(self.done)
         return self.done
-
-    def last(self, time: float, state: Array) -> Array:
-        """See `Steps.last`."""
-        return np.concatenate([state, self._fast.observe(time, state)])
-
-    def finer(self, times: Array, rows: Array, step: float) -> float:
-        """No step: within recorded ones the method has found the finest itself."""
-        return 0.0
 
     def _update(self, time: float, state: Array) -> None:
         """Let a program look at the machine, which may ask where no posture is."""

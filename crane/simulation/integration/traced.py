@@ -13,9 +13,65 @@ from crane.codegen.representation import Array as Place
 from crane.codegen.representation import Routine
 from crane.codegen.scalar import add, dot, subtract
 from crane.common.errors import InputError
+from crane.common.samples import Array
 from crane.control import At, TracedController, ValveDrive
 from crane.dynamics.traced import Sweep
 from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.state import seen_layout, state_layout
+
+
+class Stepper:
+    """A machine and its controller in machine code: what all methods have in common.
+
+    A method writes `_build`, which adds a formula `observe` with the part `seen`.
+
+    Args:
+        chart: The machine.
+        control: Its controller.
+        states: Number of the controller's states.
+        method: What the method's code depends on besides them.
+        fold: Whether zeros and ones among the controller's settings become part of the code.
+
+    Attributes:
+        bounds: See `FastClosure`, and where other coordinates are better, see `Chart.limits`.
+
+    Raises:
+        TooLongError: It would take too long to compile.
+    """
+
+    def __init__(
+        self, chart: Chart, control: TracedController, states: int, method: tuple, fold: bool
+    ):
+        machine = chart.machine
+        self._fast, self._numbers = machine.closure.fast, chart.dynamics.numbers
+        self._chart, self._control = chart, control
+        self.bounds = np.append(self._fast.bounds, chart.limits)
+        self._columns = columns_of(control)
+        self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
+        form = form_of(control, self._columns, len(machine.active), states, fold)
+        key = (*method, form, states, *chart.formulas)
+        if key not in self._fast.programs:
+            self._fast.programs[key] = program_of(control, self._fast, key, self._build)
+        self._program = self._fast.programs[key]
+
+    def _build(self, program: Program) -> None:
+        """Add formulas and routines."""
+        raise NotImplementedError
+
+    @property
+    def _arguments(self) -> tuple[Array, Array, Array]:
+        """What all formulas begin with: geometry, numbers of the machine, settings."""
+        settings = np.ascontiguousarray(self._control.settings)
+        return self._fast.geometry.numbers, self._numbers, settings
+
+    def observe(self, time: float, state: Array) -> Array:
+        """What is seen (.,) at a time [s] and a state."""
+        reference = np.ascontiguousarray(self._control.references(np.array([time])))
+        layout = self._program.outputs("observe")
+        out = np.empty(layout.size)
+        self._program.call("observe", *self._arguments, reference, state, out)
+        seen: Array = out[layout["seen"]]
+        return seen
 
 
 def beyond(r: Routine, result: Place) -> Value:
