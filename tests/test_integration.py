@@ -269,7 +269,7 @@ def failing(steps, *arguments, **settings):
 def test_a_branch_that_is_left_is_left_alike(forwarder, steps):
     free = forwarder.replace(friction={}, end_stops=())
     runs = [
-        crane.simulate(free, control, duration=0.12, step=1e-4, backend=backend)
+        crane.simulate(free, control, duration=0.1, step=2e-4, backend=backend)
         for control, backend in (
             (Push(0.0, 200.0, 0.0), "compiled"),
             (InPython(Push(0.0, 200.0, 0.0)), "compiled"),
