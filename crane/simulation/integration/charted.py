@@ -317,21 +317,21 @@ class ChartedSteps:
     @property
     def _inverted(self) -> bool:
         """Whether the controller asks for inverse dynamics, which its own coordinates need."""
-        control, asked = self._control, False
+        control, asked = self._control, 0
         if isinstance(control, ValveDrive) or not isinstance(control, TracedController):
             return False
         n, tape = len(self._chart.seen), Tape()
 
         def inverse(a_a: Sequence[Number], friction: bool) -> list[Number]:
             nonlocal asked
-            asked = True
-            return tape.loads(5, 0, n)
+            asked += 1
+            return tape.loads(5, n * asked, n)  # others each time: laws divide by differences
 
         columns = control.references(np.zeros(1)).shape[1]
         sizes = n, n, self._layout.parts["own"], len(control.settings), columns
         q_a, v_a, state, settings, reference = (tape.loads(i, 0, x) for i, x in enumerate(sizes))
         control.trace(At(q_a, v_a, state, settings, reference, inverse))
-        return asked
+        return asked > 0
 
     def _dead(self, time: float, q: Array, other: Chart) -> HaltedError:
         """What to say of coordinates that the controller cannot do without."""
