@@ -262,6 +262,41 @@ def test_unknown_method(springy):
         crane.simulate(springy, duration=0.1, method="rk5")
 
 
+def test_the_method_of_circuits_is_no_other_s(springy):
+    with pytest.raises(InputError, match="'rosenbrock' is that of circuits, take DOP853 or rk4"):
+        crane.simulate(springy, duration=0.1, method="rosenbrock")
+
+
+def test_steps_by_their_error_do_not_depend_on_what_is_recorded(forwarder):
+    """With a reference, states of the controller and friction; against fixed steps, too."""
+    control = crane.PI(forwarder, crane.task_trajectory(forwarder, "lift"))
+    fine = crane.simulate(forwarder, control, duration=0.28, step=5e-5)
+    for step in (1e-3, 7e-3, 0.07):
+        found = crane.simulate(forwarder, control, duration=0.28, step=step, method="DOP853")
+        every = round(step / 5e-5)
+        np.testing.assert_allclose(found.q, fine.q[::every], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.v, fine.v[::every], rtol=0, atol=1e-9)
+        for name, values in found.channels.items():
+            off = np.abs(values - fine.channels[name][::every]).max()
+            assert off < 1e-14 + 1e-6 * np.abs(fine.channels[name]).max(), (
+                name
+            )  # friction is steep
+
+
+def test_steps_by_their_error_turn_a_floating_machine_round():
+    """Through rotation vectors of half a turn, which go on at the opposite end."""
+    with pytest.warns(CraneWarning):
+        machine = crane.load(DATA / "slider_crank.yaml", floating=True)
+    speeds = np.array([1.0, 0.2, 0.0, 1.0, 2.0, 9.0, 0.5])
+    start = machine.home[machine.closure.active], speeds
+    run = crane.simulate(machine, initial=start, duration=3.0, step=1e-2, method="DOP853")
+    energy = run.channels["kinetic"] + run.channels["potential"]
+    assert np.ptp(energy) < 1e-8 * np.ptp(run.channels["kinetic"])
+    turned = run.q[:, [machine.active.index(f"base_r{axis}") for axis in "xyz"]]
+    sizes = np.linalg.norm(turned, axis=1)
+    assert sizes.max() <= np.pi + 1e-9 and np.abs(np.diff(turned, axis=0)).max() > np.pi
+
+
 def test_too_many_steps(forwarder):
     with pytest.raises(InputError, match="1e[+]15 steps of 0.001 s, at most 4000000"):
         crane.simulate(forwarder, duration=1e12)

@@ -222,6 +222,8 @@ def _integration(
         raise InputError(f"method '{method}' does not go round with a body that floats, take rk4")
     if method in ADAPTIVE:
         return lambda chart: AdaptiveSteps(chart, control, own, method)
+    if method == "rosenbrock":
+        raise InputError("method 'rosenbrock' is that of circuits, take DOP853 or rk4")
     raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")
 
 
