@@ -29,7 +29,7 @@ class HaltedError(SimulationError):
         q_a: Array,
         what: str,
         otherwise: str = ", with all active joints within their limits: keep away from there, "
-        "crane workspace shows where the loops close",
+        "'crane workspace' shows where the loops close",
     ):
         super().__init__(f"at t = {time:.6g} s{what}")
         self.time, self.q_a, self.otherwise = time, np.array(q_a), otherwise
@@ -57,10 +57,7 @@ def explained(
         hint = f"; with a step of {finer:g} s it goes on: shorten the step, or smooth the friction"
         return SimulationError(f"{halt}{hint} more")
     passed = _passed(machine, halt, times, q_a, reference)
-    within = (
-        ", with all active joints within their limits: keep away from there, 'crane workspace' "
-    )
-    return SimulationError(f"{halt}{passed or within + 'shows where the loops close'}")
+    return SimulationError(f"{halt}{passed or halt.otherwise}")
 
 
 def _passed(

@@ -76,7 +76,10 @@ class PythonStepper:
             if not np.abs(self.layout.view(rate).q / units).max() * step < 1:  # also NaN
                 size = self._dynamics.machine.closure.size
                 what = f" the motion explodes (over 1 rad or {size:.3g} m in a step of {step:g} s)"
-                otherwise = ", and with shorter steps, too: look at its forces and gains"
+                otherwise = (
+                    ", and with steps an eighth as long, too: let method DOP853 choose them, or "
+                    "look at its forces and gains"
+                )
                 raise HaltedError(time, self.here(state), what, otherwise)
             rate, _ = self._rate(time + share * step, state + share * step * rate)
             total = total + weight * rate
