@@ -95,10 +95,11 @@ class AdaptiveSteps:
         gentle.direction = -1.0  # type: ignore[attr-defined]
         self.done = self.reached = 0
         method: Any = self._method
-        result: Any = solve_ivp(
-            rate, (times[0], end), state, method=method, t_eval=[*times, end],
-            rtol=1e-9, atol=enough, events=(calm, gentle),
-        )  # fmt: skip
+        with np.errstate(all="ignore"):  # where a trial explodes the method gives up by itself
+            result: Any = solve_ivp(
+                rate, (times[0], end), state, method=method, t_eval=[*times, end],
+                rtol=1e-9, atol=enough, events=(calm, gentle),
+            )  # fmt: skip
         if result.status == 1 and len(result.t_events[0]):
             q_a = self.slow.here(result.y_events[0][0])
             fastest = f"{_FASTEST / pace:.3g} rad/s or {_FASTEST * closure.size / pace:.3g} m/s"
