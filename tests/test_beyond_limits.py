@@ -45,7 +45,6 @@ class InPython:
         {},
         {"method": "RK45"},
         pytest.param({"backend": "pinocchio"}, marks=pytest.mark.slow),
-        pytest.param({"method": "Radau"}, marks=pytest.mark.slow),
         pytest.param({"method": "LSODA"}, marks=pytest.mark.slow),
     ],
 )
