@@ -21,11 +21,9 @@ from crane.cli import (  # noqa: F401  register their commands
     simulate,
     workspace,
 )
-from crane.cli.shared import app, say
+from crane.cli.shared import INTERRUPTED, app, say
 from crane.cli.waiting import watched
 from crane.common.errors import CraneError, CraneWarning, one_line
-
-_INTERRUPTED = 130
 
 
 def main() -> None:
@@ -39,7 +37,7 @@ def main() -> None:
     try:
         with watched(" ".join(["crane", *arguments[:1]])):
             status = app(args=arguments, standalone_mode=False, prog_name="crane")
-        if status == _INTERRUPTED:  # what the parser makes of KeyboardInterrupt
+        if status == INTERRUPTED:  # what the parser makes of KeyboardInterrupt
             raise KeyboardInterrupt
         if sys.stdout is not None:  # it is where the shell has closed it
             sys.stdout.flush()
@@ -50,7 +48,7 @@ def main() -> None:
         sys.exit(2)
     except KeyboardInterrupt:
         say("error: interrupted, nothing was written")
-        sys.exit(_INTERRUPTED)
+        sys.exit(INTERRUPTED)
     except OSError as error:
         if debug:
             raise

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 # Commands import what they need when they run, so that `crane --help` answers at once.
 
+INTERRUPTED = 130  # exit status
+
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,

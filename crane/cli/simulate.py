@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from crane.cli.shared import (
+    INTERRUPTED,
     Active,
     Argument,
     Change,
@@ -27,8 +28,6 @@ from crane.common.errors import InputError, known
 if TYPE_CHECKING:
     from crane.control import Command, Controller
     from crane.machine import Machine
-
-_INTERRUPTED = 130
 
 
 @app.command()
@@ -104,7 +103,7 @@ def simulate(
     except InterruptedRun as cut:
         write_run(out, cut.recording)
         say(f"{cut}: what there is of it is in {out}, whose summary says where it was cut")
-        sys.exit(_INTERRUPTED)
+        sys.exit(INTERRUPTED)
     print(write_run(out, recording), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")
 

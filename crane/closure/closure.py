@@ -21,7 +21,7 @@ from crane.common.samples import Array, as_samples, per_sample, solve
 from crane.description import Coupling, LoopSpec
 
 _FEW, _FAR = 100, 0.1  # samples worth sorting: how many, how far apart as a share of the range
-_SAME = 1e-6  # difference of a closed posture and what Newton's method makes of it
+_SAME = 1e-6  # rad, machine's size, between a posture and what Newton's method makes of it
 _STEPS = 8  # from home to a target that is far from the one before it
 
 
@@ -255,7 +255,7 @@ class Closure:
             posture = self._branch.posture(q)
         except WrongBranchError:
             return False
-        return bool(np.abs(posture.q - q).max() < _SAME)
+        return bool(np.abs((posture.q - q) / self.units).max() < _SAME)
 
     def reach(self, cursor: Cursor, target: Array, sample: str = "") -> Array:
         """The posture at a target that is too far for one step, where the cursor is left.

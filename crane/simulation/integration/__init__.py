@@ -1,4 +1,7 @@
-"""Motion in time: Runge-Kutta and Rosenbrock methods in machine code, and scipy's."""
+"""Motion in time: Runge-Kutta and Rosenbrock methods in machine code, and scipy's.
+
+Each integrates in one chart (`charts`); `ChartedSteps` goes from one to the next.
+"""
 
 from crane.simulation.integration.adaptive import ADAPTIVE, AdaptiveSteps
 from crane.simulation.integration.charted import ChartedSteps

@@ -27,13 +27,13 @@ from crane.simulation.integration.stepwise import Progress, PythonStepper
 
 _WIDER = np.array([2.0, 0.1])  # how limits move where nothing is better
 _RECENT = 500  # states that are kept
-_SAME = 1e-6  # [rad], [m] between a posture as foreseen and as closed
+_SAME = 1e-6  # rad, machine's size, between a posture as foreseen and as closed
 _DEAD = 10.0  # how many times better others are at a dead centre
 _AT_A_HALT = 1.5  # how many times better other coordinates are that are tried where it halts
 
 
 class Way(Protocol):
-    """What integrates in one chart: `Steps`, `StiffSteps`, `AdaptiveSteps`."""
+    """What integrates in one chart: `Steps`, `StiffSteps`, `ExplicitSteps`, `AdaptiveSteps`."""
 
     done: int
     offset: float  # when the state is, after the next instant without a row [s]
@@ -196,7 +196,8 @@ class ChartedSteps:
             path = ahead(instants[nodes], near[nodes, :size], way.slow.observe)
             q = self._layout.view(np.resize(path.state(behind), self._layout.size)).q
             other = chart.moved(q, machine.closure.active)
-            if other is not None and np.abs(other.machine.home - q).max() < _SAME:
+            units = machine.closure.units
+            if other is not None and np.abs((other.machine.home - q) / units).max() < _SAME:
                 self._enter(self._known(other, q), 0.0)
                 path = corrected(path, behind, self._way.slow.observe)
                 return self._behind(path, behind, fine, times, state, step, rows)

@@ -17,8 +17,6 @@ from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.traced import (
     Stepper,
     beyond,
-    machine_at,
-    settings_of,
     wrapped,
 )
 
@@ -101,12 +99,8 @@ class ExplicitStepper(Stepper):
         return done, offset
 
     def _build(self, program: Program) -> None:
-        control = self._control
         for name in ("observe", "rate"):
-            tape = Tape()
-            machine = machine_at(self._chart, tape, self._state, 4)
-            settings = settings_of(control, tape, 2, fold=False)
-            tau, own_rate = control.trace(machine.seen(settings, tape.loads(3, 0, self._columns)))
+            machine, tau, own_rate = self._driven(Tape())
             sweep = machine.sweep
             if name == "observe":
                 out = {"seen": [*tau, *sweep.friction, sweep.kinetic, sweep.potential]}

@@ -12,8 +12,6 @@ from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.traced import (
     Stepper,
     beyond,
-    machine_at,
-    settings_of,
     wrapped,
 )
 
@@ -34,12 +32,8 @@ class CompiledStepper(Stepper):
         super().__init__(chart, control, states, ("rk4",), fold=False)
 
     def _build(self, program: Program) -> None:
-        control = self._control
         for name in ("observe", "rate"):
-            tape = Tape()
-            machine = machine_at(self._chart, tape, self._state, 4)
-            settings = settings_of(control, tape, 2, fold=False)
-            tau, own_rate = control.trace(machine.seen(settings, tape.loads(3, 0, self._columns)))
+            machine, tau, own_rate = self._driven(Tape())
             sweep, a_a = machine.sweep, machine.forward(tau)
             outputs = {"rate": [*sweep.slopes, *a_a, *own_rate, *machine.powers(tau)]}
             if name == "observe":

@@ -12,7 +12,7 @@ from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.state import state_layout
 
-_AHEAD = 1e-3  # [s] how far a machine is thought on that stops
+_AHEAD = 1e-3  # of `Closure.pace`: how far a machine is thought on that stops
 
 Progress = Callable[[int], None] | None
 """What is told the number of finished steps."""
@@ -96,7 +96,7 @@ class PythonStepper:
         """Why the machine cannot go on, whatever the step."""
         at, closure = self.layout.view(state), self._chart.machine.closure
         try:
-            closure.solve(at.q[closure.active] + _AHEAD * at.v_a, guess=at.q)
+            closure.solve(at.q[closure.active] + _AHEAD * closure.pace * at.v_a, guess=at.q)
         except ClosureError as error:
             return HaltedError(time, self.here(state), f": {error}")
         speed = np.abs(at.v_a).max()

@@ -20,60 +20,6 @@ from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.state import seen_layout, state_layout
 
 
-class Stepper:
-    """A machine and its controller in machine code: what all methods have in common.
-
-    A method writes `_build`, which adds a formula `observe` with the part `seen`.
-
-    Args:
-        chart: The machine.
-        control: Its controller.
-        states: Number of the controller's states.
-        method: What the method's code depends on besides them.
-        fold: Whether zeros and ones among the controller's settings become part of the code.
-
-    Attributes:
-        bounds: See `FastClosure`, and where other coordinates are better, see `Chart.limits`.
-
-    Raises:
-        TooLongError: It would take too long to compile.
-    """
-
-    def __init__(
-        self, chart: Chart, control: TracedController, states: int, method: tuple, fold: bool
-    ):
-        machine = chart.machine
-        self._fast, self._numbers = machine.closure.fast, chart.dynamics.numbers
-        self._chart, self._control = chart, control
-        self.bounds = np.append(self._fast.bounds, chart.limits)
-        self._columns = columns_of(control)
-        self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
-        form = form_of(control, self._columns, len(machine.active), states, fold)
-        key = (*method, form, states, *chart.formulas)
-        if key not in self._fast.programs:
-            self._fast.programs[key] = program_of(control, self._fast, key, self._build)
-        self._program = self._fast.programs[key]
-
-    def _build(self, program: Program) -> None:
-        """Add formulas and routines."""
-        raise NotImplementedError
-
-    @property
-    def _arguments(self) -> tuple[Array, Array, Array]:
-        """What all formulas begin with: geometry, numbers of the machine, settings."""
-        settings = np.ascontiguousarray(self._control.settings)
-        return self._fast.geometry.numbers, self._numbers, settings
-
-    def observe(self, time: float, state: Array) -> Array:
-        """What is seen (.,) at a time [s] and a state."""
-        reference = np.ascontiguousarray(self._control.references(np.array([time])))
-        layout = self._program.outputs("observe")
-        out = np.empty(layout.size)
-        self._program.call("observe", *self._arguments, reference, state, out)
-        seen: Array = out[layout["seen"]]
-        return seen
-
-
 def beyond(r: Routine, result: Place) -> Value:
     """Whether a closed posture is beyond a chart's limits, the last two of a routine's bounds."""
     return (result["steepest"] > r.bounds[3]) | (result["edge"] < r.bounds[4])
@@ -140,6 +86,67 @@ def machine_at(chart: Chart, tape: Tape, layout: Layout, state: int) -> Traced:
     )
     v_a = parts.v_a if chart.own else [sweep.rates[i + 1] for i in chart.seen]
     return Traced(chart, sweep, parts, [q[i] for i in chart.seen], v_a)
+
+
+class Stepper:
+    """A machine and its controller in machine code: what all methods have in common.
+
+    A method writes `_build`, which adds a formula `observe` with the part `seen`.
+
+    Args:
+        chart: The machine.
+        control: Its controller.
+        states: Number of the controller's states.
+        method: What the method's code depends on besides them.
+        fold: Whether zeros and ones among the controller's settings become part of the code.
+
+    Attributes:
+        bounds: See `FastClosure`, and where other coordinates are better, see `Chart.limits`.
+
+    Raises:
+        TooLongError: It would take too long to compile.
+    """
+
+    def __init__(
+        self, chart: Chart, control: TracedController, states: int, method: tuple, fold: bool
+    ):
+        machine = chart.machine
+        self._fast, self._numbers = machine.closure.fast, chart.dynamics.numbers
+        self._chart, self._control = chart, control
+        self.bounds = np.append(self._fast.bounds, chart.limits)
+        self._columns = columns_of(control)
+        self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
+        form = form_of(control, self._columns, len(machine.active), states, fold)
+        key = (*method, form, states, *chart.formulas)
+        if key not in self._fast.programs:
+            self._fast.programs[key] = program_of(control, self._fast, key, self._build)
+        self._program = self._fast.programs[key]
+
+    def _build(self, program: Program) -> None:
+        """Add formulas and routines."""
+        raise NotImplementedError
+
+    def _driven(self, tape: Tape) -> tuple[Traced, Sequence[Number], Sequence[Number]]:
+        """Machine, forces and rates of the controller; references and state are 3 and 4."""
+        machine = machine_at(self._chart, tape, self._state, 4)
+        settings = settings_of(self._control, tape, 2, fold=False)
+        reference = tape.loads(3, 0, self._columns)
+        return machine, *self._control.trace(machine.seen(settings, reference))
+
+    @property
+    def _arguments(self) -> tuple[Array, Array, Array]:
+        """What all formulas begin with: geometry, numbers of the machine, settings."""
+        settings = np.ascontiguousarray(self._control.settings)
+        return self._fast.geometry.numbers, self._numbers, settings
+
+    def observe(self, time: float, state: Array) -> Array:
+        """What is seen (.,) at a time [s] and a state."""
+        reference = np.ascontiguousarray(self._control.references(np.array([time])))
+        layout = self._program.outputs("observe")
+        out = np.empty(layout.size)
+        self._program.call("observe", *self._arguments, reference, state, out)
+        seen: Array = out[layout["seen"]]
+        return seen
 
 
 def wrapped(chart: Chart, state: Sequence[Number]) -> list[Number]:
