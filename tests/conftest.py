@@ -1,5 +1,6 @@
 """Machines that several modules test with, and how property tests run."""
 
+import dataclasses
 import os
 import time
 from pathlib import Path
@@ -23,6 +24,16 @@ settings.load_profile("crane")
 @pytest.fixture(scope="session")
 def mini():
     return crane.load("mini_forwarder")
+
+
+@pytest.fixture(scope="session")
+def smooth(mini):
+    """With friction that is stiff, not sticking."""
+    laws = {
+        joint: dataclasses.replace(mini.friction[joint], smoothing=smoothing)
+        for joint, smoothing in {"q1": 1e-2, "X1": 1e-3, "X2": 1e-3}.items()
+    }
+    return mini.replace(friction={**mini.friction, **laws})
 
 
 @pytest.fixture(scope="session")

@@ -83,8 +83,8 @@ def test_pushed_beyond_the_limits_without_a_reference(free):
 
 
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
-def test_a_step_that_is_too_long_is_told_with_one_that_is_not(mini):
-    path = crane.task_trajectory(mini, "lift")
+def test_a_step_that_is_too_long_is_told_with_one_that_is_not(smooth):
+    mini, path = smooth, crane.task_trajectory(smooth, "lift")
     with pytest.raises(SimulationError, match=r"with a step of 0\.0025 s it goes on: shorten"):
         crane.simulate(mini, crane.PI(mini, path), duration=0.5, step=5e-3)
     crane.simulate(mini, crane.PI(mini, path), duration=0.5, step=2.5e-3)

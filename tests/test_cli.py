@@ -313,7 +313,7 @@ def test_study(tmp_path):
     )  # fmt: skip
     result = typed(*command, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
-    assert "*                 0      60.90" in result.stdout
+    assert "*                 0      62.10" in result.stdout
     assert "3 variants, best peak_X1 first" in result.stdout
     assert {path.name for path in (tmp_path / "study").iterdir()} == {"study.csv", "study.png"}
     assert "is not empty" in one_error(typed(*command, cwd=tmp_path))

@@ -74,11 +74,11 @@ def test_settings_reuse_machine_code_and_other_numbers_do_not(page, monkeypatch)
     monkeypatch.setattr(
         CompiledStepper, "_build", lambda x, program: made.append(x) or build(x, program)
     )
-    tighter = crane.simulate(machine, page["Fast"](machine, trajectory, 0.5 * most), duration=0.02)
+    tighter = crane.simulate(machine, page["Fast"](machine, trajectory, 0.5 * most), duration=0.2)
     assert not made
-    assert np.abs(tighter.tau[:, 0]).max() == 0.5 * most[0]
+    assert (np.abs(tighter.tau).max(axis=0) == 0.5 * most).any()
     start, damping = trajectory.position(0.0), np.diag([0.05, 500.0, 500.0])
-    stronger = page["Shaken"](machine, np.array([0.04, 3.0, 3.0]), damping)
+    stronger = page["Shaken"](machine, np.array([0.8, 40.0, 40.0]), damping)
     one, two = (
         crane.simulate(machine, law, start, duration=0.1) for law in (page["shaken"], stronger)
     )

@@ -17,7 +17,7 @@ from crane.closure.traced import Bodies, Constants, Loops
 from crane.codegen import Program, Tape
 from crane.codegen.derivative import derivatives
 from crane.common.errors import CraneWarning, InputError
-from crane.dynamics.compiled import QUANTITIES
+from crane.dynamics.compiled import MOVES, QUANTITIES
 from crane.dynamics.traced import Sweep
 from crane.identification.mechanics.base import random_samples
 from crane.identification.mechanics.identify import identify
@@ -103,7 +103,7 @@ def formula(dynamics, quantity, q, v_a, x):
     loops = Loops(fast._equations, fast._structure, fast._active, fast._passive, posture)
     sweep = Sweep(
         posture, loops, Floats(dynamics.numbers), q.tolist(), v_a.tolist(), dynamics.carriers,
-        dynamics.plan, dynamics.spans,
+        dynamics.plan, dynamics.spans, dynamics.forces.sticking, quantity in MOVES,
     )  # fmt: skip
     return np.array(QUANTITIES[quantity](sweep, x.tolist()), dtype=float)
 
@@ -232,7 +232,7 @@ def test_dampers_and_ropes_take_out_what_the_length_s_rate_says(mini):
         lost = 7.0 * boom**2 + 400.0 * depth * (max(0.0, 1 + 1.5 * strut) - 1) * strut
         q = machine.closure.solve(home)
         rates = dynamics.at("rates", q, v_a, np.zeros(3))
-        assert rates[-1] == pytest.approx(lost, rel=1e-8) and lost > 0
+        assert rates[-2] == pytest.approx(lost, rel=1e-8) and lost > 0
 
 
 def test_the_balance_of_energies(mini):
@@ -664,12 +664,12 @@ def test_what_mjcf_has_no_place_for_is_told(tmp_path, mini):
 
 
 def test_operations_of_machines_without_elements_read_none():
-    """The numbers of a machine end where those of its joints do: 10, 19 and 1 each, gravity."""
+    """Those of a machine end behind its joints': 10, 22 and 1 each, gravity, whether it moves."""
     machine = crane.load("mini_forwarder")
     dynamics = crane.Dynamics(machine)
-    assert len(dynamics.numbers) == 30 * machine.model.nv + 3 and dynamics.spans == ()
+    assert len(dynamics.numbers) == 33 * machine.model.nv + 4 and dynamics.spans == ()
     sizes = [
         len(crane.Dynamics(machine.replace(ropes=ropes)).numbers)
         for ropes in ((), (crane.Rope(BOOM, 1, 1),), (crane.Rope(BOOM, 1, 1),) * 2)
     ]
-    assert [two - one for one, two in pairwise(sizes)] == [25, 25]
+    assert [two - one for one, two in pairwise(sizes)] == [28, 28]

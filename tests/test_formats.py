@@ -173,8 +173,11 @@ def test_changes_locks_and_payloads_are_written(tmp_path):
 def test_writing_tells_what_is_left_out(tmp_path):
     machine = crane.load(DATA / "four_bar.yaml")
     for writer, lost in (
-        (write_urdf_plus, "end stops, tasks, gains, springs and forces"),
-        (write_mjcf, "end stops, tasks, gains"),
+        (
+            write_urdf_plus,
+            "the friction law of crank, end stops, tasks, gains, springs and forces",
+        ),
+        (write_mjcf, "the friction law of crank, end stops, tasks, gains"),
     ):
         with pytest.warns(CraneWarning, match=rf"has no place for {lost}, left out"):
             writer(machine, tmp_path / "written.xml")

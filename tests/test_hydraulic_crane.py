@@ -279,9 +279,11 @@ def test_a_tonne_on_the_stops_moves_them_as_steel_gives_way(lever, duration):
     cylinder = machine.hydraulics.cylinders["X_lift"]
     pressed = cylinder.area_a * channels["pressure_X_lift_a"][-1]
     pressed -= cylinder.area_b * channels["pressure_X_lift_b"][-1]
-    pushed = stop.stiffness * beyond[-1]
-    friction = 310.0  # at rest, either way
-    assert abs(abs(pressed - weight) - pushed) < friction
+    inwards = 1.0 if q[-1] < machine.lower[LIFT] else -1.0
+    sinking = 1.0 - stop.damping * inwards * recording.v[-1, LIFT]  # as the oil leaks
+    pushed = inwards * stop.stiffness * beyond[-1] * sinking
+    assert abs(pressed + pushed - weight - channels["friction_X_lift"][-1]) < 2.0
+    assert abs(channels["friction_X_lift"][-1]) < 300.1
     assert 1e-4 < beyond[-1] < 6e-4 and beyond.max() < 1.5e-3
     assert np.abs(recording.v[-1]).max() < 1e-3
 

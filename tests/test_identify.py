@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from motions import NOISE, noisy
 from rig import Rig, Tolerances, default_sensors
+from scipy.interpolate import CubicSpline
 
 import crane
 from crane.common.errors import InputError, RecordingError
@@ -196,7 +197,8 @@ def test_a_resting_joint_is_left_out(mini):
 
 def test_recordings_of_simulations_serve(mini):
     """From strokes and forces alone, velocities by the smoother."""
-    path = crane.task_trajectory(mini, "loading")
+    given = motion(mini)
+    path = crane.Trajectory(CubicSpline(given.time, given.q))
     recording = crane.simulate(mini, crane.ComputedTorque(mini, path), path(0.0)[:2])
     slow = [0.03, 5e-4, 5e-4]
     result = identify(mini, recording, prior=0.1, slow=slow)

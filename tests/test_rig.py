@@ -48,6 +48,14 @@ def real(mini):
 
 
 @pytest.fixture(scope="module")
+def stiff():
+    """With friction whose slope at rest asks for short substeps."""
+    slopes = {"q1": 4e-4, "X1": 4e-5, "X2": 4e-5}
+    changes = {f"friction.{joint}.smoothing": slope for joint, slope in slopes.items()}
+    return crane.load("mini_forwarder", changes)
+
+
+@pytest.fixture(scope="module")
 def recording(real, path):
     return real.run(path, label="there")
 
@@ -86,7 +94,7 @@ def test_the_controller_samples_and_holds(mini, exact):
             method="DOP853",
         )
         q_a, v_a = piece.q[-1], piece.v[-1]
-    assert np.abs(v_a).min() > 1e-3  # it moved
+    assert np.abs(v_a[[0, 2]]).min() > 1e-3 and v_a[1] == 0  # it moved, and A1 has not yet
 
 
 def test_fast_sampling_becomes_the_continuous_controller(mini, exact, path):
@@ -102,23 +110,22 @@ def test_fast_sampling_becomes_the_continuous_controller(mini, exact, path):
     assert ((ratios > 1.8) & (ratios < 2.2)).all()
 
 
-def test_substeps_are_stable(real, path, monkeypatch):
+def test_substeps_are_stable(stiff, path, monkeypatch):
     """Half as long: the true motion is the same to far below what the sensors tell."""
-    same = Rig(real.machine, 1, sensors=ideal(real.machine))
-    coarse = same.run(path)
+    coarse = Rig(stiff, 1, sensors=ideal(stiff)).run(path)
     monkeypatch.setattr(rig, "_STABLE", rig._STABLE / 2)
-    fine = Rig(real.machine, 1, sensors=ideal(real.machine)).run(path)
+    fine = Rig(stiff, 1, sensors=ideal(stiff)).run(path)
     for name, allowed in (("true", 1e-9), ("true_velocity", 1e-8), ("true_force", 1e-5)):
         assert np.abs(columns(coarse, name) - columns(fine, name)).max() < allowed
     assert not np.array_equal(columns(coarse, "true"), columns(fine, "true"))
 
 
-def test_the_rate_that_sets_the_substeps_is_the_fastest(real, path, monkeypatch):
+def test_the_rate_that_sets_the_substeps_is_the_fastest(stiff, path, monkeypatch):
     """Runge-Kutta bears 2.785 on the real axis: 2.6 is calm, 4 chatters."""
     found = []
     for bound in (2.0, 2.6, 4.0):
         monkeypatch.setattr(rig, "_STABLE", bound)
-        found.append(Rig(real.machine, 1, sensors=ideal(real.machine)).run(path))
+        found.append(Rig(stiff, 1, sensors=ideal(stiff)).run(path))
     calm, chatter = (
         np.abs(columns(other, "true_velocity") - columns(found[0], "true_velocity"))[:, 1:].max()
         for other in found[1:]
@@ -127,7 +134,7 @@ def test_the_rate_that_sets_the_substeps_is_the_fastest(real, path, monkeypatch)
 
 
 def test_a_joint_sticks_until_the_force_breaks_it_away(mini):
-    """Below F_C + F_S + offset the smoothed law lets it creep at v = s artanh(F / (F_C + F_S)).
+    """Below F_C + F_S + offset it stays where it is.
 
     The slewing joint bears no weight: the force is K_p (c t - q) of a ramp.
     """
@@ -141,21 +148,17 @@ def test_a_joint_sticks_until_the_force_breaks_it_away(mini):
     found = stuck.run(ramp)
     force = found.channels["true_force_q1"] - law.coulomb_offset
     v = found.channels["true_velocity_q1"]
-    sticks = force < 0.9 * breakaway
-    creep = law.smoothing * np.arctanh(np.maximum(force[sticks], 0.0) / breakaway)
+    sticks = force < breakaway
     assert sticks.sum() > 200
-    # it reaches that creep, and no more; while the offset still pushes back it creeps back
-    assert (v[sticks] < 1.01 * creep + 1e-7).all()
+    assert (v[sticks] == 0).all()
     later = np.flatnonzero(sticks)[-1]
-    assert v[later] > 0.9 * creep[-1]
     # F_C + F_S is passed at the time of the ramp, then it slips faster than stiction reaches
-    slips = np.argmax(v > 0.1 * law.stribeck)
     due = (breakaway + law.coulomb_offset) / (15 * rate)
-    assert found.time[slips] == pytest.approx(due, rel=0.03)
+    assert found.time[np.argmax(v > 0)] == pytest.approx(due, abs=1.5e-3)
     assert v.max() > 2 * law.stribeck
     free = Rig(slow, 1, NONE, ideal(slow)).run(ramp)
     early = free.channels["true_velocity_q1"][later]
-    assert early > 3 * v[later]
+    assert early > 0
 
 
 def test_forces_saturate(mini):
@@ -251,7 +254,7 @@ def test_a_force_keeps_its_sign_when_the_load_drives():
     assert (exact.channels["true_force_X1"][lowers] < -15.0).all()
     np.testing.assert_allclose(exact.tau, columns(exact, "true_force"), rtol=0, atol=1e-11)
     # as inverse dynamics has it: tau positive drives the joint's way
-    middle, rates = slice(1000, 3000, 100), columns(exact, "true_velocity")
+    middle, rates = slice(1100, 3000, 100), columns(exact, "true_velocity")
     needed = crane.Dynamics(machine).inverse(
         columns(exact, "true")[middle],
         rates[middle],
@@ -284,7 +287,7 @@ def test_parameters_are_within_the_tolerances(mini, seed):
         gap = numbers[name] - value
         if link == "friction":
             field = what.partition(".")[2]
-            if field in ("smoothing", "stiction", "stribeck"):
+            if field in ("stiction", "stribeck"):
                 continue
             assert abs(gap) <= most.friction * abs(value)
         elif value == 0:
@@ -433,10 +436,6 @@ def test_tips_are_of_the_model_and_of_the_plant(real, recording):
         (
             lambda m: Rig(crane.load("mini_forwarder", lock={"X2": 0.01}), 1),
             "'mini_forwarder' has a payload or locked joints",
-        ),
-        (
-            lambda m: Rig(m.replace(friction={"q1": Friction(0.1, smoothing=0.0)}), 1, NONE),
-            "the friction of 'q1' jumps at rest",
         ),
     ],
 )

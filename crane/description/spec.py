@@ -153,16 +153,18 @@ class Friction:
     tau = (coulomb + stiction e^-(v / stribeck)^2) sign(v) + coulomb_offset
           + viscous v + viscous_offset |v|,
 
-    the joint's drive force that the friction consumes, with sign(v) smoothed to
-    tanh(v / smoothing). Without stiction this is equation (5) of the reduced-scale forwarder
-    paper with the sign that brakes.
+    the joint's drive force that the friction consumes. At rest it is what keeps the joint there,
+    anything from coulomb_offset - (coulomb + stiction) to coulomb_offset + (coulomb + stiction).
+    With a smoothing it is a function of v instead, sign(v) = tanh(v / smoothing), and what should
+    rest creeps. Without stiction this is equation (5) of the reduced-scale forwarder paper with
+    the sign that brakes.
 
     Attributes:
         coulomb: [N] or [N m].
         coulomb_offset: Difference between the two directions [N] or [N m].
         viscous: [N s/m] or [N m s/rad].
         viscous_offset: Difference between the two directions [N s/m] or [N m s/rad].
-        smoothing: Velocity over which the sign changes [m/s] or [rad/s]; 0 for a jump.
+        smoothing: Velocity over which the sign changes [m/s] or [rad/s]; 0: it jumps, and sticks.
         stiction: By how much friction at rest exceeds Coulomb friction [N] or [N m].
         stribeck: Velocity over which stiction vanishes [m/s] or [rad/s].
     """
@@ -171,7 +173,7 @@ class Friction:
     coulomb_offset: float = 0.0
     viscous: float = 0.0
     viscous_offset: float = 0.0
-    smoothing: float = 1e-3
+    smoothing: float = 0.0
     stiction: float = 0.0
     stribeck: float = 1e-2
 
@@ -179,6 +181,16 @@ class Friction:
         _check(self, "friction", "coulomb", "viscous", "smoothing", "stiction", "stribeck")
         if self.stribeck == 0:
             raise InputError("stribeck of friction is 0, give the velocity where stiction ends")
+
+    @property
+    def breakaway(self) -> float:
+        """How much friction at rest can differ from `coulomb_offset` [N] or [N m]."""
+        return self.coulomb + self.stiction
+
+    @property
+    def sticks(self) -> bool:
+        """Whether it holds a joint at rest."""
+        return self.smoothing == 0 and self.breakaway > 0
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,21 @@ from crane.closure.traced import Constants, folded
 from crane.codegen import Number, Program, Tape, largest
 from crane.common.samples import Array
 from crane.dynamics.recursion import Plan
-from crane.dynamics.traced import Spans, Sweep
+from crane.dynamics.traced import Moved, Spans, Sweep
 from crane.machine import Machine
 
+
+def _rates(sweep: Sweep, moved: Moved) -> list[Number]:
+    return [*sweep.slopes, *moved.a_a, sweep.dissipation, moved.margin]
+
+
+def _observed(sweep: Sweep, moved: Moved) -> list[Number]:
+    return [*moved.friction, sweep.kinetic, sweep.potential, *moved.rest]
+
+
+MOVES = ("rates", "observation")  # what depends on `JointForces.set_modes`
 # What can be asked of a sweep, given a second argument x (n,): a_A for inverse and regressor,
-# tau_A for forward.
+# tau_A for the others.
 QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
     "inverse": lambda sweep, x: sweep.inverse(x, friction=False),
     "inverse with friction": lambda sweep, x: sweep.inverse(x, friction=True),
@@ -28,12 +38,8 @@ QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
     "friction": lambda sweep, x: sweep.friction,
     "passive": lambda sweep, x: sweep.passive,
     "energy": lambda sweep, x: [sweep.kinetic, sweep.potential],
-    "rates": lambda sweep, x: [
-        *sweep.slopes,
-        *sweep.forward(x, friction=True),
-        sweep.dissipation,
-    ],
-    "observation": lambda sweep, x: [*sweep.friction, sweep.kinetic, sweep.potential],
+    "rates": lambda sweep, x: _rates(sweep, sweep.moved(x, rest=True)),
+    "observation": lambda sweep, x: _observed(sweep, sweep.moved(x, rest=True)),
     "regressor": lambda sweep, x: [entry for row in sweep.regressor(x) for entry in row],
 }
 _FLOAT = np.dtype(np.float64)
@@ -45,10 +51,12 @@ class QuantityCode:
     Args:
         quantity: A key of `QUANTITIES`.
         machine: The machine.
-        numbers: See `numbers_of`.
+        numbers: See `numbers_of`; read when a quantity is asked for.
+        pattern: What of them is part of the formulas.
         carriers: See `crane.dynamics.formulation`.
         plan: See `crane.dynamics.recursion`.
         spans: See `crane.dynamics.traced.spans_of`.
+        sticking: Of `JointForces`.
 
     Attributes:
         size: Length of the result of one sample.
@@ -63,18 +71,22 @@ class QuantityCode:
         quantity: str,
         machine: Machine,
         numbers: Array,
+        pattern: Array,
         carriers: tuple[int, ...],
         plan: Plan,
         spans: Spans,
+        sticking: tuple[int, ...],
     ):
         fast = self._fast = machine.closure.fast
         self._numbers = numbers
         nq, n = machine.model.nv, len(machine.active)
-        key = (quantity, folded(numbers), carriers, plan, spans)
+        key = (quantity, folded(pattern), carriers, plan, spans, sticking)
         if key not in fast.programs:
             fast.programs[key] = fast.kept(
                 ("quantity", *key),
-                lambda program: _build(program, quantity, fast, numbers, n, carriers, plan, spans),
+                lambda program: _build(
+                    program, quantity, fast, pattern, n, carriers, plan, spans, sticking
+                ),
             )
         self._program = program = fast.programs[key]
         self.size = program.outputs("formula").size
@@ -141,11 +153,14 @@ def _build(
     carriers: tuple[int, ...],
     plan: Plan,
     spans: Spans,
+    sticking: tuple[int, ...],
 ) -> None:
     tape = Tape()
     q, posture, loops = fast.trace(tape, 0, 2)
     constants = Constants(tape, 1, numbers)
-    sweep = Sweep(posture, loops, constants, q, tape.loads(3, 0, n), carriers, plan, spans)
+    v_a = tape.loads(3, 0, n)
+    modes = quantity in MOVES
+    sweep = Sweep(posture, loops, constants, q, v_a, carriers, plan, spans, sticking, modes)
     outputs = QUANTITIES[quantity](sweep, tape.loads(3, n, n))
     program.add("formula", 4, outputs)
     tape = Tape()  # what is not finite is left to the checks that name it

@@ -12,7 +12,7 @@ from crane.dynamics.compiled import QuantityCode
 from crane.dynamics.formulation import carriers
 from crane.dynamics.joint_forces import JointForces
 from crane.dynamics.recursion import planned
-from crane.dynamics.traced import numbers_of, spans_of
+from crane.dynamics.traced import modes_at, numbers_of, spans_of
 from crane.dynamics.tree import TreeDynamics
 from crane.machine import Machine
 from crane.machine.masses import has_mass
@@ -72,6 +72,10 @@ class Dynamics:
         if self.backend == "compiled":
             geometry = machine.closure.fast.geometry
             self.numbers = np.ascontiguousarray(numbers_of(machine, geometry, self.forces))
+        # what becomes part of formulas; not what changes with the motion
+        self.pattern = self.numbers.copy()
+        self._modes = modes_at(machine, self.forces) if self.backend == "compiled" else []
+        self.pattern[self._modes] = np.nan
 
     def __repr__(self) -> str:
         """Of what, and how it is computed."""
@@ -298,6 +302,15 @@ class Dynamics:
         formula.along(np.ascontiguousarray(q), inputs, out)
         return out
 
+    def set_modes(self, slip: Array, held: Array, pace: Array, moving: bool) -> None:
+        """Say what the joints do whose friction sticks; see `JointForces.set_modes`.
+
+        It counts for "rates" and "observation" alone, which only an integration asks for.
+        """
+        self.forces.set_modes(slip, held, pace, moving)
+        if self._modes:
+            self.numbers[self._modes] = [*np.column_stack([slip, held, pace]).ravel(), moving]
+
     @property
     def _n(self) -> int:
         return len(self.machine.active)
@@ -308,7 +321,14 @@ class Dynamics:
             try:
                 self._formulas[quantity] = (
                     QuantityCode(
-                        quantity, self.machine, self.numbers, self.carriers, self.plan, self.spans
+                        quantity,
+                        self.machine,
+                        self.numbers,
+                        self.pattern,
+                        self.carriers,
+                        self.plan,
+                        self.spans,
+                        self.forces.sticking,
                     )
                     if self.backend == "compiled"
                     else None

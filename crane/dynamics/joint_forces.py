@@ -11,10 +11,17 @@ from crane.machine import Machine
 
 _LAW = (
     "coulomb", "coulomb_offset", "viscous", "viscous_offset", "sharpness", "stiction", "stribeck",
+    "slip", "held", "pace",
     "stiffness", "damping", "constant", "slack",
     "stop", "stop_damping", "lower", "upper",
     "gas", "gas_share", "gas_rest", "gas_exponent",
 )  # fmt: skip
+_MODES = slice(_LAW.index("slip"), _LAW.index("pace") + 1)
+_SPRING = slice(_LAW.index("stiffness"), _LAW.index("slack") + 1)
+_STOP = slice(_LAW.index("stop"), _LAW.index("upper") + 1)
+_GAS = slice(_LAW.index("gas"), len(_LAW))
+AT_REST = 5e-10  # velocity of a machine that is none
+STILL = 1e-9  # acceleration of a joint that is none [rad/s^2], [m/s^2]
 _JUMP = 1e300  # sharpness of a sign that is not smoothed
 
 
@@ -33,8 +40,12 @@ class JointForces:
 
     Attributes:
         lengths: The distances that something acts along; m of them.
-        table: (nv + m, 19) per joint, then per distance: Coulomb friction, its offset, viscous
-            friction, its offset, one over the smoothing velocity, stiction, one over its velocity;
+        sticking: Columns of the joints whose friction sticks.
+        moving: 0 where friction holds the whole machine at rest, else 1; see `set_modes`.
+        table: (nv + m, 22) per joint, then per distance: Coulomb friction, its offset, viscous
+            friction, its offset, one over the smoothing velocity, stiction, one over its velocity,
+            and where it sticks, the sign of the slip or the share of the limit that it has at
+            rest, whether it is held, and one over a velocity of the machine (`set_modes`);
             stiffness, damping, constant force, energy of the spring at q = 0; stiffness and
             damping of the end stops, lower and upper limit; force of a gas spring at rest, its
             area over its volume there, where that is, exponent. A rope is an end stop.
@@ -45,6 +56,7 @@ class JointForces:
         self._joints, self.lengths = machine.model.nv, Lengths(machine, pairs)
         table = self.table = np.zeros((self._joints + len(pairs), len(_LAW)))
         table[:, _LAW.index("sharpness")] = 1.0
+        self.sticking, self.moving = sticking(machine), 1.0
         for joint, friction in machine.friction.items():
             table[machine.column(joint), :7] = (
                 friction.coulomb,
@@ -58,41 +70,73 @@ class JointForces:
         for stop in machine.end_stops:
             i = machine.column(stop.joint)
             lower, upper = machine.coordinates.lower, machine.coordinates.upper
-            table[i, 11:15] = stop.stiffness, stop.damping, lower[i], upper[i]
-        table[:, 15:] = 0.0, 1.0, 0.0, 1.0
+            table[i, _STOP] = stop.stiffness, stop.damping, lower[i], upper[i]
+        table[:, _GAS] = 0.0, 1.0, 0.0, 1.0
         for row, item in zip(rows, machine.elements, strict=True):
             match item:
                 case ForceElement():
                     # springs of one joint add up: sum k (q - rest) = K q - sum k rest
-                    table[row, 7:11] += (
+                    table[row, _SPRING] += (
                         item.stiffness,
                         item.damping,
                         item.force + item.stiffness * item.rest,
                         0.5 * item.stiffness * item.rest**2,
                     )
                 case GasSpring():
-                    table[row, 15:] = (
+                    table[row, _GAS] = (
                         item.area * item.pressure,
                         item.area / item.volume,
                         item.rest,
                         item.exponent,
                     )
                 case Rope():
-                    table[row, 11:15] = item.stiffness, item.damping, 0.0, item.length
+                    table[row, _STOP] = item.stiffness, item.damping, 0.0, item.length
         (
             self._stiffness, self._damping, self._constant, self._slack,
             self._stop, self._stop_damping, self._lower, self._upper,
             self._gas, self._gas_share, self._gas_rest, self._gas_exponent,
-        ) = np.ascontiguousarray(table[:, 7:].T)  # fmt: skip
+        ) = np.ascontiguousarray(table[:, _SPRING.start :].T)  # fmt: skip
 
-    def friction(self, v: Array) -> Array:
+    @property
+    def breakaway(self) -> Array:
+        """(k,) how much friction of the joints that stick can differ from its offset at rest."""
+        law = self.table[list(self.sticking)]
+        limits: Array = law[:, _LAW.index("coulomb")] + law[:, _LAW.index("stiction")]
+        return limits
+
+    def held(self, share: Array) -> Array:
+        """(k,) friction at rest of the joints that stick, with shares (k,) of its limit."""
+        offset: Array = self.table[list(self.sticking), _LAW.index("coulomb_offset")]
+        return offset + share * self.breakaway
+
+    @property
+    def modes(self) -> tuple[Array, Array, Array]:
+        """(k,) each, as `set_modes` has them."""
+        slip, held, pace = self.table[list(self.sticking), _MODES].T
+        return slip, held, pace
+
+    def set_modes(self, slip: Array, held: Array, pace: Array, moving: bool) -> None:
+        """Say what the joints do whose friction sticks.
+
+        Args:
+            slip: (k,) signs of their slips, or shares of the limit that those at rest have.
+            held: (k,) 1 where a joint is kept at rest by what that takes, else 0.
+            pace: (k,) one over velocities of the machine.
+            moving: Whether anything moves.
+        """
+        self.moving = float(moving)
+        self.table[list(self.sticking), _MODES] = np.column_stack([slip, held, pace])
+
+    def friction(self, v: Array, modes: bool = False) -> Array:
         """Drive force that friction consumes at every joint.
 
-        tau_F = (F_C + F_S e^-(v / v_S)^2) s + D_C + F_V v + D_V v s with s = tanh(v / smoothing):
-        equation (5) of the reduced-scale forwarder paper with the sign that brakes, and stiction.
+        tau_F = (F_C + F_S e^-(v / v_S)^2) s + D_C + F_V v + D_V v s with s = tanh(v / smoothing)
+        or sign(v): equation (5) of the reduced-scale forwarder paper with the sign that brakes,
+        and stiction.
 
         Args:
             v: (nv,) [m/s], [rad/s].
+            modes: Whether s of the joints whose friction sticks is what `set_modes` says.
 
         Returns:
             (nv,) [N], [N m].
@@ -100,8 +144,27 @@ class JointForces:
         law = self.table[: self._joints].T
         coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck = law[:7]
         sign = np.tanh(v * sharpness)
+        if modes:
+            here = list(self.sticking)
+            sign[here] = self.table[here, _LAW.index("slip")]
         sticking = stiction * np.exp(-((v * stribeck) ** 2))
         return (coulomb + sticking) * sign + coulomb_offset + (viscous + viscous_offset * sign) * v
+
+    def starting(self, v: Array, a: Array) -> Array:
+        """Friction of joints at rest that sticks and is to give way, against their acceleration.
+
+        Args:
+            v: (nv,) [m/s], [rad/s].
+            a: (nv,) [m/s^2], [rad/s^2].
+
+        Returns:
+            (nv,) beside `friction`, (F_C + F_S) sign(a) where v = 0 [N], [N m].
+        """
+        here = list(self.sticking)
+        out = np.zeros_like(v)
+        starts = (v[here] == 0) & (np.abs(a[here]) > STILL)
+        out[here] = np.where(starts, np.sign(a[here]) * self.breakaway, 0.0)
+        return out
 
     def passive(self, q: Array, v: Array) -> Array:
         """Force of springs, dampers, constant forces, gas, end stops and ropes on every joint.
@@ -173,6 +236,12 @@ class JointForces:
             + self._slack.sum()
             + 0.5 * self._stop @ depth**2
         )
+
+
+def sticking(machine: Machine) -> tuple[int, ...]:
+    """Columns of the joints whose friction sticks, in order."""
+    laws = machine.friction.items()
+    return tuple(sorted(machine.column(joint) for joint, law in laws if law.sticks))
 
 
 def _rows(machine: Machine) -> tuple[list[int], list[Pair]]:

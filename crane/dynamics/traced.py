@@ -1,6 +1,7 @@
 """One forward sweep (Kane's form) and the forces along joints and distances, as formulas."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,21 +16,24 @@ from crane.codegen.scalar import (
     cross,
     dot,
     maximum,
+    minimum,
     product,
     scale,
     subtract,
     times,
+    where_positive,
 )  # fmt: skip
 from crane.common.samples import Array
 from crane.dynamics.composite import Composite
 from crane.dynamics.inertia import Pair
-from crane.dynamics.joint_forces import JointForces
+from crane.dynamics.joint_forces import AT_REST, STILL, JointForces
 from crane.dynamics.lengths import LEAST
 from crane.dynamics.moving import Moving
 from crane.dynamics.recursion import Plan, accelerations
 from crane.machine import Machine
 
-BODY, JOINT = 10, 19  # numbers per body, and of the law of a joint or distance
+_SLIP = 7  # of the numbers of a joint, the first of those that change with the motion
+BODY, JOINT = 10, 22  # numbers per body, and of the law of a joint or distance
 Effects = tuple[Number, Number, Number, Number]
 _SOLVED = 7  # freedoms up to which solving with M_A takes fewer operations than recursion
 _UPPER = np.triu_indices(3)
@@ -40,8 +44,9 @@ def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Arr
     """Inertias, force laws and gravity in the order that `Sweep` reads them.
 
     Per body mass, COM (3), inertia about it (xx, xy, xz, yy, yz, zz) in the body's directions of
-    the geometry; per joint the 19 numbers of `JointForces.table`; gravity (3); per joint its rotor
-    inertia; per distance its 19 numbers, and where its two ends are on their bodies, likewise.
+    the geometry; per joint the 22 numbers of `JointForces.table`; gravity (3); per joint its rotor
+    inertia; per distance its 22 numbers, and where its two ends are on their bodies, likewise;
+    whether anything moves.
     """
     bodies = []
     for i, joint in enumerate(machine.coordinates.joints, start=1):
@@ -59,13 +64,39 @@ def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Arr
         turns = (geometry.turns[machine.coordinates.bodies[joint]] for joint, _ in ends)
         places = (turn.T @ place for turn, (_, place) in zip(turns, ends, strict=True))
         numbers += [law, *places]
-    return np.concatenate(numbers)
+    return np.concatenate([*numbers, [forces.moving]])
+
+
+def modes_at(machine: Machine, forces: JointForces) -> list[int]:
+    """Where `numbers_of` has what `JointForces.set_modes` says, joint by joint."""
+    bodies = machine.model.nv
+    first = BODY * bodies + _SLIP
+    last = (BODY + JOINT + 1) * bodies + 3 + (JOINT + 6) * len(forces.lengths.ends)
+    return [first + JOINT * i + k for i in forces.sticking for k in range(3)] + [last]
 
 
 def spans_of(machine: Machine, forces: JointForces) -> Spans:
     """The bodies that the ends of each distance of `JointForces.lengths` are on."""
     bodies = machine.coordinates.bodies
     return tuple((bodies[one], bodies[two]) for (one, _), (two, _) in forces.lengths.ends)
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A machine under forces, with friction that sticks.
+
+    Attributes:
+        a_a: (n,) accelerations.
+        rest: (k,) friction of the joints at rest whose friction sticks, 0 of those that slip.
+        friction: gamma^T tau_F (n,).
+        margin: What is left until a joint slips that is at rest, as a share of its limit, or
+            comes to rest that slips, as a velocity of the machine; the least. Negative beyond.
+    """
+
+    a_a: Vector
+    rest: Vector
+    friction: Vector
+    margin: Number
 
 
 class Sweep:
@@ -81,6 +112,8 @@ class Sweep:
         plan: How forward dynamics goes through the machine's clusters; see
             `crane.dynamics.recursion`.
         spans: See `spans_of`.
+        sticking: Columns of the joints whose friction sticks.
+        modes: Whether `JointForces.set_modes` says what these do, not their velocities.
 
     Attributes:
         gamma: Rows of gamma by joint.
@@ -98,7 +131,10 @@ class Sweep:
         carriers: Sequence[int],
         plan: Plan = (),
         spans: Spans = (),
+        sticking: Sequence[int] = (),
+        modes: bool = False,
     ):
+        self._sticking, self._modes = sticking, modes
         self._carriers, self._plan, self._spans = carriers, plan, spans
         self._posture, self._loops, self._q = posture, loops, q
         self._size = len(posture.geometry.parents)
@@ -113,6 +149,7 @@ class Sweep:
         self._span_numbers = [
             constants.vector(after + (JOINT + 6) * k, JOINT + 6) for k in range(len(spans))
         ]
+        self._moving = constants[after + (JOINT + 6) * len(spans)]
         self.gamma = loops.gamma
         self.rates: Vector = [0.0, *(dot(self.gamma[i], v_a) for i in range(1, self._size))]
         # the loops' drift is that of the whole machine whatever carries a body
@@ -251,7 +288,7 @@ class Sweep:
         ]
         return self._projected(self._along_tree(wrenches))
 
-    def _law(self, law: Vector, q: Number, rate: Number) -> Effects:
+    def _law(self, law: Vector, q: Number, rate: Number, modes: bool = False) -> Effects:
         """Of a joint or distance: passive force, friction, power taken out, energy stored.
 
         Written apart from `JointForces`, which has the same in numpy, so that each checks the
@@ -259,12 +296,12 @@ class Sweep:
         """
         (
             coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck,
-            stiffness, damping, constant, slack, stop, stop_damping, lower, upper,
+            slip, _, _, stiffness, damping, constant, slack, stop, stop_damping, lower, upper,
             gas, gas_share, gas_rest, gas_exponent,
         ) = law  # fmt: skip
         friction = viscous * rate + coulomb_offset
         if coulomb != 0.0 or viscous_offset != 0.0 or stiction != 0.0:
-            sign = apply("tanh", sharpness * rate)
+            sign = slip if modes else apply("tanh", sharpness * rate)
             if stiction != 0.0:
                 slow = stribeck * rate
                 coulomb = coulomb + stiction * apply("exp", -1.0 * (slow * slow))
@@ -294,7 +331,8 @@ class Sweep:
     @cached_property
     def _at_joints(self) -> list[Effects]:
         """`_law` of all joints (nb + 1,)."""
-        laws = (self._law(*x) for x in zip(self._laws, self._q, self.rates[1:], strict=True))
+        every = zip(self._laws, self._q, self.rates[1:], strict=True)
+        laws = (self._law(*x, self._modes and i in self._sticking) for i, x in enumerate(every))
         return [(0.0,) * 4, *laws]
 
     @cached_property
@@ -396,9 +434,16 @@ class Sweep:
         return total
 
     def inverse(self, a_a: Sequence[Number], friction: bool) -> Vector:
-        """M_A a_A + bias - passive [+ friction]."""
+        """M_A a_A + bias - passive [+ friction]; friction at rest is against the acceleration."""
         rates = [0.0, *(dot(row, a_a) + self.drift[i] for i, row in sorted(self.gamma.items()))]
-        return self._projected(subtract(self._along_inertial(rates), self._forces(friction)))
+        along = subtract(self._along_inertial(rates), self._forces(friction))
+        for i in self._sticking if friction else ():
+            law, rate = self._laws[i], rates[i + 1]
+            sign = law[_SLIP] if self._modes else apply("tanh", law[4] * self.rates[i + 1])
+            back = where_positive(-STILL - rate, -1.0, 0.0)
+            start = (law[0] + law[5]) * (where_positive(rate - STILL, 1.0, back) - sign)
+            along[i + 1] = along[i + 1] + where_positive(1.0 - apply("abs", sign), start, 0.0)
+        return self._projected(along)
 
     def _forces(self, friction: bool) -> Vector:
         """Forces along the joints (nb + 1,) that nobody commands."""
@@ -410,6 +455,69 @@ class Sweep:
             return self._recursive(tau, friction)
         right = add(tau, self._projected(self._forces(friction)))
         return Positive(self.mass).solve(subtract(right, self.inertial_bias))
+
+    @property
+    def held(self) -> list[tuple[Number, Vector]]:
+        """Of each joint that can stick, whether it is held, and its row of gamma."""
+        return [(self._laws[i][_SLIP + 1], self.gamma[i + 1]) for i in self._sticking]
+
+    def moved(self, tau: Sequence[Number], rest: bool) -> Moved:
+        """Accelerations under active forces, with joints at rest or without.
+
+        Joints k that are held accelerate by nothing, Gamma a_A + d = 0 with Gamma their rows of
+        gamma and d their drift, and r is what that takes beside the offset of their friction:
+
+            M_A a_A = f - Gamma^T r,    Gamma M_A^-1 Gamma^T r = Gamma M_A^-1 f + d.
+
+        Args:
+            tau: (n,).
+            rest: Whether some joint is at rest.
+        """
+        laws = [self._laws[i] for i in self._sticking]
+        slip, held, pace = ([law[_SLIP + k] for law in laws] for k in range(3))
+        limits = [law[0] + law[5] for law in laws]
+        rates = [self.rates[i + 1] for i in self._sticking]
+        slips = [s * v * p for s, v, p in zip(slip, rates, pace, strict=True)]
+        if not rest:
+            none: Vector = [0.0] * len(laws)
+            return Moved(self.forward(tau, True), none, self.friction, _least(slips))
+        rows = [self.gamma[i + 1] for i in self._sticking]
+        right = subtract(add(tau, self._projected(self._forces(True))), self.inertial_bias)
+        mass = Positive(self.mass)
+        half = [scale(w, mass.halved(row)) for w, row in zip(held, rows, strict=True)]
+        weighed = [[x * d for x, d in zip(row, mass.inverse, strict=True)] for row in half]
+        ahead = mass.halved(right)
+        matrix = [[dot(one, other) for other in half] for one in weighed]
+        asked: Vector = []
+        for k, (i, w) in enumerate(zip(self._sticking, held, strict=True)):
+            matrix[k][k] = matrix[k][k] + (1.0 - w)
+            asked.append(dot(weighed[k], ahead) + w * self.drift[i + 1])
+        reach = Positive(matrix).solve(asked)
+        braking: Vector = [0.0] * self._n
+        for r, row in zip(reach, rows, strict=True):
+            braking = add(braking, scale(r, row))
+        a_a = mass.solve(subtract(right, braking))
+        free = {joint: w for joint, w in zip(self._sticking, held, strict=True)}
+        for k, joint in enumerate(self._loops.active_joints):
+            a_a[k] = a_a[k] * self._moving  # rest to the last bit
+            if joint - 1 in free:
+                a_a[k] = a_a[k] * (1.0 - free[joint - 1])
+        left = [1.0 - apply("abs", r) / limit for r, limit in zip(reach, limits, strict=True)]
+        margins = [
+            where_positive(w - 0.5, one, other)
+            for w, one, other in zip(held, left, slips, strict=True)
+        ]
+        some = 1.0 - _least([1.0 - w for w in held])  # whether any is held
+        # at rest: held, or with a share of its limit, or all of it, beside others that are held
+        at_rest = [
+            where_positive(
+                1.0 - apply("abs", s),
+                law[1] + limit * s + r,
+                where_positive(some * AT_REST - apply("abs", v) * p, law[1] + limit * s, 0.0),
+            )
+            for s, law, limit, r, v, p in zip(slip, laws, limits, reach, rates, pace, strict=True)
+        ]
+        return Moved(a_a, at_rest, add(self.friction, braking), _least(margins))
 
     def _recursive(self, tau: Sequence[Number], friction: bool) -> Vector:
         """The same without M_A."""
@@ -452,6 +560,14 @@ class Sweep:
                 for k in range(self._n):
                     out[k].append(row[k] * rate)
         return out
+
+
+def _least(values: Sequence[Number]) -> Number:
+    """The least, 1 of none."""
+    out: Number = 1.0
+    for value in values:
+        out = minimum(out, value)
+    return out
 
 
 def _carriers(parents: Sequence[int], body: int) -> set[int]:

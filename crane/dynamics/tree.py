@@ -9,7 +9,7 @@ import pinocchio as pin
 
 from crane.common.errors import MechanismError
 from crane.common.samples import Array, solve
-from crane.dynamics.joint_forces import JointForces
+from crane.dynamics.joint_forces import AT_REST, JointForces
 from crane.machine import Machine
 
 
@@ -121,7 +121,9 @@ class TreeDynamics:
         match quantity:
             case "inverse" | "inverse with friction":
                 a = gamma @ x + motion.drift
-                return self._project(motion, a, quantity.endswith("friction"))
+                friction = quantity.endswith("friction")
+                start = self._forces.starting(v, a) if friction else np.zeros_like(v)
+                return self._project(motion, a, friction) + gamma.T @ start
             case "forward" | "forward with friction":
                 return self._forward(motion, x, quantity.endswith("friction"))
             case "mass matrix":
@@ -137,21 +139,48 @@ class TreeDynamics:
             case "energy":
                 return self._energy(motion)
             case "rates":
-                a_a = self._forward(motion, x, True)
+                a_a, _, margin, _ = self._moved(motion, x)
                 rates = self._coordinates.rates(q, v)
-                return np.concatenate([rates, a_a, [self._dissipation(motion)]])
+                return np.concatenate([rates, a_a, [self._dissipation(motion), margin]])
             case "observation":
-                return np.concatenate([gamma.T @ self._forces.friction(v), self._energy(motion)])
+                _, along, _, needed = self._moved(motion, x)
+                here, (slip, held, pace) = list(self._forces.sticking), self._forces.modes
+                rests = (np.abs(slip) < 1) | (held.any() & (np.abs(v[here]) * pace < AT_REST))
+                rest = np.where(rests, self._forces.held(slip) + needed, 0.0)
+                return np.concatenate([gamma.T @ along, self._energy(motion), rest])
             case "regressor":
                 return (gamma.T @ self._regressor(q, v, gamma @ x + motion.drift)).ravel()
         raise AssertionError(quantity)
 
     def _forward(self, motion: ClosedState, tau_a: Array, friction: bool) -> Array:
-        bias = self._project(motion, motion.drift, friction)
+        return self._accelerated(motion, tau_a - self._project(motion, motion.drift, friction))
+
+    def _moved(self, motion: ClosedState, tau_a: Array) -> tuple[Array, Array, float, Array]:
+        """Accelerations, friction of all joints, margin, and what holds; see `Sweep.moved`."""
+        forces, here = self._forces, list(self._forces.sticking)
+        slip, held, pace = forces.modes
+        along = forces.friction(motion.v, modes=True)
+        bias = self._project(motion, motion.drift, False) + motion.gamma.T @ along
+        a_a = self._accelerated(motion, tau_a - bias)
+        margins, holding = slip * motion.v[here] * pace, np.zeros(len(here))
+        stuck = np.flatnonzero(held)
+        if len(stuck):
+            rows = motion.gamma[here][stuck]
+            reach = np.array([self._accelerated(motion, row) for row in rows])
+            asked = rows @ a_a + motion.drift[here][stuck]
+            needed = np.linalg.solve(rows @ reach.T, asked)
+            a_a = (a_a - needed @ reach) * forces.moving
+            holding[stuck] = needed
+            along[here] += holding
+            margins[stuck] = 1.0 - np.abs(needed) / forces.breakaway[stuck]
+        return a_a, along, float(min([1.0, *margins])), holding
+
+    def _accelerated(self, motion: ClosedState, net: Array) -> Array:
+        """M_A^-1 of net forces."""
         mass = self._mass(motion)
         try:
             np.linalg.cholesky(mass)  # elimination would divide by what rounding leaves
-            return solve(mass, tau_a - bias)
+            return solve(mass, net)
         except np.linalg.LinAlgError:
             raise MechanismError(
                 "the mass matrix is not definite: some motion moves no mass that counts beside "
@@ -172,7 +201,7 @@ class TreeDynamics:
         """Power that friction, dampers and end stops take out."""
         conservative = self._forces.passive(motion.q, np.zeros_like(motion.v))
         braking = conservative - self._forces.passive(motion.q, motion.v)
-        return float(motion.v @ (self._forces.friction(motion.v) + braking))
+        return float(motion.v @ (self._forces.friction(motion.v, modes=True) + braking))
 
     def _project(self, motion: ClosedState, a: Array, friction: bool) -> Array:
         """gamma^T (rnea(q, v, a) - f [+ tau_F])."""

@@ -179,7 +179,7 @@ def plain_friction(machine: Machine) -> list[str]:
         f"the friction law of {joint}"
         for joint, law in machine.friction.items()
         if law.coulomb_offset or law.viscous_offset or law.stiction or (
-            law.coulomb and law.smoothing != 1e-3
+            law.coulomb and law.smoothing
         )
     ]  # fmt: skip
 

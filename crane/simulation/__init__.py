@@ -1,11 +1,10 @@
 """Machines in time: runs, batches of them, recordings replayed."""
 
 from crane.simulation.batch import Batch, simulate_batch
-from crane.simulation.recorded import imbalance
 from crane.simulation.replays import Comparison, replay
 from crane.simulation.run import Force, InterruptedRun, Progress, integrate, simulate
 
 __all__ = [
-    "Batch", "Comparison", "Force", "InterruptedRun", "Progress", "imbalance", "integrate",
+    "Batch", "Comparison", "Force", "InterruptedRun", "Progress", "integrate",
     "replay", "simulate", "simulate_batch",
 ]  # fmt: skip

@@ -13,11 +13,12 @@ from crane.common.samples import Array, Brief
 from crane.control import Controller
 from crane.dynamics import Dynamics
 from crane.machine import Machine
-from crane.simulation.recorded import imbalance, limits_passed
+from crane.simulation.judgement import said
 from crane.simulation.run import (
     Progress,
     as_controller,
     count_steps,
+    fixed,
     integrate,
     reference_beyond,
 )
@@ -104,8 +105,7 @@ def simulate_batch(
         time, rows, notes = integrate(Dynamics(machine), control, starts[i], steps, step)
         energy = np.hstack([rows.kinetic, rows.potential, rows.work, rows.lost])
         q_a = rows.q[:, machine.closure.active]
-        told = *notes, limits_passed(machine, time, rows.q), imbalance(rows, step)
-        doubts = filter(None, told)
+        doubts = [*notes, *said(machine, time, rows, step, fixed(control, None))]
         return time, q_a, rows.v_a, rows.tau, energy, "; ".join(doubts)
 
     results: dict[int, _Result] = {}

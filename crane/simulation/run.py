@@ -35,7 +35,8 @@ from crane.simulation.integration.halt import HaltedError, explained
 from crane.simulation.integration.state import row_layout
 from crane.simulation.integration.steps import Steps
 from crane.simulation.integration.stiff import StiffSteps
-from crane.simulation.recorded import imbalance, recorded
+from crane.simulation.judgement import limits_passed, said
+from crane.simulation.recorded import recorded
 
 _MOST = 4_000_000  # steps of one recording
 _ENERGIES = 2  # of the state: work, lost
@@ -128,11 +129,11 @@ def simulate(
     for note in notes:
         warnings.warn(note, CraneWarning, stacklevel=2)
     if len(time) <= steps:
+        if text := limits_passed(machine, time, rows.q):
+            warnings.warn(text, CraneWarning, stacklevel=2)
         cut = f"cut at {time[-1]:g} s of {steps * step:g} s"
         raise InterruptedRun(recorded(machine, control, time, rows, f"{label} ({cut})".lstrip()))
-    # the energies are integrated with the motion, so they tell when the step is too long
-    text = imbalance(rows, step)
-    if text and formulation == "exact":
+    for text in said(machine, time, rows, step, fixed(control, method), formulation == "exact"):
         warnings.warn(text, CraneWarning, stacklevel=2)
     return recorded(machine, control, time, rows, label)
 
@@ -171,7 +172,8 @@ def integrate(
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
     state = np.concatenate([posture, v_a, own, np.zeros(_ENERGIES)])
     make = _integration(machine, control, len(own), method)
-    integration = ChartedSteps(Chart.of(dynamics), control, len(own), make)
+    chart = Chart.of(dynamics)
+    integration = ChartedSteps(chart, control, len(own), make)
     layout = row_layout(machine, control, len(own))
     times = step * np.arange(steps + 1, dtype=np.float64)
     rows = np.empty((steps + 1, layout.size), order="F")  # recorded by columns, without a copy
@@ -194,7 +196,12 @@ def integrate(
         return times[:done], layout.view(rows[:done]), integration.notes
     if progress is not None:
         progress(1.0)
-    return times, layout.view(rows), integration.notes
+    return times, layout.view(rows), [*integration.notes, *chart.sticking.notes]
+
+
+def fixed(control: Controller, method: str | None) -> bool:
+    """Whether a method makes steps of the recorded length."""
+    return method == "rk4" or (method is None and not isinstance(control, ValveDrive))
 
 
 def _own_start(control: Controller, dynamics: Dynamics, q: Array) -> Array:

@@ -26,6 +26,7 @@ from forwarder.paper import (
 FORMULATIONS = ("exact", "decoupled")
 READINGS = ("braking", "as printed")
 STEP = 1e-3  # [s]
+_SMOOTHING = 1e-3  # [m/s], [rad/s] over which sign(v) turns that drives; A
 
 
 def friction_as_printed(v: Array, sign: Array) -> Array:
@@ -40,31 +41,27 @@ class Pushed(PI):
     Args:
         machine: The crane with its viscous friction mu_v only.
         path: Reference.
-        smoothing: (3,) velocities over which sign(v) turns.
         integral: (3,) see `PI`.
     """
 
-    def __init__(
-        self, machine: crane.Machine, path: crane.Trajectory, smoothing: Array, integral: Array
-    ):
+    def __init__(self, machine: crane.Machine, path: crane.Trajectory, integral: Array):
         super().__init__(machine, path, integral=integral)
-        self._smoothing = smoothing
         table = np.array([FRICTION[joint] for joint in JOINTS])
-        self.settings = np.concatenate([self.settings, np.ravel(table), 1.0 / smoothing])
+        self.settings = np.concatenate([self.settings, np.ravel(table)])
 
     def push(self, v_a: Array) -> Array:
         """F_F, (3,) or (N, 3)."""
-        return friction_as_printed(v_a, np.tanh(v_a / self._smoothing))
+        return friction_as_printed(v_a, np.tanh(v_a / _SMOOTHING))
 
     def law(self, at: At) -> tuple[list, list]:
         """See `PI`."""
         n = len(at.q_a)
         tau, rate = super().law(at)
-        table, sharpness = at.settings[2 * n : 6 * n], at.settings[6 * n :]
+        table = at.settings[2 * n :]
         out = []
         for i, (force, v) in enumerate(zip(tau, at.v_a, strict=True)):
             mean, offset, viscous, viscous_offset = table[4 * i : 4 * i + 4]
-            sign = apply("tanh", sharpness[i] * v)
+            sign = apply("tanh", v / _SMOOTHING)
             out.append(force - mean * sign - offset - viscous * v - viscous_offset * (v * sign))
         return out, rate
 
@@ -129,11 +126,10 @@ def simulate(
     if reading == "braking":
         control = PI(machine, path, integral=weight / gains)
     else:
-        smoothing = np.array([machine.friction[joint].smoothing for joint in machine.active])
         plant = without_active_friction(machine)
         weight = crane.Dynamics(plant, formulation).inverse(q, 0 * v, 0 * v, friction=True)
         weight = weight + friction_as_printed(0 * v, 0 * v)
-        machine, control = plant, Pushed(plant, path, smoothing, weight / gains)
+        machine, control = plant, Pushed(plant, path, weight / gains)
     recording = crane.simulate(machine, control, step=STEP, formulation=formulation)
     tau = recording.tau + control.push(recording.v) if reading != "braking" else recording.tau
     return run_of(recording, path, tau)

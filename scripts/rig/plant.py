@@ -13,7 +13,6 @@ from crane.formats import read
 from crane.machine import Machine
 
 _STRIBECK = {"rad": 1e-2, "m": 1e-3}  # [rad/s], [m/s] where stiction ends; A
-_SMOOTHING = 0.04  # share of it over which the sign of the velocity changes; A
 
 
 @dataclass(frozen=True)
@@ -51,11 +50,7 @@ class Tolerances:
 def drawn(
     machine: Machine, tolerances: Tolerances, random: np.random.Generator
 ) -> dict[str, float]:
-    """Changes that make a plant of a machine, by the names of `crane.description.parameters`.
-
-    Raises:
-        InputError: A joint's friction jumps at rest.
-    """
+    """Changes that make a plant of a machine, by the names of `crane.description.parameters`."""
     spec = read(machine.reference)
     printed = parameters(spec)
     nominal = {**printed, **machine.changes}
@@ -95,15 +90,9 @@ def _stuck(
     }
     law = dataclasses.replace(law, **coefficients)
     if not (tolerances.stiction and law.coulomb):
-        if law.coulomb + law.stiction > 0 and law.smoothing == 0:
-            raise InputError(
-                f"the friction of '{joint}' jumps at rest, give it a smoothing or stiction"
-            )
         return law
-    slow = _STRIBECK[machine.unit(joint)]
-    return dataclasses.replace(
-        law, stiction=tolerances.stiction * law.coulomb, stribeck=slow, smoothing=_SMOOTHING * slow
-    )
+    stiction, stribeck = tolerances.stiction * law.coulomb, _STRIBECK[machine.unit(joint)]
+    return dataclasses.replace(law, stiction=stiction, stribeck=stribeck)
 
 
 def _pins(machine: Machine, spec: MachineSpec) -> list[tuple[str, str]]:

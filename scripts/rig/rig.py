@@ -27,6 +27,7 @@ from crane.simulation.integration import Chart, HaltedError, Steps, explained, r
 from rig.plant import Tolerances, drawn
 from rig.sensors import Sensors, default_sensors
 
+_LONGEST = 1e-3  # substep [s]
 _STABLE = 2.0  # fastest rate times substep; Runge-Kutta of fourth order bears 2.785
 _CUTOFF = 5.0  # [Hz] of the measured velocity
 
@@ -114,7 +115,7 @@ class Rig:
 
         equation (7) with the gains of the machine file, cut off at `limits`. z_0 carries the
         model's weight. Between, the plant is integrated by Runge-Kutta of fourth order in equal
-        substeps, as many as the friction's slope at rest asks for.
+        substeps of at most a millisecond, as many as the friction's slope asks for.
 
         `q` is measured; `v` is its central difference after a Butterworth filter of second order
         and 5 Hz, run forth and back; `tau` is equation (8) of the measured current. That current
@@ -262,16 +263,16 @@ def _velocity(q: Array, step: float) -> Array:
 
 
 def _substeps(dynamics: Dynamics, reference: Array, step: float) -> int:
-    """Substeps with which Runge-Kutta is stable where the machine sticks.
+    """Substeps with which Runge-Kutta is stable.
 
-    The fastest rate there is the largest eigenvalue of M_A^-1 gamma^T D gamma, D the slopes of
-    friction at rest (coulomb + stiction) / smoothing + viscous.
+    The fastest rate is the largest eigenvalue of M_A^-1 gamma^T D gamma, D the slopes of friction
+    at rest: viscous, and (coulomb + stiction) / smoothing where it does not stick.
     """
     machine, fastest = dynamics.machine, 0.0
     slopes = np.zeros(machine.model.nv)
     for joint, f in machine.friction.items():
-        rest = f.coulomb + f.stiction
-        slopes[machine.column(joint)] = f.viscous + (rest / f.smoothing if rest else 0.0)
+        smoothed = f.breakaway / f.smoothing if f.smoothing else 0.0
+        slopes[machine.column(joint)] = f.viscous + smoothed
     # the plant goes no farther than its limits, wherever its reference is
     within = np.clip(reference[:: max(1, len(reference) // 100)], machine.lower, machine.upper)
     try:
@@ -284,4 +285,4 @@ def _substeps(dynamics: Dynamics, reference: Array, step: float) -> int:
         mass = dynamics.mass_matrix(q[machine.closure.active])
         rates = np.linalg.eigvals(np.linalg.solve(mass, damping))
         fastest = max(fastest, float(np.abs(rates).max()))
-    return max(1, math.ceil(step * fastest / _STABLE))
+    return max(1, math.ceil(step * max(fastest / _STABLE, 1.0 / _LONGEST) * (1.0 - 1e-9)))

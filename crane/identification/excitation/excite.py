@@ -1,7 +1,7 @@
 """Periodic references that tell as much as possible about a machine's parameters."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ from crane.recordings.timeseries import TIME, Table
 _SHARE = 0.01  # of a drive's force limit, its noise if none is given
 _WORST = 5  # parameters in the table
 _MOST = 4_000_000  # samples of the recording
+_SMOOTHING = 5e-4  # of velocities of the machine, over which friction turns in the search
 _MEMORY = 1e9  # that motions are optimised in [bytes]
 
 Progress = Callable[[float], None]
@@ -212,6 +213,8 @@ def excite(
     period = as_number(period, "the period", "s", above=0)
     step = as_number(step, "the step", "s", above=0)
     seed = as_seed(seed)
+    # friction that jumps has no gradient to search along
+    smooth = model or Model(_smoothed(machine))
     model = model or Model(machine)
     _check_size(model, period, harmonics, periods, step)
     bounds = limits(machine, acceleration, margin)
@@ -236,7 +239,8 @@ def excite(
     scaled = _anywhere(model, bounds, 2 * np.pi / period * harmonics)
     information = Information(model, base, deviation, force, scaled, prior)
     count = periods * period / step
-    search = Search(information, bounds, period, harmonics, count, CRITERIA[criterion])
+    seen = Information(smooth, base, deviation, force, scaled, prior)
+    search = Search(seen, bounds, period, harmonics, count, CRITERIA[criterion])
     draws = search.draws(np.random.default_rng(seed))
     costs = search.rate(draws)[0]
     order = np.argsort(costs, kind="stable")[:starts]
@@ -272,6 +276,17 @@ def excite(
         seed=seed,
         step=step,
     )
+
+
+def _smoothed(machine: Machine) -> Machine:
+    """The machine with friction that is smooth where it sticks."""
+    rates = machine.closure.units / machine.closure.pace
+    laws = {
+        joint: replace(law, smoothing=_SMOOTHING * float(rates[machine.column(joint)]))
+        for joint, law in machine.friction.items()
+        if law.sticks
+    }
+    return machine.replace(friction={**machine.friction, **laws})
 
 
 def _check_size(model: Model, period: float, harmonics: int, periods: int, step: float) -> None:

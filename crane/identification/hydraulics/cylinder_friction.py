@@ -27,6 +27,7 @@ from crane.recordings.recording import Recording
 
 NAMES = ("coulomb", "coulomb_offset", "viscous", "stiction", "stribeck")
 
+_RESTS = 1e-3  # of the largest speed, below which nothing slides
 _SLIDING = 3.0  # smoothing velocities, above which the sign of the speed is told
 _STEADY = 0.05  # of the speed, by which it may change
 _MOST = 4000  # samples
@@ -120,7 +121,7 @@ def identify_cylinder_friction(
 
     Args:
         machine: Its masses count as known; friction of this joint is not used but for its
-            smoothing, that of the other joints belongs to their own forces.
+            smoothing if it has any, that of the other joints belongs to their own forces.
         recording: Of all its active joints, tau of this one by (20).
         joint: An active joint.
         settle: [s].
@@ -137,9 +138,9 @@ def identify_cylinder_friction(
     load = Dynamics(machine).inverse(motion.q, motion.v, motion.a)[:, index]
     given = machine.friction.get(joint, Friction())
     v = motion.v[:, index]
+    slow = max(_SLIDING * given.smoothing, _RESTS * float(np.abs(v).max()))
     at = np.flatnonzero(
-        steady(motion.time, settle, v, share=_STEADY, relative=True)
-        & (np.abs(v) > _SLIDING * given.smoothing)
+        steady(motion.time, settle, v, share=_STEADY, relative=True) & (np.abs(v) > slow)
     )
     speed, force = v[at], (motion.tau[:, index] - load)[at]
     for sense, word in ((1, "extends"), (-1, "retracts")):
@@ -147,8 +148,7 @@ def identify_cylinder_friction(
         if len(sizes) < 2 or sizes.max() < 1.5 * sizes.min():
             raise RecordingError(
                 f"'{joint}' never {word} steadily at two speeds above "
-                f"{_SLIDING * given.smoothing:g} {machine.unit(joint)}/s, record constant speeds "
-                "both ways"
+                f"{slow:.3g} {machine.unit(joint)}/s, record constant speeds both ways"
             )
     every = max(1, len(at) // _MOST)
     at, speed, force = at[::every], speed[::every], force[::every]

@@ -24,6 +24,7 @@ from crane.common.errors import ClosureError, MechanismError
 from crane.common.samples import Array
 from crane.dynamics import Dynamics
 from crane.machine import Machine
+from crane.simulation.integration.sticking import Sticking
 
 STEEP = 5.0  # entries of gamma, in shares of the machine's size, from which others are looked for
 _BETTER = 3.0  # times smaller has a condition to be that changes coordinates
@@ -38,15 +39,19 @@ class Chart:
     Attributes:
         dynamics: Of the machine in the chart's coordinates.
         seen: (n,) columns of the joints whose coordinates and forces are the user's.
+        sticking: What the joints do whose friction sticks, the same in all charts of a run.
     """
 
     dynamics: Dynamics
     seen: Indices
+    sticking: Sticking
 
     @classmethod
     def of(cls, dynamics: Dynamics) -> "Chart":
         """The user's coordinates of a machine."""
-        return cls(dynamics, dynamics.machine.closure.active)
+        machine, forces = dynamics.machine, dynamics.forces
+        sticking = Sticking(machine, forces.sticking, forces.breakaway)
+        return cls(dynamics, machine.closure.active, sticking)
 
     @property
     def machine(self) -> Machine:
@@ -63,7 +68,8 @@ class Chart:
         """What formulas of the chart depend on besides its loops."""
         dynamics = self.dynamics
         parts = dynamics.carriers, dynamics.plan, dynamics.spans
-        return folded(dynamics.numbers), *parts, tuple(self.seen.tolist())
+        forces = dynamics.forces
+        return folded(dynamics.pattern), *parts, forces.sticking, tuple(self.seen.tolist())
 
     def turns(self, q: Array) -> Array:
         """C (n, n) of closed postures (nq,) or (N, nq): v_A = C v_B."""
@@ -145,4 +151,4 @@ class Chart:
         except MechanismError:
             return None
         dynamics = Dynamics(machine, self.dynamics.formulation, self.dynamics.backend)
-        return Chart(dynamics, self.seen)
+        return Chart(dynamics, self.seen, self.sticking)

@@ -14,11 +14,8 @@ from crane.codegen.scalar import add, apply, dot, maximum, minimum, scale, subtr
 from crane.common.samples import Array
 from crane.control import TracedController
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.traced import (
-    Stepper,
-    beyond,
-    wrapped,
-)
+from crane.simulation.integration.sticking import NEAR
+from crane.simulation.integration.traced import HELD, Stepper, beyond, wrapped
 
 STAGES, MORE = 12, 3  # of a step, and for what is between its ends
 TOLERANCE = 1e-11  # error of a step, per size of the state
@@ -28,6 +25,7 @@ SPACING = 5e-4  # [s] between the instants that references are known at, at most
 _ROWS = 2000  # of references of a call
 _FASTER, _SLOWER, _SAFETY = 5.0, 0.2, 0.9  # change of the step's length from one to the next
 _SHORTEST = 1e-9  # part of a recorded step that is given up on
+_EVENTS = 6  # of the bounds, whether to stop where a joint starts or stops
 _NEARLY = 1.0 - 2.0**-41  # of what is left: all of it
 
 
@@ -57,7 +55,8 @@ class ExplicitStepper(Stepper):
         rates = closure.units[closure.active] / closure.pace
         least = _LEAST * np.concatenate([closure.units, rates, np.ones(states), [1.0 / _LEAST]])
         self.tolerance = tolerance * least
-        self._lengths = np.zeros(5)
+        self.bounds = np.append(self.bounds, 1.0)
+        self._lengths = np.zeros(6)
 
     def run(
         self, first: float, state: Array, offset: float, step: float, rows: Array
@@ -76,6 +75,7 @@ class ExplicitStepper(Stepper):
             all where the next step needs a closer look or other coordinates.
         """
         lengths, parts = self._lengths, 2 * max(1, int(np.ceil(0.5 * step / SPACING)))
+        lengths[5] = 0.0
         if lengths[0] != step:
             lengths[:2] = step, 0.01 * min(step, SPACING)
         length, done = max(1, _ROWS // parts), 0
@@ -86,7 +86,7 @@ class ExplicitStepper(Stepper):
             places = np.arange(-parts, count * parts + 1, dtype=np.float64)
             grid = first + step * done + step / parts * places
             references = np.ascontiguousarray(self._control.references(grid))
-            lengths[2:] = offset, 2.0 * step / parts, count * step
+            lengths[2:] = offset, 2.0 * step / parts, count * step, 0.0
             made = self._program.call(
                 "run", count, self._fast.close_address, *self._arguments, references, state,
                 out, lengths, self.bounds, self.tolerance,
@@ -98,16 +98,34 @@ class ExplicitStepper(Stepper):
                 break
         return done, offset
 
+    @property
+    def event(self) -> float:
+        """Whether a joint starts or stops in the next step."""
+        return float(self._lengths[5])
+
+    def advance(self, time: float, state: Array, length: float) -> tuple[Array, float]:
+        """The state a step later, whatever starts or stops, and its margin (`Moved.margin`)."""
+        state = state.copy()
+        self._lengths[:2] = length, length
+        self.bounds[_EVENTS] = 0.0
+        _, offset = self.run(time + length, state, -length, length, np.empty((0, 0)))
+        self.bounds[_EVENTS] = 1.0
+        self._lengths[0] = 0.0
+        if offset < 0:
+            return state, -np.inf
+        return state, self.observe(time + length, state)[1]
+
     def _build(self, program: Program) -> None:
-        for name in ("observe", "rate"):
-            machine, tau, own_rate = self._driven(Tape())
-            sweep = machine.sweep
-            if name == "observe":
-                out = {"seen": [*tau, *sweep.friction, sweep.kinetic, sweep.potential]}
-            else:
-                a_a, powers = machine.forward(tau), machine.powers(tau)
-                out = {"rate": [*sweep.slopes, *a_a, *own_rate, *powers]}
-            program.add(name, 5, out)
+        for added, rest in self._rests:
+            for name in ("observe", "rate"):
+                machine, tau, own_rate = self._driven(Tape())
+                moved = machine.moved(tau, rest)
+                if name == "observe":
+                    out = {"seen": machine.observed(tau, rest)}
+                else:
+                    slopes, powers = machine.sweep.slopes, machine.powers(tau)
+                    out = {"rate": [*slopes, *moved.a_a, *own_rate, *powers]}
+                program.add(name + added, 5, {**out, "margin": [moved.margin]})
         # the parabola through rows at 0, 1/2, 1
         tape = Tape()
         s, columns = tape.load(1, 0), self._columns
@@ -184,14 +202,18 @@ class ExplicitStepper(Stepper):
         """run: steps and recorded instants until the last of these, or one needs a closer look.
 
         h: recorded step; length to try; when the state is, after the first instant, and behind,
-        after the next one; length of three references; when the last recorded step ends.
+        after the next one; length of three references; when the last recorded step ends; whether
+        a joint starts or stops in the next step.
         """
         size, seen, columns = self._state.size, self._seen.size, self._columns
         method, floating = self._method, self._chart.machine.coordinates.floating
         names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds", "tol")
         with program.routine("run", counts=("steps",), functions=("close",), arrays=names) as r:
             following = r.array("following", program.outputs("finish"))
-            k = r.array("k", (STAGES + 1 + MORE) * size)
+            # a rate has its margin behind it, which the next one replaces
+            k = r.array("k", (STAGES + 1 + MORE) * size + 1)
+            ending = r.array("ending", program.outputs("rate"))
+            looked = r.array("looked", program.outputs("observe"))
             stage, inside = r.array("stage", size), r.array("inside", 7 * size)
             result = r.array("result", self._fast.outputs("newton"))
             found = r.array("found", self._fast.outputs("newton"))
@@ -217,7 +239,7 @@ class ExplicitStepper(Stepper):
             def call(formula: str, time: Value, at: Place, out: Place) -> None:
                 if columns:
                     refer(time)
-                r.call(formula, *machine, at, out)
+                self._call(r, formula, *machine, at, out)
 
             def stop() -> None:
                 r.store(r.h, 2, t - due)
@@ -228,6 +250,9 @@ class ExplicitStepper(Stepper):
                 left, proposed = r.let(end - t), r.let(r.h[1])
                 with r.when(~(left > whole * _SHORTEST)):
                     r.leave()
+                if self._sticks:  # what is at rest does not tell how soon it starts
+                    with r.when((r.bounds[HELD] > 0.5) & (proposed > whole)):
+                        r.set(proposed, whole)
                 last = r.let(proposed >= left * _NEARLY)
                 length = r.let(select(last, left, proposed))
                 with r.when(~(length >= whole * _SHORTEST)):
@@ -253,13 +278,20 @@ class ExplicitStepper(Stepper):
                         with r.when(following["move"] < _FOLLOWED):
                             stop()
                     with r.otherwise():
-                        call("rate", t + length, following, k.at(STAGES * size))
+                        call("rate", t + length, following, ending)
+                        if self._sticks:
+                            looking = r.bounds[_EVENTS] > 0.5
+                            with r.when((ending["margin"] < -NEAR) & looking):
+                                r.store(r.h, 5, 1.0)
+                                stop()
+                        r.copy(k.at(STAGES * size), ending, size)
                         with r.when(due < (t + length) * _NEARLY):
                             for i in range(MORE):
                                 r.call(f"more{i}", r.state, k, part, stage)
                                 at = k.at((STAGES + 1 + i) * size)
                                 call("rate", t + length * float(method.C_EXTRA[i]), stage, at)
                             r.call("dense", r.state, k, part, following, inside)
+                        count, since = r.let(recorded), r.let(due)
                         with r.forever():
                             with r.when(~(due < (t + length) * _NEARLY)):
                                 r.leave()
@@ -269,7 +301,14 @@ class ExplicitStepper(Stepper):
                             closed = r.call("close", r.geometry, stage, found, r.bounds)
                             with r.when(closed < 1):
                                 stop()
-                            call("observe", due, stage, row.at(size))
+                            call("observe", due, stage, looked)
+                            if self._sticks:
+                                with r.when((looked["margin"] < -NEAR) & looking & (due > t)):
+                                    r.store(r.h, 5, 1.0)
+                                    r.set(recorded, count)
+                                    r.set(due, since)
+                                    stop()
+                            r.copy(row.at(size), looked, seen)
                             r.copy(row, stage, size)
                             r.set(recorded, recorded + 1)
                             r.set(due, due + whole)

@@ -54,8 +54,8 @@ def explained(
         finer: A step with which the motion goes on [s]; 0 where that has not been found.
     """
     if finer:
-        hint = f"; with a step of {finer:g} s it goes on: shorten the step, or smooth the friction"
-        return SimulationError(f"{halt}{hint} more")
+        hint = f"; with a step of {finer:g} s it goes on: shorten the step"
+        return SimulationError(f"{halt}{hint}")
     passed = _passed(machine, halt, times, q_a, reference)
     return SimulationError(f"{halt}{passed or halt.otherwise}")
 

@@ -9,6 +9,7 @@ from crane.common.samples import Array
 from crane.control import TracedController
 from crane.simulation.integration.blocks import in_blocks
 from crane.simulation.integration.charts import Chart
+from crane.simulation.integration.sticking import NEAR
 from crane.simulation.integration.traced import (
     Stepper,
     beyond,
@@ -29,21 +30,34 @@ class CompiledStepper(Stepper):
     """
 
     def __init__(self, chart: Chart, control: TracedController, states: int):
+        self._lengths = np.zeros(3)
         super().__init__(chart, control, states, ("rk4",), fold=False)
 
+    @property
+    def event(self) -> float:
+        """How far behind the last recorded instant a joint has started or stopped [s], else 0."""
+        return float(self._lengths[2])
+
     def _build(self, program: Program) -> None:
-        for name in ("observe", "rate"):
-            machine, tau, own_rate = self._driven(Tape())
-            sweep, a_a = machine.sweep, machine.forward(tau)
-            outputs = {"rate": [*sweep.slopes, *a_a, *own_rate, *machine.powers(tau)]}
-            if name == "observe":
-                outputs["seen"] = [*tau, *sweep.friction, sweep.kinetic, sweep.potential]
-            program.add(name, 5, outputs)
+        for added, rest in self._rests:
+            for name in ("observe", "rate"):
+                machine, tau, own_rate = self._driven(Tape())
+                moved = machine.moved(tau, rest)
+                slopes, powers = machine.sweep.slopes, machine.powers(tau)
+                outputs = {"rate": [*slopes, *moved.a_a, *own_rate, *powers]}
+                if name == "observe":
+                    outputs["seen"] = machine.observed(tau, rest)
+                    outputs["margin"] = [moved.margin]
+                program.add(name + added, 5, outputs)
         self._add_sums(program)
         self._add_run(program)
 
     def _add_run(self, program: Program) -> None:
-        """run: steps, each recorded before it is made, until one needs a closer look."""
+        """run: steps, each recorded before it is made, until one needs a closer look.
+
+        h: length of a step, half of it; then how far behind the last recorded instant a joint has
+        started or stopped, if one has.
+        """
         size, seen, columns = self._state.size, self._seen.size, self._columns
         names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds")
         with program.routine("run", counts=("steps",), functions=("close",), arrays=names) as r:
@@ -55,16 +69,20 @@ class CompiledStepper(Stepper):
             with r.loop(r.steps) as i:
                 first = r.refs.row(i, 2 * columns)
                 middle, last = first.at(columns), first.at(2 * columns)
-                r.call("observe", *machine, first, r.state, k1)
+                self._call(r, "observe", *machine, first, r.state, k1)
+                if self._sticks:
+                    with r.when(k1["margin"] < -NEAR):
+                        r.store(r.h, 2, r.h[0])
+                        r.give(i)
                 row = r.out.row(i, size + seen)
                 r.copy(row, r.state, size)
                 r.copy(row.at(size), k1.at("seen"), seen)
                 r.call("blend", r.state, k1, half, following)
-                r.call("rate", *machine, middle, following, k2)
+                self._call(r, "rate", *machine, middle, following, k2)
                 r.call("blend", r.state, k2, half, following)
-                r.call("rate", *machine, middle, following, k3)
+                self._call(r, "rate", *machine, middle, following, k3)
                 r.call("blend", r.state, k3, r.h, following)
-                r.call("rate", *machine, last, following, k4)
+                self._call(r, "rate", *machine, last, following, k4)
                 r.call("finish", r.geometry, r.state, k1, k2, k3, k4, r.h, following)
                 with r.when(~(following["move"] < 1.0)):
                     r.give(i)
@@ -87,15 +105,15 @@ class CompiledStepper(Stepper):
 
         Returns:
             How many steps were done; the one after them needs a closer look, or other
-            coordinates.
+            coordinates, or see `event`.
         """
         arguments = self._arguments
-        steps = np.array([step, 0.5 * step])
+        self._lengths[:] = step, 0.5 * step, 0.0
 
         def call(count: int, references: Array, out: Array) -> int:
             return self._program.call(
                 "run", count, self._fast.close_address, *arguments, references, state,
-                out, steps, self.bounds,
+                out, self._lengths, self.bounds,
             )  # fmt: skip
 
         return in_blocks(call, self._control, times, step, rows)

@@ -10,44 +10,32 @@ from crane.control import Controller, TracedController, ValveDrive
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.runge_kutta import CompiledStepper
-from crane.simulation.integration.stepwise import Progress, PythonStepper
+from crane.simulation.integration.stepwise import Progress
+from crane.simulation.integration.sticking import NEAR
+from crane.simulation.integration.switching import Switching
 
 _CHUNK = 5000  # steps between reports of progress
 _BACK, _AHEAD = 40, 20  # steps before and after a halt that are done anew with finer ones
 _FINER = (2, 8)  # how much finer
 
 
-class Steps:
+class Steps(Switching):
     """Runge-Kutta steps in machine code, with care where that stops.
 
     Args:
         chart: The machine.
         control: Its controller.
         own: Number of the controller's states.
-
-    Attributes:
-        slow: Makes a step with care, or says why it cannot.
-        done: Number of instants that have their row, after a run or where it halted.
-        reached: Index of the instant of the state, which may have no row yet.
     """
 
-    offset = 0.0
-
     def __init__(self, chart: Chart, control: Controller, own: int):
-        self.slow = PythonStepper(chart, control, own)
-        self.done = self.reached = 0
         self._fast: CompiledStepper | None = None
-        if isinstance(control, ValveDrive) or chart.dynamics.backend != "compiled":
-            return
-        if isinstance(control, TracedController):
+        compiled = not isinstance(control, ValveDrive) and chart.dynamics.backend == "compiled"
+        if compiled and isinstance(control, TracedController):
             with suppress(TooLongError):
                 self._fast = CompiledStepper(chart, control, own)
-
-    def limit(self, limits: Array) -> None:
-        """Look for other coordinates from there on, see `Chart.limits`."""
-        self.slow.limits = limits
-        if self._fast is not None:
-            self._fast.bounds[-2:] = limits
+        super().__init__(chart, control, own, self._fast)
+        self._next = 0.0
 
     def run(
         self, times: Array, state: Array, step: float, rows: Array, progress: Progress = None
@@ -56,7 +44,7 @@ class Steps:
 
         Args:
             times: (N,) instants [s].
-            state: At the first; replaced by that where it has got to.
+            state: At the first, or `offset` after it; replaced by that where it has got to.
             step: [s].
             rows: (N, .) in any order, filled with state and observations at the instants.
             progress: Called with the number of finished steps.
@@ -67,51 +55,74 @@ class Steps:
         Raises:
             HaltedError: A step cannot be taken.
         """
-        size, i = len(state), 0
+        first = times[0] if len(times) else self._next
         self.done = self.reached = 0
-        while i < len(times):
-            beyond = min(i + _CHUNK, len(times))
-            if self._fast is not None:
-                i += self._fast.run(times[i:beyond], state, step, rows[i:])
-                self.done = self.reached = i
-            if i < beyond:  # it stopped, or there is none
-                if self.slow.steep(state):
-                    break
-                rows[i, :size] = state
-                self.done = i + 1
-                rate, rows[i, size:] = self.slow.observe(times[i], state)
-                state[:] = self.slow.advance(times[i], state, rate, step)
-                i += 1
-                self.reached = i
+        self._begin(first + self.offset, state)
+        while self.done < len(times) or self.offset < 0:
+            now = first + step * self.reached
+            if self.offset < 0:
+                self._completed(now, state, step)
+                continue
+            if not self._some(times, state, step, rows):
+                break
             if progress is not None:
-                progress(i)
-        return i
+                progress(self.done)
+        self._next = first + step * self.reached
+        return self.reached
 
-    def last(self, time: float, state: Array) -> Array:
-        """A row without a step after it.
+    def _some(self, times: Array, state: Array, step: float, rows: Array) -> bool:
+        """Make some steps, or go on to where a joint starts or stops.
 
-        Args:
-            time: [s].
-            state: There.
-
-        Raises:
-            HaltedError: It cannot be observed.
+        Returns:
+            False where other coordinates are better.
         """
-        fast = self._fast
-        seen = fast.observe(time, state) if fast else self.slow.observe(time, state)[1]
-        return np.concatenate([state, seen])
+        size, i = len(state), self.done
+        beyond, event = min(i + _CHUNK, len(times)), 0.0
+        if self._fast is not None:
+            i += self._fast.run(times[i:beyond], state, step, rows[i:])
+            self.done = self.reached = i
+            event = self._fast.event
+        if i < beyond and not event:  # it stopped, or there is none
+            if self.slow.steep(state):
+                return False
+            rate, seen = self.slow.observe(times[i], state)
+            if self.slow.margin < -NEAR:
+                event = step
+            else:
+                rows[i, :size], rows[i, size:] = state, seen
+                self.done = i + 1
+                state[:] = self.slow.advance(times[i], state, rate, step)
+                i = self.reached = i + 1
+        if not event and i == len(times) and self._sticking.columns:  # nobody looks behind it
+            event = step * (self._look(times[-1] + step, state)[1] < -NEAR)
+        if event and i:
+            state[:] = rows[i - 1, :size]
+            later = self._switched(times[i - 1], state, event, step)
+            self.offset = self._left(later - step, step)
+        elif event:
+            self._settle(times[0], state)
+        return True
+
+    def _step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
+        """See `Switching._step`."""
+        if self._fast is not None:
+            after, row = state.copy(), np.empty((1, self._fast.width))
+            if self._fast.run(np.array([time]), after, length, row):
+                return after, self._fast.observe(time + length, after)[1]
+        rate, _ = self.slow.observe(time, state)
+        after = self.slow.advance(time, state, rate, length)
+        self.slow.observe(time + length, after)
+        return after, self.slow.margin
 
     def finer(self, times: Array, rows: Array, step: float) -> float:
-        """A step [s] with which the motion goes on where it halted; 0 if none was found.
-
-        Arguments as those of the run that halted.
-        """
+        """See `Switching.finer`."""
         done = self.done
         back, beyond = max(0, done - _BACK), min(done + _AHEAD, len(times))
         for share in _FINER:
             part = step / share
             again = times[back] + part * np.arange(share * (beyond - back))
             state = rows[back, : self.slow.layout.size].copy()
+            self.offset, self._sticking.settled = 0.0, False
             with suppress(HaltedError):
                 made = self.run(again, state, part, np.empty((len(again), rows.shape[1])))
                 if made == len(again):

@@ -29,12 +29,27 @@ class PythonStepper:
     Attributes:
         layout: Parts of the state.
         limits: Where other coordinates are looked for, see `Chart.limits`.
+        margin: See `Moved.margin`, at the state whose rate was computed last.
     """
 
     def __init__(self, chart: Chart, control: Controller, own: int):
         self._chart, self._dynamics, self._control = chart, chart.dynamics, control
         self.layout = state_layout(chart.machine, own)
-        self.limits = chart.limits
+        self.limits, self.margin = chart.limits, 1.0
+
+    def settle(self, time: float, state: Array) -> None:
+        """Find which joints stick at a state, whose velocities are made those of rest.
+
+        Raises:
+            HaltedError: The loops cannot be closed, or the passive joints are not determined.
+        """
+        at, chart = self.layout.view(state), self._chart
+        try:
+            tau, _ = self._asked(time, at, chart.velocities(at.q, at.v_a))
+            forces = chart.forces(at.q, tau)
+            at.v_a[:] = chart.sticking.settle(self._dynamics, at.q, at.v_a, forces)
+        except ClosureError as error:
+            raise HaltedError(time, self.here(state), f": {error}") from None
 
     def steep(self, state: Array) -> bool:
         """Whether a state is beyond the limits."""
@@ -55,7 +70,8 @@ class PythonStepper:
         """
         rate, tau = self._rate(time, state)
         at = self.layout.view(state)
-        seen = self._dynamics.at("observation", at.q, at.v_a, tau)
+        forces = self._chart.forces(at.q, tau)
+        seen = self._dynamics.at("observation", at.q, at.v_a, forces)
         more: Array = np.zeros(0)
         if isinstance(self._control, ValveDrive):
             control = self._control
@@ -104,7 +120,7 @@ class PythonStepper:
             time,
             self.here(state),
             f" the motion cannot be followed, the fastest joint moves at {speed:.3g} m/s or rad/s",
-            ": look at its forces and gains, give end stops damping, or smooth the friction more",
+            ": look at its forces and gains, or give end stops damping",
         )
 
     def _rate(self, time: float, state: Array) -> tuple[Array, Array]:
@@ -115,7 +131,8 @@ class PythonStepper:
             rates = self._dynamics.at("rates", at.q, at.v_a, chart.forces(at.q, tau))
         except ClosureError as error:
             raise HaltedError(time, self.here(state), f": {error}") from None
-        return np.concatenate([rates[:-1], own_rate, [tau @ v_a, rates[-1]]]), tau
+        self.margin = float(rates[-1])
+        return np.concatenate([rates[:-2], own_rate, [tau @ v_a, rates[-2]]]), tau
 
     def _asked(self, time: float, at: Parts, v_a: Array) -> tuple[Array, Array]:
         """What the controller answers, (n,) and (k,)."""

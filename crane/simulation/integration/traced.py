@@ -15,13 +15,16 @@ from crane.codegen.scalar import add, dot, subtract
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.control import At, TracedController, ValveDrive
-from crane.dynamics.traced import Sweep
+from crane.dynamics.traced import Moved, Sweep
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.state import seen_layout, state_layout
 
+HELD = 5  # of `Stepper.bounds`, whether joints are at rest
+_REST = "_rest"
+
 
 def beyond(r: Routine, result: Place) -> Value:
-    """Whether a closed posture is beyond a chart's limits, the last two of a routine's bounds."""
+    """Whether a closed posture is beyond a chart's limits, see `Stepper.bounds`."""
     return (result["steepest"] > r.bounds[3]) | (result["edge"] < r.bounds[4])
 
 
@@ -53,10 +56,15 @@ class Traced:
         inverse = self.sweep.inverse if self.chart.own else _undetermined
         return At(self.q_a, self.v_a, self.parts.own, settings, reference, inverse)
 
-    def forward(self, tau: Sequence[Number]) -> list[Number]:
-        """Accelerations of the chart's coordinates under a controller's forces."""
+    def moved(self, tau: Sequence[Number], rest: bool) -> Moved:
+        """What it does under a controller's forces, with joints at rest or without."""
         forces = self.chart.traced_forces(self.sweep.gamma, tau)
-        return self.sweep.forward(forces, friction=True)
+        return self.sweep.moved(forces, rest)
+
+    def observed(self, tau: Sequence[Number], rest: bool) -> list[Number]:
+        """What is seen, but for a circuit's channels; see `seen_layout`."""
+        moved, sweep = self.moved(tau, rest), self.sweep
+        return [*tau, *moved.friction, sweep.kinetic, sweep.potential, *moved.rest]
 
     def forces(self, tau: Sequence[Number]) -> list[Number]:
         """What acts along the chart's coordinates: a controller's, passive forces, friction."""
@@ -80,10 +88,11 @@ def machine_at(chart: Chart, tape: Tape, layout: Layout, state: int) -> Traced:
     dynamics, closure = chart.dynamics, chart.machine.closure
     q, posture, loops = closure.fast.trace(tape, 0, state)
     parts = layout.view(tape.loads(state, 0, layout.size))
-    constants = Constants(tape, 1, dynamics.numbers)
+    constants = Constants(tape, 1, dynamics.pattern)
     sweep = Sweep(
-        posture, loops, constants, q, parts.v_a, dynamics.carriers, dynamics.plan, dynamics.spans
-    )
+        posture, loops, constants, q, parts.v_a, dynamics.carriers, dynamics.plan,
+        dynamics.spans, dynamics.forces.sticking, True,
+    )  # fmt: skip
     v_a = parts.v_a if chart.own else [sweep.rates[i + 1] for i in chart.seen]
     return Traced(chart, sweep, parts, [q[i] for i in chart.seen], v_a)
 
@@ -91,7 +100,8 @@ def machine_at(chart: Chart, tape: Tape, layout: Layout, state: int) -> Traced:
 class Stepper:
     """A machine and its controller in machine code: what all methods have in common.
 
-    A method writes `_build`, which adds a formula `observe` with the part `seen`.
+    A method writes `_build`, which adds formulas `observe` with the parts `seen` and `margin`,
+    and `observe_rest` where joints can stick.
 
     Args:
         chart: The machine.
@@ -101,7 +111,8 @@ class Stepper:
         fold: Whether zeros and ones among the controller's settings become part of the code.
 
     Attributes:
-        bounds: See `FastClosure`, and where other coordinates are better, see `Chart.limits`.
+        bounds: See `FastClosure`; where other coordinates are better, see `Chart.limits`; whether
+            joints are at rest.
 
     Raises:
         TooLongError: It would take too long to compile.
@@ -113,8 +124,9 @@ class Stepper:
         machine = chart.machine
         self._fast, self._numbers = machine.closure.fast, chart.dynamics.numbers
         self._chart, self._control = chart, control
-        self.bounds = np.append(self._fast.bounds, chart.limits)
+        self.bounds = np.concatenate([self._fast.bounds, chart.limits, [0.0]])
         self._columns = columns_of(control)
+        self._sticks = bool(chart.sticking.columns)
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
         form = form_of(control, self._columns, len(machine.active), states, fold)
         key = (*method, form, states, *chart.formulas)
@@ -134,19 +146,45 @@ class Stepper:
         return machine, *self._control.trace(machine.seen(settings, reference))
 
     @property
+    def width(self) -> int:
+        """Length of a row."""
+        return self._state.size + self._seen.size
+
+    def adopt(self) -> None:
+        """Take over what the joints do whose friction sticks."""
+        if self._sticks:
+            self._chart.sticking.tell(self._chart.dynamics)
+            self.bounds[HELD] = self._chart.sticking.held.any()
+
+    @property
+    def _rests(self) -> tuple[tuple[str, bool], ...]:
+        """What to add to a formula's name without joints at rest, and with some."""
+        return (("", False), (_REST, True)) if self._sticks else (("", False),)
+
+    def _call(self, r: Routine, formula: str, *arguments: Place) -> None:
+        """Call a formula for what the joints do that stick."""
+        if not self._sticks:
+            r.call(formula, *arguments)
+            return
+        with r.when(r.bounds[HELD] > 0.5):
+            r.call(formula + _REST, *arguments)
+        with r.otherwise():
+            r.call(formula, *arguments)
+
+    @property
     def _arguments(self) -> tuple[Array, Array, Array]:
         """What all formulas begin with: geometry, numbers of the machine, settings."""
         settings = np.ascontiguousarray(self._control.settings)
         return self._fast.geometry.numbers, self._numbers, settings
 
-    def observe(self, time: float, state: Array) -> Array:
-        """What is seen (.,) at a time [s] and a state."""
+    def observe(self, time: float, state: Array) -> tuple[Array, float]:
+        """What is seen (.,) at a time [s] and a state, and its margin (`Moved.margin`)."""
         reference = np.ascontiguousarray(self._control.references(np.array([time])))
         layout = self._program.outputs("observe")
         out = np.empty(layout.size)
-        self._program.call("observe", *self._arguments, reference, state, out)
-        seen: Array = out[layout["seen"]]
-        return seen
+        name = "observe" + _REST if self.bounds[HELD] else "observe"
+        self._program.call(name, *self._arguments, reference, state, out)
+        return out[layout["seen"]], float(out[layout.start("margin")])
 
 
 def wrapped(chart: Chart, state: Sequence[Number]) -> list[Number]:

@@ -1,0 +1,196 @@
+"""What is to be said of a run: limits passed, energy lost or gained, friction that chatters."""
+
+import numpy as np
+
+from crane.codegen import Parts
+from crane.common.errors import SimulationError
+from crane.common.samples import FARTHEST, Array
+from crane.dynamics.joint_forces import JointForces
+from crane.machine import Machine
+from crane.motion.trajectories import limit_slack
+
+_SHOWN = 3  # joints beyond their limits that are named
+_IMBALANCE = 5e-3  # share of the energy that went through
+_STROKE = 5e-3  # share of a cylinder's stroke, of which no steel gives way
+_GAIN = 0.05  # share of what a stop held at most
+_SLOW = 3.0  # smoothing velocities, below which friction turns
+_OFF = 0.2  # of what is taken out over a step
+_FEW, _RARE = 3, 1e-3  # samples that may, of all
+_BLOCK = 20000  # samples looked at at once
+
+
+def said(
+    machine: Machine, time: Array, rows: Parts, step: float, fixed: bool, exact: bool = True
+) -> list[str]:
+    """What to say of a run.
+
+    The energies are integrated with the motion, so they tell when the step is too long.
+
+    Args:
+        machine: The machine.
+        time: (N,) [s].
+        rows: See `integrate`.
+        step: [s].
+        fixed: Whether the method's steps are these, whatever their error.
+        exact: Whether the formulation keeps its energy.
+
+    Raises:
+        SimulationError: An end stop gave back more energy than it took.
+    """
+    if exact and (text := stop_gains(machine, time, rows, step)):
+        raise SimulationError(text)
+    every = (
+        limits_passed(machine, time, rows.q),
+        strokes_passed(machine, time, rows.q),
+        chatter(machine, time, rows, step) if fixed else "",
+        imbalance(rows, step) if exact else "",
+    )
+    return [text for text in every if text]
+
+
+def limits_passed(machine: Machine, time: Array, q: Array) -> str:
+    """What to say of joints that went beyond limits where nothing stops them, else nothing.
+
+    Args:
+        machine: The machine.
+        time: (N,) [s].
+        q: (N, nv) the motion.
+    """
+    lower, upper = machine.coordinates.lower, machine.coordinates.upper
+    beyond = np.maximum(lower - q, q - upper)
+    farthest = beyond.max(axis=0)
+    stopped = {stop.joint for stop in machine.end_stops}
+    slack = limit_slack(machine)
+    passed = [i for i in np.flatnonzero(farthest > slack) if machine.joints[i] not in stopped]
+    if not passed:
+        return ""
+    units = machine.closure.units
+    passed.sort(key=lambda i: -farthest[i] / min(upper[i] - lower[i], FARTHEST * units[i]))
+    words = []
+    for i in passed[:_SHOWN]:
+        joint, first = machine.joints[i], int(np.argmax(beyond[:, i] > slack[i]))
+        limit = lower[i] if q[first, i] < lower[i] else upper[i]
+        unit = machine.unit(joint)
+        words.append(
+            f"'{joint}' passes its limit {limit:.4g} {unit} at t = {time[first]:.4g} s, by up to "
+            f"{farthest[i]:.3g} {unit}"
+        )
+    more = f" and {len(passed) - _SHOWN} more joints" if len(passed) > _SHOWN else ""
+    one = len(passed) == 1
+    return (
+        f"{', '.join(words)}{more}: nothing stops {'it' if one else 'them'} there, give "
+        f"{'it an end stop' if one else 'them end stops'}"
+    )
+
+
+def strokes_passed(machine: Machine, time: Array, q: Array) -> str:
+    """What to say of cylinders whose stops give way as no steel does, else nothing.
+
+    Arguments as those of `limits_passed`.
+    """
+    cylinders = machine.hydraulics.cylinders if machine.hydraulics is not None else {}
+    stopped = {stop.joint for stop in machine.end_stops}
+    words = []
+    for joint in cylinders:
+        i = machine.column(joint)
+        lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
+        depth = np.maximum(lower - q[:, i], q[:, i] - upper)
+        deepest, most = int(depth.argmax()), _STROKE * (upper - lower)
+        if joint in stopped and depth[deepest] > most:
+            words.append(
+                f"the piston of '{joint}' is {depth[deepest]:.3g} m beyond its stroke at "
+                f"t = {time[deepest]:.4g} s"
+            )
+    if not words:
+        return ""
+    return f"{', '.join(words)}: make end stops as stiff as steel is, or move slower"
+
+
+def _gap(rows: Parts) -> Array:
+    """(N,) work less change of energy less dissipation [J]: what a run has lost by its steps."""
+    change = rows.kinetic + rows.potential - rows.kinetic[0] - rows.potential[0]
+    gap: Array = (rows.work - change - rows.lost)[:, 0]
+    return gap
+
+
+def stop_gains(machine: Machine, time: Array, rows: Parts, step: float) -> str:
+    """What to say of an end stop that gave back more energy than it took, else nothing."""
+    gap = _gap(rows)
+    size = np.abs(rows.kinetic[:, 0]) + np.abs(rows.potential[:, 0])
+    for stop in machine.end_stops:
+        i = machine.column(stop.joint)
+        lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
+        depth = np.maximum(0.0, np.maximum(lower - rows.q[:, i], rows.q[:, i] - upper))
+        edges = np.flatnonzero(np.diff((depth > 0).astype(np.int8), prepend=0, append=0))
+        for first, behind in edges.reshape(-1, 2).tolist():
+            before, after = max(first - 1, 0), min(behind, len(gap) - 1)
+            held = 0.5 * stop.stiffness * float(depth[first:behind].max()) ** 2
+            gained = float(gap[before] - gap[after])
+            if gained > _GAIN * held + 1e-9 * float(size[before]):
+                return (
+                    f"at t = {time[first]:.4g} s the end stop of '{stop.joint}' gives back "
+                    f"{gained:.2g} J more than it takes, so the step of {step:g} s is too long "
+                    "for it: shorten it, or let method DOP853 choose it"
+                )
+    return ""
+
+
+def chatter(machine: Machine, time: Array, rows: Parts, step: float) -> str:
+    """What to say of smoothed friction that steps did not follow, else nothing.
+
+    Where a step of a fixed length is too long for a slope that turns within it, friction changes
+    its sign from stage to stage: what it took out over the step is not what its power at both
+    ends says.
+    """
+    laws = machine.friction.items()
+    smoothings = {machine.column(x): f.smoothing for x, f in laws if f.smoothing and f.breakaway}
+    columns = list(smoothings)
+    if not columns:
+        return ""
+    forces, slow = JointForces(machine), _SLOW * np.array(list(smoothings.values()))
+    count, names, lost = 0, set(), rows.lost[:, 0]
+    least = 1e-6 * float(np.diff(lost).max())
+    first = len(time)
+    for start in range(0, len(time) - 1, _BLOCK):
+        part = slice(start, start + _BLOCK + 1)
+        q = rows.q[part]
+        v = np.einsum("nij,nj->ni", machine.closure.gamma(q), rows.v_a[part])
+        braking = forces.passive(q, 0.0 * v) - forces.passive(q, v)
+        power = np.einsum("ni,ni->n", v, forces.friction(v) + braking)
+        taken, due = np.diff(lost[part]), 0.5 * step * (power[1:] + power[:-1])
+        turning = np.abs(v[:-1, columns]) < slow
+        off = np.abs(taken - due)
+        wrong = (off > _OFF * np.maximum(np.abs(taken), np.abs(due))) & (off > least)
+        wrong &= turning.any(axis=1)
+        if wrong.any():
+            count += int(wrong.sum())
+            first = min(first, start + int(wrong.argmax()))
+            names |= {columns[i] for i in np.flatnonzero(turning[wrong].any(axis=0))}
+    if count <= max(_FEW, _RARE * len(time)):
+        return ""
+    joints = [f"'{machine.joints[i]}'" for i in sorted(names)]
+    more = f" and {len(joints) - _SHOWN} more joints" if len(joints) > _SHOWN else ""
+    return (
+        f"friction of {', '.join(joints[:_SHOWN])}{more} chatters in {count} of {len(time)} "
+        f"samples, first at t = {time[first]:.4g} s: steps of {step:g} s do not follow its "
+        "smoothing, leave that out, so that it sticks, or shorten the step"
+    )
+
+
+def imbalance(rows: Parts, step: float) -> str:
+    """What to say if a simulation does not keep its energy, else nothing.
+
+    Args:
+        rows: See `integrate`; work, lost, kinetic, potential [J] of it.
+        step: [s].
+    """
+    gap = float(np.abs(_gap(rows)).max())
+    parts = rows.work, rows.lost, rows.kinetic, rows.potential
+    throughput = float(max(np.ptp(part) for part in parts))
+    rounding = 1e-12 * float(max(np.abs(rows.kinetic).max(), np.abs(rows.potential).max()))
+    if gap <= _IMBALANCE * throughput + rounding:
+        return ""
+    return (
+        f"work, energy and dissipation differ by {gap:.2g} J of {throughput:.2g} J, so the "
+        f"step of {step:g} s is too long: shorten it, or let method DOP853 choose it"
+    )
