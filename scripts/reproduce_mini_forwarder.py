@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from forwarder import figures, page
-from forwarder.paper import TASKS
+from forwarder.paper import SMOOTH, TASKS
 from forwarder.runs import (
     FORMULATIONS,
     READINGS,
@@ -58,8 +58,8 @@ def main() -> None:
     parser.add_argument("--rigs", type=int, default=RIGS, help="virtual rigs")
     options = parser.parse_args()
     warnings.simplefilter("ignore", crane.CraneWarning)
-    machine = crane.load("mini_forwarder")
-    rig = Rig(machine, SEED)
+    machine, rough = crane.load("mini_forwarder", SMOOTH), crane.load("mini_forwarder")
+    rig = Rig(rough, SEED)
     paths = {task: crane.task_trajectory(machine, task) for task in TASKS}
     runs: dict[str, dict[tuple[str, str], Run]] = {}
     measured: dict[str, Run] = {}
@@ -71,9 +71,7 @@ def main() -> None:
         }
         recording = rig.run(path, label=task)
         measured[task] = run_of(recording, path, recording.tau)
-    wins = {
-        seed: exact_wins(Rig(machine, seed), paths, runs) for seed in range(1, options.rigs + 1)
-    }
+    wins = {seed: exact_wins(Rig(rough, seed), paths, runs) for seed in range(1, options.rigs + 1)}
     sensitivity = page.Ranges(feasible_set(options.draws, seed=0), options.draws)
     parts = [
         page.scoreboard(runs, sensitivity),

@@ -55,22 +55,17 @@ def plant():
 
 @pytest.mark.parametrize("method", ["weak", "chambers"])
 def test_x_without_noise_is_exact(ideal, tmp_path, method):
-    """From the crane's own simulation, through the logger's file and back.
-
-    But for pressures that turn sharply between samples where the boom sticks.
-    """
+    """From the crane's own simulation, through the logger's file and back."""
     machine, runs = ideal
     read = {x: experiment.measured(machine, r, tmp_path, 0, 0.0) for x, r in runs.items()}
-    assert worst(circuit.identified(machine, read, (method,))[method]).max() < 5e-6
+    assert worst(circuit.identified(machine, read, (method,))[method]).max() < 1e-6
 
 
 @pytest.mark.parametrize("method", ["weak", "chambers"])
 def test_x_with_noise_predicts_the_recording_left_out(ideal, logged, method):
-    found = circuit.left_out(ideal[0], logged, method)
-    # in 24 draws of the noise the modulus was inside in 96 and 92 of 100: here one may be out
-    assert sum(inside(X)[0] for X in found.values()) >= len(found) - 1
-    for name, X in found.items():
+    for name, X in circuit.left_out(ideal[0], logged, method).items():
         assert worst(X)[1:].max() < 0.05
+        assert inside(X)[0]
         # noise of the stroke's derivative over a window is what remains
         assert X.predict(logged[name]).relative < 0.02
 
@@ -178,7 +173,7 @@ def test_torques_are_predicted(plant, motions, model):
     found = mechanics.learned(plant.joints, motions["learn"], model)
     left = mechanics.true_forces(plant.joints, motions["set 1"]).relative
     judged = mechanics.judge(found, motions["set 1"]).relative
-    assert (left < [0.002, 0.004, 0.04]).all()  # a jump of friction is filtered away
+    assert (left < [0.002, 0.004, 0.03]).all()
     assert (judged < 2.5 * left).all()
 
 

@@ -17,6 +17,7 @@ from crane.machine import Machine
 from crane.motion.trajectories import Trajectory
 
 _LONGEST = 4000.0  # of levers [s], what a simulation can have of milliseconds
+_LOGGED = 0.02  # [s] between samples of a log, at most
 _JUMP = 0.01  # of the spool's stroke, over which the feedforward jumps the dead band
 
 
@@ -127,7 +128,7 @@ class Signals(Command):
                     f"pressure of the supply is {highest:g} Pa at most, far below the tank's"
                     + (meant("pressure", highest) or ", give it in Pa from a vacuum")
                 )
-        self._values = np.column_stack(columns)
+        self._values = np.asfortranarray(np.column_stack(columns))  # read column by column
         self._count = len(circuit.joints)
 
     def _column(self, values: ArrayLike, what: str) -> Array:
@@ -137,6 +138,12 @@ class Signals(Command):
     def duration(self) -> float:
         """From zero to the last instant [s]."""
         return float(self._time[-1])
+
+    def breaks(self) -> Array:
+        """Times (k,) [s] at which signals turn; none of a log, whose samples are close."""
+        if len(self._time) > 1 and self.duration - self._time[0] < _LOGGED * len(self._time):
+            return np.zeros(0)
+        return self._time
 
     def references(self, times: Array) -> Array:
         """See `Command`."""

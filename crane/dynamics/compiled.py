@@ -22,7 +22,7 @@ def _observed(sweep: Sweep, moved: Moved) -> list[Number]:
     return [*moved.friction, sweep.kinetic, sweep.potential, *moved.rest]
 
 
-MOVES = ("rates", "observation")  # what depends on `JointForces.set_modes`
+MOVES = ("rates", "observation", "resting")  # what depends on `JointForces.set_modes`
 # What can be asked of a sweep, given a second argument x (n,): a_A for inverse and regressor,
 # tau_A for the others.
 QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
@@ -40,6 +40,7 @@ QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
     "energy": lambda sweep, x: [sweep.kinetic, sweep.potential],
     "rates": lambda sweep, x: _rates(sweep, sweep.moved(x, rest=True)),
     "observation": lambda sweep, x: _observed(sweep, sweep.moved(x, rest=True)),
+    "resting": lambda sweep, x: sweep.resting(x),
     "regressor": lambda sweep, x: [entry for row in sweep.regressor(x) for entry in row],
 }
 _FLOAT = np.dtype(np.float64)

@@ -34,7 +34,7 @@ from crane.machine import Machine
 
 _SLIP = 7  # of the numbers of a joint, the first of those that change with the motion
 BODY, JOINT = 10, 22  # numbers per body, and of the law of a joint or distance
-Effects = tuple[Number, Number, Number, Number]
+Effects = tuple[Number, Number, Number, Number, Number]
 _SOLVED = 7  # freedoms up to which solving with M_A takes fewer operations than recursion
 _UPPER = np.triu_indices(3)
 Spans = tuple[tuple[int, int], ...]  # by distance the bodies of both ends; 0 is the world
@@ -289,7 +289,7 @@ class Sweep:
         return self._projected(self._along_tree(wrenches))
 
     def _law(self, law: Vector, q: Number, rate: Number, modes: bool = False) -> Effects:
-        """Of a joint or distance: passive force, friction, power taken out, energy stored.
+        """Of a joint or distance: passive force, friction, power taken out, energy, stiffness.
 
         Written apart from `JointForces`, which has the same in numpy, so that each checks the
         other.
@@ -307,33 +307,37 @@ class Sweep:
                 coulomb = coulomb + stiction * apply("exp", -1.0 * (slow * slow))
             friction = friction + (coulomb + viscous_offset * rate) * sign
         force = constant - stiffness * q - damping * rate
+        slope = -1.0 * stiffness
         stored = 0.5 * stiffness * q * q - constant * q + slack
         lost = (friction + damping * rate) * rate
         if gas != 0.0:
             swollen = 1.0 + gas_share * (q - gas_rest)
             if gas_exponent == 1.0:
-                force = force + gas / swollen
+                pressed = gas / swollen
                 stored = stored - gas / gas_share * apply("log", swollen)
             else:
                 less = 1.0 - gas_exponent
                 power = apply("exp", less * apply("log", swollen))
-                force = force + gas * power / swollen
+                pressed = gas * power / swollen
                 stored = stored - gas / gas_share * ((power - 1.0) / less)
+            force = force + pressed
+            slope = slope - gas_exponent * gas_share * pressed / swollen
         if stop != 0.0:
             over, under = maximum(q - upper, 0.0), maximum(lower - q, 0.0)
-            push = stop * over * maximum(1.0 + stop_damping * rate, 0.0)
-            pull = stop * under * maximum(1.0 - stop_damping * rate, 0.0)
+            harder, softer = (maximum(1.0 + s * stop_damping * rate, 0.0) for s in (1.0, -1.0))
+            push, pull = stop * over * harder, stop * under * softer
+            slope = slope - stop * where_positive(over, harder, where_positive(under, softer, 0.0))
             force = force + pull - push
             stored = stored + 0.5 * stop * (over * over + under * under)
             lost = lost + (push - stop * over - pull + stop * under) * rate
-        return force, friction, lost, stored
+        return force, friction, lost, stored, slope
 
     @cached_property
     def _at_joints(self) -> list[Effects]:
         """`_law` of all joints (nb + 1,)."""
         every = zip(self._laws, self._q, self.rates[1:], strict=True)
         laws = (self._law(*x, self._modes and i in self._sticking) for i, x in enumerate(every))
-        return [(0.0,) * 4, *laws]
+        return [(0.0,) * 5, *laws]
 
     @cached_property
     def _at_lengths(self) -> list[tuple[dict[int, Number], Effects]]:
@@ -366,8 +370,8 @@ class Sweep:
     @cached_property
     def _passive(self) -> Vector:
         """f, passive forces along the joints (nb + 1,)."""
-        out = [force for force, _, _, _ in self._at_joints]
-        for slopes, (force, _, _, _) in self._at_lengths:
+        out = [effects[0] for effects in self._at_joints]
+        for slopes, (force, *_) in self._at_lengths:
             for i, slope in slopes.items():
                 out[i] = out[i] + force * slope
         return out
@@ -375,7 +379,7 @@ class Sweep:
     @property
     def _friction(self) -> Vector:
         """tau_F, friction along the joints (nb + 1,)."""
-        return [friction for _, friction, _, _ in self._at_joints]
+        return [effects[1] for effects in self._at_joints]
 
     def _sum(self, which: int) -> Number:
         """Of what `_law` gives, over all joints and distances."""
@@ -383,6 +387,38 @@ class Sweep:
         for effects in (*self._at_joints, *(effects for _, effects in self._at_lengths)):
             total = total + effects[which]
         return total
+
+    @property
+    def stiffness(self) -> list[Vector]:
+        """d(gamma^T f)/dq_A of springs, gas, end stops and ropes at frozen gamma (n, n)."""
+        along = [(self.gamma[i], self._at_joints[i][4]) for i in range(1, self._size)]
+        for slopes, effects in self._at_lengths:
+            row: Vector = [0.0] * self._n
+            for i, slope in slopes.items():
+                row = add(row, scale(slope, self.gamma[i]))
+            along.append((row, effects[4]))
+        out: list[Vector] = [[0.0] * self._n for _ in range(self._n)]
+        for row, stiffness in along:
+            for k, entry in enumerate(row):
+                out[k] = add(out[k], scale(entry * stiffness, row))
+        return out
+
+    @property
+    def ways(self) -> list[Vector]:
+        """d(slopes)/dv_A (nb, n), none of free-flyers."""
+        flying = {i + k for i in self._posture.geometry.flyers for k in range(6)}
+        none: Vector = [0.0] * self._n
+        return [none if i in flying else self.gamma[i] for i in range(1, self._size)]
+
+    @property
+    def free(self) -> Vector:
+        """(n,) 0 of active joints that are at rest to the last bit, else 1."""
+        out: Vector = [self._moving] * self._n
+        held = {i: self._laws[i][_SLIP + 1] for i in self._sticking}
+        for k, joint in enumerate(self._loops.active_joints):
+            if joint - 1 in held:
+                out[k] = self._moving * (1.0 - held[joint - 1])
+        return out
 
     @property
     def slopes(self) -> Vector:
@@ -456,6 +492,19 @@ class Sweep:
         right = add(tau, self._projected(self._forces(friction)))
         return Positive(self.mass).solve(subtract(right, self.inertial_bias))
 
+    def resting(self, tau: Sequence[Number]) -> Vector:
+        """What tells which joints stick: M_A (n^2), rows of gamma (k n), their drift (k), net (n).
+
+        Of the joints whose friction sticks; net is what tau leaves behind bias and friction.
+        """
+        rows = [entry for i in self._sticking for entry in self.gamma[i + 1]]
+        drift = [self.drift[i + 1] for i in self._sticking]
+        return [*(entry for row in self.mass for entry in row), *rows, *drift, *self._net(tau)]
+
+    def _net(self, tau: Sequence[Number]) -> Vector:
+        """What is left of tau behind bias and friction."""
+        return subtract(add(tau, self._projected(self._forces(True))), self.inertial_bias)
+
     @property
     def held(self) -> list[tuple[Number, Vector]]:
         """Of each joint that can stick, whether it is held, and its row of gamma."""
@@ -482,7 +531,7 @@ class Sweep:
             none: Vector = [0.0] * len(laws)
             return Moved(self.forward(tau, True), none, self.friction, _least(slips))
         rows = [self.gamma[i + 1] for i in self._sticking]
-        right = subtract(add(tau, self._projected(self._forces(True))), self.inertial_bias)
+        right = self._net(tau)
         mass = Positive(self.mass)
         half = [scale(w, mass.halved(row)) for w, row in zip(held, rows, strict=True)]
         weighed = [[x * d for x, d in zip(row, mass.inverse, strict=True)] for row in half]
@@ -497,11 +546,7 @@ class Sweep:
         for r, row in zip(reach, rows, strict=True):
             braking = add(braking, scale(r, row))
         a_a = mass.solve(subtract(right, braking))
-        free = {joint: w for joint, w in zip(self._sticking, held, strict=True)}
-        for k, joint in enumerate(self._loops.active_joints):
-            a_a[k] = a_a[k] * self._moving  # rest to the last bit
-            if joint - 1 in free:
-                a_a[k] = a_a[k] * (1.0 - free[joint - 1])
+        a_a = [a * free for a, free in zip(a_a, self.free, strict=True)]
         left = [1.0 - apply("abs", r) / limit for r, limit in zip(reach, limits, strict=True)]
         margins = [
             where_positive(w - 0.5, one, other)

@@ -148,6 +148,12 @@ class TreeDynamics:
                 rests = (np.abs(slip) < 1) | (held.any() & (np.abs(v[here]) * pace < AT_REST))
                 rest = np.where(rests, self._forces.held(slip) + needed, 0.0)
                 return np.concatenate([gamma.T @ along, self._energy(motion), rest])
+            case "resting":
+                here = list(self._forces.sticking)
+                along = gamma.T @ self._forces.friction(v, modes=True)
+                net = x - self._project(motion, motion.drift, False) - along
+                parts = self._mass(motion), gamma[here], motion.drift[here], net
+                return np.concatenate([np.ravel(part) for part in parts])
             case "regressor":
                 return (gamma.T @ self._regressor(q, v, gamma @ x + motion.drift)).ravel()
         raise AssertionError(quantity)

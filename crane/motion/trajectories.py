@@ -13,6 +13,7 @@ from crane.motion.kinematics import Kinematics
 
 _LIMIT_SLACK = 1e-6  # [rad], [machine's size]
 _KNOTS_PER_SECOND = 100
+_JUMP = 1e-9  # of the largest value, what no jump is
 
 
 def limit_slack(machine: Machine) -> Array:
@@ -68,6 +69,18 @@ class Trajectory:
         rests = [np.ravel(roots) for roots in np.ravel(rate.roots(extrapolate=False))]
         times = np.concatenate([curve.x, *rests])
         return np.unique(times[np.isfinite(times)])
+
+    def breaks(self) -> Array:
+        """Times (k,) [s] at which coordinates, velocities or accelerations jump, and the ends."""
+        x = self._curves[0].x
+        jumps = np.zeros(len(x), dtype=bool)
+        jumps[[0, -1]] = True
+        for curve in self._curves:
+            powers = np.diff(x)[:, None] ** np.arange(len(curve.c))[::-1]
+            ends = np.einsum("imj,mi->mj", curve.c, powers)[:-1]
+            size = np.abs(curve.c[-1]).max(axis=0) + np.finfo(float).tiny
+            jumps[1:-1] |= (np.abs(ends - curve.c[-1, 1:]) > _JUMP * size).any(axis=1)
+        return np.asarray(x[jumps])
 
     def __call__(self, time: ArrayLike) -> tuple[Array, Array, Array]:
         """Coordinates, velocities and accelerations.

@@ -37,13 +37,14 @@ def said(
     Raises:
         SimulationError: An end stop gave back more energy than it took.
     """
-    if exact and (text := stop_gains(machine, time, rows, step)):
+    gap = _gap(rows)
+    if exact and (text := stop_gains(machine, time, rows, step, gap)):
         raise SimulationError(text)
     every = (
         limits_passed(machine, time, rows.q),
         strokes_passed(machine, time, rows.q),
         chatter(machine, time, rows, step) if fixed else "",
-        imbalance(rows, step) if exact else "",
+        imbalance(rows, step, gap) if exact else "",
     )
     return [text for text in every if text]
 
@@ -108,25 +109,32 @@ def strokes_passed(machine: Machine, time: Array, q: Array) -> str:
 
 def _gap(rows: Parts) -> Array:
     """(N,) work less change of energy less dissipation [J]: what a run has lost by its steps."""
-    change = rows.kinetic + rows.potential - rows.kinetic[0] - rows.potential[0]
-    gap: Array = (rows.work - change - rows.lost)[:, 0]
+    stored = rows.kinetic[:, 0] + rows.potential[:, 0]
+    gap: Array = rows.work[:, 0] - rows.lost[:, 0] - stored + stored[0]
     return gap
 
 
-def stop_gains(machine: Machine, time: Array, rows: Parts, step: float) -> str:
+def _throughput(rows: Parts) -> float:
+    """The energy that went through [J]."""
+    parts = rows.work, rows.lost, rows.kinetic, rows.potential
+    return float(max(np.ptp(part) for part in parts))
+
+
+def stop_gains(machine: Machine, time: Array, rows: Parts, step: float, gap: Array) -> str:
     """What to say of an end stop that gave back more energy than it took, else nothing."""
-    gap = _gap(rows)
-    size = np.abs(rows.kinetic[:, 0]) + np.abs(rows.potential[:, 0])
+    least = _IMBALANCE * _throughput(rows)
+    if not np.ptp(gap) > least:
+        return ""
     for stop in machine.end_stops:
         i = machine.column(stop.joint)
         lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
-        depth = np.maximum(0.0, np.maximum(lower - rows.q[:, i], rows.q[:, i] - upper))
+        depth = np.maximum(lower - rows.q[:, i], rows.q[:, i] - upper)
         edges = np.flatnonzero(np.diff((depth > 0).astype(np.int8), prepend=0, append=0))
         for first, behind in edges.reshape(-1, 2).tolist():
             before, after = max(first - 1, 0), min(behind, len(gap) - 1)
             held = 0.5 * stop.stiffness * float(depth[first:behind].max()) ** 2
             gained = float(gap[before] - gap[after])
-            if gained > _GAIN * held + 1e-9 * float(size[before]):
+            if gained > max(_GAIN * held, least):
                 return (
                     f"at t = {time[first]:.4g} s the end stop of '{stop.joint}' gives back "
                     f"{gained:.2g} J more than it takes, so the step of {step:g} s is too long "
@@ -147,24 +155,26 @@ def chatter(machine: Machine, time: Array, rows: Parts, step: float) -> str:
     columns = list(smoothings)
     if not columns:
         return ""
+    lost = rows.lost[:, 0]
+    taken, least = np.diff(lost), 1e-6 * float(np.diff(lost).max())
+    friction = np.einsum("ni,ni->n", rows.friction, rows.v_a)
+    suspects = np.flatnonzero(_differ(taken, _mean(friction) * step, least))
     forces, slow = JointForces(machine), _SLOW * np.array(list(smoothings.values()))
-    count, names, lost = 0, set(), rows.lost[:, 0]
-    least = 1e-6 * float(np.diff(lost).max())
-    first = len(time)
-    for start in range(0, len(time) - 1, _BLOCK):
-        part = slice(start, start + _BLOCK + 1)
-        q = rows.q[part]
-        v = np.einsum("nij,nj->ni", machine.closure.gamma(q), rows.v_a[part])
-        braking = forces.passive(q, 0.0 * v) - forces.passive(q, v)
-        power = np.einsum("ni,ni->n", v, forces.friction(v) + braking)
-        taken, due = np.diff(lost[part]), 0.5 * step * (power[1:] + power[:-1])
-        turning = np.abs(v[:-1, columns]) < slow
-        off = np.abs(taken - due)
-        wrong = (off > _OFF * np.maximum(np.abs(taken), np.abs(due))) & (off > least)
+    count, names, first = 0, set(), len(time)
+    for start in range(0, len(suspects), _BLOCK):  # with dampers and stops, and where they turn
+        here = suspects[start : start + _BLOCK]
+        power, turning = np.zeros((2, len(here))), np.zeros((len(here), len(columns)), dtype=bool)
+        for end, at in enumerate((here, here + 1)):
+            q = rows.q[at]
+            v = np.einsum("nij,nj->ni", machine.closure.gamma(q), rows.v_a[at])
+            braking = forces.passive(q, 0.0 * v) - forces.passive(q, v)
+            power[end] = friction[at] + np.einsum("ni,ni->n", v, braking)
+            turning |= np.abs(v[:, columns]) < slow
+        wrong = _differ(taken[here], 0.5 * step * power.sum(axis=0), least)
         wrong &= turning.any(axis=1)
         if wrong.any():
             count += int(wrong.sum())
-            first = min(first, start + int(wrong.argmax()))
+            first = min(first, int(here[wrong.argmax()]))
             names |= {columns[i] for i in np.flatnonzero(turning[wrong].any(axis=0))}
     if count <= max(_FEW, _RARE * len(time)):
         return ""
@@ -177,16 +187,21 @@ def chatter(machine: Machine, time: Array, rows: Parts, step: float) -> str:
     )
 
 
-def imbalance(rows: Parts, step: float) -> str:
-    """What to say if a simulation does not keep its energy, else nothing.
+def _mean(values: Array) -> Array:
+    """(N - 1,) of each two neighbours."""
+    return 0.5 * (values[1:] + values[:-1])
 
-    Args:
-        rows: See `integrate`; work, lost, kinetic, potential [J] of it.
-        step: [s].
-    """
-    gap = float(np.abs(_gap(rows)).max())
-    parts = rows.work, rows.lost, rows.kinetic, rows.potential
-    throughput = float(max(np.ptp(part) for part in parts))
+
+def _differ(one: Array, other: Array, least: float) -> np.ndarray:
+    """Where energies (N,) [J] are not the same."""
+    gap = np.abs(one - other)
+    return (gap > _OFF * np.maximum(np.abs(one), np.abs(other))) & (gap > least)
+
+
+def imbalance(rows: Parts, step: float, gaps: Array) -> str:
+    """What to say if a simulation does not keep its energy, else nothing."""
+    gap = float(np.abs(gaps).max())
+    throughput = _throughput(rows)
     rounding = 1e-12 * float(max(np.abs(rows.kinetic).max(), np.abs(rows.potential).max()))
     if gap <= _IMBALANCE * throughput + rounding:
         return ""

@@ -30,11 +30,13 @@ from crane.recordings.recording import Recording
 from crane.simulation.integration.adaptive import ADAPTIVE, AdaptiveSteps
 from crane.simulation.integration.charted import ChartedSteps, Way
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.explicit_steps import ExplicitSteps
+from crane.simulation.integration.controlled import ControlledStepper
+from crane.simulation.integration.controlled_steps import ControlledSteps
+from crane.simulation.integration.explicit import ExplicitStepper
 from crane.simulation.integration.halt import HaltedError, explained
+from crane.simulation.integration.rosenbrock import StiffStepper
 from crane.simulation.integration.state import row_layout
 from crane.simulation.integration.steps import Steps
-from crane.simulation.integration.stiff import StiffSteps
 from crane.simulation.judgement import limits_passed, said
 from crane.simulation.recorded import recorded
 
@@ -42,7 +44,9 @@ _MOST = 4_000_000  # steps of one recording
 _ENERGIES = 2  # of the state: work, lost
 
 Force = Callable[[float, Array, Array], Array]
+Stepper = Callable[[Chart, TracedController, int], ControlledStepper]
 Progress = Callable[[float], None]
+_CONTROLLED: dict[str, Stepper] = {"DOP853": ExplicitStepper, "rosenbrock": StiffStepper}
 
 
 class InterruptedRun(KeyboardInterrupt):
@@ -215,43 +219,37 @@ def _integration(
     machine: Machine, control: Controller, own: int, method: str | None
 ) -> Callable[[Chart], Way]:
     """What integrates by a method, or by that which the controller asks for."""
-    if isinstance(control, ValveDrive) and method in (None, "rosenbrock"):
-        return lambda chart: _stiff(chart, control, own)
-    if isinstance(control, ValveDrive) and control.period:
+    valves = isinstance(control, ValveDrive)
+    method = method or ("rosenbrock" if valves else "rk4")
+    if method not in ("rk4", "rosenbrock", *ADAPTIVE):
+        known_ones = known(("rk4", "rosenbrock", *ADAPTIVE), method)
+        raise InputError(f"method '{method}' is unknown, {known_ones}")
+    if isinstance(control, ValveDrive) and control.period and method != "rosenbrock":
         raise InputError(
             f"method '{method}' does not call the valves' program, leave the method out"
         )
-    if method in (None, "rk4"):
+    if method == "rk4":
         return lambda chart: Steps(chart, control, own)
-    if method == "DOP853" and not isinstance(control, ValveDrive):
-        return lambda chart: _explicit(chart, control, own)
-    if method in ADAPTIVE and machine.coordinates.floating:
-        raise InputError(f"method '{method}' does not go round with a body that floats, take rk4")
-    if method in ADAPTIVE:
-        return lambda chart: AdaptiveSteps(chart, control, own, method)
-    if method == "rosenbrock":
-        raise InputError("method 'rosenbrock' is that of circuits, take DOP853 or rk4")
-    raise InputError(f"method '{method}' is unknown, {known(('rk4', *ADAPTIVE), method)}")
+    steppers = {"rosenbrock": StiffStepper} if valves else _CONTROLLED
+    return lambda chart: _controlled(chart, control, own, method, steppers.get(method))
 
 
-def _explicit(chart: Chart, control: Controller, own: int) -> Way:
-    """The explicit method of order 8: machine code, or scipy where there is none."""
-    if chart.dynamics.backend == "compiled" and isinstance(control, TracedController):
+def _controlled(
+    chart: Chart, control: Controller, own: int, method: str, stepper: Stepper | None
+) -> Way:
+    """A method that chooses its steps: machine code, or scipy where there is none."""
+    if (
+        stepper is not None
+        and chart.dynamics.backend == "compiled"
+        and isinstance(control, TracedController)
+    ):
         with suppress(TooLongError):
-            return ExplicitSteps(chart, control, own)
+            return ControlledSteps(chart, control, own, stepper)
+    if isinstance(control, ValveDrive) and control.period:
+        raise InputError("a program with a period runs on the compiled backend alone")
     if chart.machine.coordinates.floating:
         raise InputError("scipy's methods do not go round with a body that floats, take rk4")
-    return AdaptiveSteps(chart, control, own, "DOP853")
-
-
-def _stiff(chart: Chart, control: ValveDrive, own: int) -> Way:
-    """What integrates a circuit: machine code, or scipy where there is none."""
-    if chart.dynamics.backend == "compiled":
-        with suppress(TooLongError):
-            return StiffSteps(chart, control)
-    if control.period:
-        raise InputError("a program with a period runs on the compiled backend alone")
-    return AdaptiveSteps(chart, control, own, "BDF")
+    return AdaptiveSteps(chart, control, own, "BDF" if method == "rosenbrock" else method)
 
 
 def as_controller(controller: Controller | Command | Force | None, machine: Machine) -> Controller:

@@ -24,6 +24,10 @@ FRICTION = {
 }
 VISCOUS = {"q1": 0.8, "X1": 0.4, "X2": 0.4}  # mu_v of the active joints; passive ones 0.4
 
+# Velocities over which sign(v) turns in simulations of it [rad/s], [m/s]; A.
+SMOOTHING = {"q1": 1e-2, "X1": 1e-3, "X2": 1e-3}
+SMOOTH = {f"friction.{joint}.smoothing": value for joint, value in SMOOTHING.items()}
+
 # Facts of the text on the strokes: task, joint, second of the reversal.
 REVERSALS = (("return", "X1", 7.0), ("return", "X2", 4.0), ("lift", "X2", 6.0))
 CRUISE = -2e-3  # [m/s] X1' of trajectory 1 from second 2 to 8

@@ -18,6 +18,8 @@ from forwarder.paper import (
     FRICTION,
     JOINTS,
     REVERSALS,
+    SMOOTH,
+    SMOOTHING,
     TASKS,
     VISCOUS,
     published,
@@ -26,7 +28,7 @@ from forwarder.paper import (
 FORMULATIONS = ("exact", "decoupled")
 READINGS = ("braking", "as printed")
 STEP = 1e-3  # [s]
-_SMOOTHING = 1e-3  # [m/s], [rad/s] over which sign(v) turns that drives; A
+_TURNS = np.array(list(SMOOTHING.values()))
 
 
 def friction_as_printed(v: Array, sign: Array) -> Array:
@@ -51,7 +53,7 @@ class Pushed(PI):
 
     def push(self, v_a: Array) -> Array:
         """F_F, (3,) or (N, 3)."""
-        return friction_as_printed(v_a, np.tanh(v_a / _SMOOTHING))
+        return friction_as_printed(v_a, np.tanh(v_a / _TURNS))
 
     def law(self, at: At) -> tuple[list, list]:
         """See `PI`."""
@@ -61,7 +63,7 @@ class Pushed(PI):
         out = []
         for i, (force, v) in enumerate(zip(tau, at.v_a, strict=True)):
             mean, offset, viscous, viscous_offset = table[4 * i : 4 * i + 4]
-            sign = apply("tanh", v / _SMOOTHING)
+            sign = apply("tanh", v / float(_TURNS[i]))
             out.append(force - mean * sign - offset - viscous * v - viscous_offset * (v * sign))
         return out, rate
 
@@ -311,7 +313,7 @@ def feasible_set(
             if what in ("actuator mass", "all"):
                 changes |= actuators_of(mass)
             try:
-                machine = crane.load("mini_forwarder", changes)
+                machine = crane.load("mini_forwarder", changes | SMOOTH)
                 tasks = {task: coarse(machine, task) for task in TASKS}
             except ClosureError:
                 continue

@@ -78,6 +78,7 @@ def crane_of(kind: str) -> Crane:
             and with a spool that follows at once, all as in the paper's equations.
     """
     changes = {"payload.mass": LOAD}
+    changes |= {f"friction.{joint}.smoothing": 1e-3 for joint in CYLINDERS}  # [m/s]; A
     if kind != "published":
         for joint, values in COEFFICIENTS.items():
             changes[f"valve.{joint}.margin"] = 0.0

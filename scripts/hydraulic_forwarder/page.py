@@ -84,7 +84,7 @@ def scoreboard(found: Results) -> str:
             f"{sum(held for *_, held in asked)} of {len(asked)} hold. {off} The paper states no "
             "errors; the bounds for torques and for (29) are ours. *Paper's crane*: as in the "
             "paper's equations, rigid hoses and walls, no leakage, a spool that follows at once. "
-            "*The machine*: all of it.",
+            "*The machine*: all of it. Friction of both is smooth over 1 mm/s.",
             table(("", "asked", "found", "holds"), rows),
         ]
     )

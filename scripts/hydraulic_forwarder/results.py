@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-import crane
 from crane.common.samples import Array
 from crane.identification.hydraulics.cylinder_friction import CylinderFriction
 from crane.identification.hydraulics.orifice_rows import Sides
@@ -193,8 +192,8 @@ def swing(motion: Motion) -> float:
 
 def true_law(speed: Array) -> Array:
     """Friction of the machine file at speeds both ways (2, N)."""
-    law = crane.load("patu655").friction["X_lift"]
+    law = crane_of("published").machine.friction["X_lift"]
     top = np.abs(speed).max()
     v = np.concatenate([-np.geomspace(top, 3e-3, 200), np.geomspace(3e-3, top, 200)])
     stick = law.coulomb + law.stiction * np.exp(-((v / law.stribeck) ** 2))
-    return np.array([v, stick * np.sign(v) + law.viscous * v])
+    return np.array([v, stick * np.tanh(v / law.smoothing) + law.viscous * v])

@@ -33,6 +33,7 @@ from crane.recordings.recording import Recording
 
 METHODS = {"ols": least_squares, "wls": weighted, "huber": huber}
 _SLOW = 0.02  # of a joint's largest velocity, below which its rows are left out
+_RESTING = {"rad": 1e-2, "m": 1e-3}  # [rad/s], [m/s] where stiction ends that nobody described
 _SETTLED = 4.0  # of the velocity over which friction's sign changes, tanh 4 = 0.9993
 _MOVING = 0.5  # of a joint's largest velocity, above which rows count always
 _KNOWN = 0.75  # of the frequency where a smoother passes half: there it passes 91 %
@@ -205,7 +206,8 @@ def _slow(machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastes
     for i, joint in enumerate(machine.active):
         law = machine.friction.get(joint)
         if law is not None:
-            near = max(_SETTLED * law.smoothing, _SETTLED * law.stribeck * (law.stiction > 0))
+            slow = law.smoothing or (_RESTING[machine.unit(joint)] if law.sticks else 0.0)
+            near = _SETTLED * (max(law.stribeck, law.smoothing) if law.stiction else slow)
             out[i] = max(out[i], min(near, _MOVING * fastest[i]))
     if isinstance(slow, Mapping):
         for joint, value in slow.items():

@@ -168,7 +168,3 @@ class AdaptiveSteps(Switching):
             q[:] = closure.solve(q[closure.active], guess=q)
         except ClosureError as error:
             raise HaltedError(time, self.slow.here(state), f": {error}") from None
-
-    def _step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
-        """Not needed: scipy's methods find events in what is between their steps."""
-        raise NotImplementedError

@@ -1,24 +1,15 @@
-"""Steps of a Rosenbrock method in machine code, for stiff circuits."""
+"""Steps of a Rosenbrock method in machine code, which nothing stiff shortens."""
 
 import numpy as np
 
-from crane.codegen import Expression, Number, Program, Tape, largest, maximum, select
+from crane.closure.traced import largest_share
+from crane.codegen import Expression, Number, Program, Tape, Value, largest, maximum
 from crane.codegen.derivative import derivatives
-from crane.codegen.factors import eliminated, loaded, stored, substituted
-from crane.codegen.scalar import add, apply, dot, minimum, scale, times
-from crane.common.samples import Array
-from crane.control import At, ValveDrive
-from crane.simulation.integration.blocks import in_blocks
+from crane.codegen.factors import Matrix, eliminated, loaded, stored, substituted
+from crane.codegen.scalar import add, apply, minimum, scale, subtract, times
+from crane.control import TracedController, ValveDrive
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.sticking import NEAR
-from crane.simulation.integration.traced import (
-    Stepper,
-    Traced,
-    beyond,
-    machine_at,
-    settings_of,
-    wrapped,
-)
+from crane.simulation.integration.controlled import SLOWER, Attempt, ControlledStepper, Way, mixed
 
 # ROS34PW2 of Rang and Angermann (2005): order 3 with any Jacobian, L-stable, stiffly accurate,
 # with an embedded method of order 2.
@@ -46,176 +37,87 @@ _BACKWARD = np.diag(np.diag(_INVERSE)) - _INVERSE
 _FINAL, _SECOND = WEIGHTS @ _INVERSE, EMBEDDED @ _INVERSE
 
 _RELATIVE = 1e-8  # accuracy of a step, per size of the state
-# accuracy that matters [rad], [machine's size], and that per `Closure.pace`
-_COORDINATE, _VELOCITY = 1e-11, 1e-9
-_FASTER, _SLOWER, _SAFETY = 6.0, 0.2, 0.9  # change of the step's length from one to the next
-_SHORTEST = 1e-9  # part of a recorded step that is given up on
-_NEARLY = 1.0 - 2.0**-41  # of what is left of a recorded step: all of it
+# accuracy that matters [rad], [machine's size], that per `Closure.pace`, and of a law's states
+_COORDINATE, _VELOCITY, _OWN = 1e-11, 1e-9, 1e-9
+_FASTER, _SAFETY = 6.0, 0.9  # change of the step's length from one to the next
 
 
-def mixed(tape: Tape, array: int, size: int, weights: Array) -> list[Number]:
-    """A weighted sum of vectors of some size that are in an argument one after the other."""
-    out: list[Number] = [0.0] * size
-    for j, weight in enumerate(weights):
-        if weight:
-            out = add(out, scale(float(weight), tape.loads(array, j * size, size)))
-    return out
+class StiffStepper(ControlledStepper):
+    """Steps of ROS34PW2, of an error below 1e-8.
 
+    The Jacobian of y' = f(y) is exact for the controller's states and for what forces, friction
+    and passive forces do to the velocities; of coordinates it has what springs, stops, gas and
+    the controller do with them, along the active ones and at frozen gamma; and none for the rest
+    (weight, centrifugal forces, integrals): the order does not depend on it. In the transformed
+    variables u = sum gamma_ij k_j, stage i solves
 
-class StiffStepper(Stepper):
-    """Many steps at once in machine code, by a method that stiff circuits do not shorten.
+        (1 / (h gamma) - J) u_i = f(y + sum a_ij u_j) + sum c_ij / h u_j,
 
-    y' = f(y) is stepped by ROS34PW2 with its own choice of length within each recorded step. The
-    Jacobian is exact for the controller's states and for what forces, friction and passive forces
-    do to the velocities, and zero for the rest (coordinates, centrifugal forces, integrals):
-    the order does not depend on it. In the transformed variables u = sum gamma_ij k_j, stage i
-    solves
+    where u_q = h gamma (r_q + Gamma u_v) with the right side r leaves
 
-        (1 / (h gamma) - J) u_i = f(y + sum a_ij u_j) + sum c_ij / h u_j.
+        [M_A - h gamma D - (h gamma)^2 K] u_v - h gamma B u_o = h gamma (M_A r_v + h gamma K r_qA)
 
-    (Hairer and Wanner, Solving Ordinary Differential Equations II, IV.7.)
+    and the rows of the controller's states o. With circuits J has nothing of coordinates. (Hairer
+    and Wanner, Solving Ordinary Differential Equations II, IV.7.)
 
     Args:
         chart: The machine.
         control: Its controller.
+        states: Number of the controller's states.
 
     Raises:
         TooLongError: It would take too long to compile.
     """
 
-    _control: ValveDrive
-
-    def __init__(self, chart: Chart, control: ValveDrive):
-        self._stiff = int(np.isfinite(control.scales).sum())
-        super().__init__(chart, control, len(control.scales), ("stiff", self._stiff), fold=True)
-        machine = chart.machine
-        units, pace = machine.closure.units, machine.closure.pace
-        self._scales = np.concatenate(
+    def __init__(self, chart: Chart, control: TracedController, states: int):
+        scales = control.scales if isinstance(control, ValveDrive) else np.full(states, _OWN)
+        self._stiff = int(np.isfinite(scales).sum())
+        closure = chart.machine.closure
+        accuracies = np.concatenate(
             [
-                1.0 / (_COORDINATE * units),
-                pace / (_VELOCITY * units[machine.closure.active]),
-                1.0 / control.scales,
+                _COORDINATE * closure.units,
+                _VELOCITY * closure.units[closure.active] / closure.pace,
+                scales,
             ]
         )
-        self._lengths = np.zeros(3)
+        method = ("stiff", self._stiff)
+        super().__init__(chart, control, states, method, True, 1.0 / accuracies)
 
-    def run(self, times: Array, state: Array, step: float, rows: Array) -> int:
-        """See `CompiledStepper.run`."""
-        arguments = self._arguments
-        if self._lengths[0] != step:
-            self._lengths[:2] = step, 0.01 * step
-        self._lengths[2] = 0.0
-
-        def call(count: int, references: Array, out: Array) -> int:
-            return self._program.call(
-                "run", count, self._fast.close_address, *arguments, references, state,
-                out, self._lengths, self.bounds, self._scales,
-            )  # fmt: skip
-
-        return in_blocks(call, self._control, times, step, rows)
-
-    @property
-    def event(self) -> float:
-        """See `CompiledStepper.event`."""
-        return float(self._lengths[2])
-
-    def _trace(self, tape: Tape, state: int, theta: int | None) -> tuple[Traced, At]:
-        """The machine at a state, its references between three rows or in one."""
-        control, columns = self._control, self._columns
-        machine = machine_at(self._chart, tape, self._state, state)
-        settings = settings_of(control, tape, 2, fold=True)
-        rows = [tape.loads(3, columns * row, columns) for row in range(3)]
-        reference = rows[0]
-        if theta is not None:
-            # the parabola through the rows at 0, 1/2, 1
-            s = tape.load(theta, 0)
-            shares = ((2.0 * s - 1.0) * (s - 1.0), 4.0 * s * (1.0 - s), s * (2.0 * s - 1.0))
-            reference = [dot(shares, values) for values in zip(*rows, strict=True)]
-        return machine, machine.seen(settings, reference)
-
-    def _build(self, program: Program) -> None:
-        control = self._control
+    def _add_method(self, program: Program) -> None:
+        """combine(s, u), prepare(..., h), solve(rate, u, factors, h) of stages; finish; dense."""
         for added, rest in self._rests:
-            machine, at = self._trace(Tape(), 5, 4)
-            tau, own_rate = control.trace(at)
-            moved, slopes = machine.moved(tau, rest), machine.sweep.slopes
-            rate = [*slopes, *moved.a_a, *own_rate, *machine.powers(tau)]
-            program.add(f"rate{added}", 6, {"rate": rate, "margin": [moved.margin]})
-            machine, at = self._trace(Tape(), 4, None)
-            tau, _ = control.trace(at)
-            seen = [*machine.observed(tau, rest), *control.look(at)]
-            margin = machine.moved(tau, rest).margin
-            program.add(f"observe{added}", 5, {"seen": seen, "margin": [margin]})
             self._add_solves(program, added, rest)
-        self._add_sums(program)
-        self._add_run(program)
-
-    def _add_run(self, program: Program) -> None:
-        """run: recorded steps of length h[0], each in as many parts as their error asks for.
-
-        h[1] is the length to try next; h[2] how far behind the last recorded instant a joint has
-        started or stopped, if one has.
-        """
-        size, seen, columns = self._state.size, self._seen.size, self._columns
-        names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds", "scales")
-        with program.routine("run", counts=("steps",), functions=("close",), arrays=names) as r:
-            following = r.array("following", program.outputs("finish"))
-            u = r.array("u", STAGES * size)
-            stage, slope = r.array("stage", size), r.array("slope", program.outputs("rate"))
-            looked = r.array("looked", program.outputs("observe"))
-            # the last has the most
-            factors = r.array("factors", program.outputs("prepare" + self._rests[-1][0]))
-            result = r.array("result", self._fast.outputs("newton"))
-            theta, part = r.array("theta", 1), r.array("part", 1)
-            whole = r.let(r.h[0])
-            with r.loop(r.steps) as i:
-                refs, row = r.refs.row(i, 2 * columns), r.out.row(i, size + seen)
-                machine = (r.geometry, r.numbers, r.control, refs)
-                r.copy(row, r.state, size)
-                self._call(r, "observe", *machine, r.state, looked)
-                if self._sticks:
-                    with r.when(looked["margin"] < -NEAR):
-                        r.store(r.h, 2, whole)
-                        r.give(i)
-                r.copy(row.at(size), looked, seen)
-                t = r.let(0.0)
-                with r.forever():
-                    left, proposed = r.let(whole - t), r.let(r.h[1])
-                    last = r.let(proposed >= left * _NEARLY)
-                    length = r.let(select(last, left, proposed))
-                    with r.when(~(length >= whole * _SHORTEST)):
-                        r.give(i)
-                    r.store(part, 0, length)
-                    r.store(theta, 0, t / whole)
-                    self._call(r, "prepare", *machine, theta, r.state, part, factors)
-                    for k in range(STAGES):
-                        r.store(theta, 0, (t + length * float(ALPHA[k].sum())) / whole)
-                        r.call(f"combine{k}", r.state, u, stage)
-                        self._call(r, "rate", *machine, theta, stage, slope)
-                        if self._sticks and k == 0:
-                            with r.when((slope["margin"] < -NEAR) & (t > 0.0)):
-                                r.store(r.h, 2, t)
-                                r.give(i + 1)
-                        self._call(r, f"solve{k}", slope, u, factors, part, u.at(k * size))
-                    r.call("finish", r.state, u, r.scales, following)
-                    change = following["change"]
-                    wanted = r.let(length * select(change > 0.0, change, _SLOWER))  # NaN: slower
-                    with r.when(following["error"] <= 1.0):
-                        closed = r.call("close", r.geometry, following, result, r.bounds)
-                        with r.when(closed < 1):
-                            r.give(i)
-                        r.copy(r.state, following, size)
-                        # a last part that was cut short says nothing against the length it was
-                        # cut from
-                        r.store(r.h, 1, select(last & (proposed > wanted), proposed, wanted))
-                        r.set(t, t + length)
-                        with r.when(last):
-                            r.leave()
-                    with r.otherwise():
-                        r.store(r.h, 1, wanted)
-                with r.when(beyond(r, result)):
-                    r.give(i + 1)
-            r.give(r.steps)
+        size, q = self._state.size, self._state.parts["q"]
+        for i in range(1, STAGES):
+            tape = Tape()
+            state = tape.loads(0, 0, size)
+            program.add(f"combine{i}", 2, add(state, mixed(tape, 1, size, _FORWARD[i])))
+        tape = Tape()
+        state = tape.loads(1, 0, size)
+        after = add(state, mixed(tape, 2, size, _FINAL))
+        gap = mixed(tape, 2, size, _FINAL - _SECOND)
+        used = self._state.start("own") + self._stiff
+        shares = [
+            gap[i] / (1.0 / tape.load(3, i) + _RELATIVE * apply("abs", after[i]))
+            for i in range(used)
+        ]
+        # the integrals count only so far as that NaN and infinity anywhere show
+        error = maximum(largest(shares), largest(scale(1e-30, gap[used:])))
+        usable = minimum(maximum(error, 1e-9), 1e9)
+        change = _SAFETY * apply("exp", (-1.0 / 3.0) * apply("log", usable))
+        change = minimum(maximum(change, SLOWER), _FASTER)
+        long = [not turns for turns in self._fast.geometry.revolute[1:]]
+        way = subtract(after[:q], state[:q])
+        move = largest_share(way, long, self._fast.per_size(tape))
+        outputs = {"state": after, "error": [error], "change": [change], "move": [move]}
+        program.add("finish", 4, outputs)
+        # the cubic through both ends and their slopes
+        tape = Tape()
+        h = tape.load(2, 0)
+        way = subtract(tape.loads(3, 0, size), tape.loads(0, 0, size))
+        slopes = [scale(h, tape.loads(array, 0, size)) for array in (1, 4)]
+        parts = *way, *subtract(slopes[0], way), *subtract(scale(2.0, way), add(*slopes))
+        program.add("dense", 5, list(parts))
 
     def _add_solves(self, program: Program, added: str, rest: bool) -> None:
         """prepare(..., h): elimination of 1 - h gamma J, rows of the velocities times M_A.
@@ -224,70 +126,82 @@ class StiffStepper(Stepper):
         they have in `rate`, whatever the Jacobian says: a row Gamma x = Gamma b for each of them.
         """
         tape = Tape()
-        machine, at = self._trace(tape, 5, 4)
-        sweep, parts = machine.sweep, machine.parts
-        tau, own_rate = self._control.trace(at)
-        net = machine.forces(tau)
-        unknown = [x for x in (*parts.own[: self._stiff], *parts.v_a) if isinstance(x, Expression)]
-        jacobian = derivatives([*own_rate[: self._stiff], *net], unknown)
-        reach = GAMMA * tape.load(6, 0)
-        matrix = [[-1.0 * (reach * entry) for entry in row] for row in jacobian]
-        for i in range(self._stiff):
+        machine, _, tau, own_rate = self._driven(tape)
+        sweep, parts, stiff = machine.sweep, machine.parts, self._stiff
+        own_rate, mass, n = list(own_rate[:stiff]), sweep.mass, len(parts.v_a)
+        reach = GAMMA * tape.load(5, 0)
+        unknown = [x for x in (*parts.own[:stiff], *parts.v_a) if isinstance(x, Expression)]
+        jacobian = derivatives([*own_rate, *machine.forces(tau)], unknown)
+        by_q: Matrix = [[0.0] * n for _ in range(stiff + n)]
+        ways: Matrix = [[0.0] * n for _ in parts.q]
+        if not self._short:  # sums of oil and strokes stay what they are where J has neither
+            by_q = [scale(reach, row) for row in machine.stiffness(own_rate, tau)]
+            ways = [scale(reach, row) for row in sweep.ways]
+        matrix = [scale(-1.0 * reach, row) for row in jacobian]
+        for i in range(stiff):
             matrix[i][i] = matrix[i][i] + 1.0
-        for i, row in enumerate(sweep.mass):
+        for i, row in enumerate(mass):
             for j, entry in enumerate(row):
-                at_row = matrix[self._stiff + i]
-                at_row[self._stiff + j] = at_row[self._stiff + j] + entry
-        mass, n = sweep.mass, len(parts.v_a)
+                matrix[stiff + i][stiff + j] = matrix[stiff + i][stiff + j] + entry
+        for row, slopes in zip(matrix, by_q, strict=True):
+            for j, slope in enumerate(slopes):
+                row[stiff + j] = row[stiff + j] - reach * slope
         constraints = sweep.held if rest else []
-        for row in matrix:
-            row += [0.0] * len(constraints)
         kept = [scale(held, row) for held, row in constraints]
+        for row in matrix:
+            row += [0.0] * len(kept)
         for k, row in enumerate(kept):
             for j, entry in enumerate(row):
-                matrix[self._stiff + j][self._stiff + n + k] = entry
-            others: list[Number] = [0.0] * len(constraints)
+                matrix[stiff + j][stiff + n + k] = entry
+            others: list[Number] = [0.0] * len(kept)
             others[k] = constraints[k][0] - 1.0
-            matrix.append([*([0.0] * self._stiff), *row, *others])
+            matrix.append([*([0.0] * stiff), *row, *others])
         factors = eliminated(matrix)
-        outputs = {"factors": stored(factors), "mass": stored(mass), "rows": stored(kept)}
-        program.add(f"prepare{added}", 7, outputs)
+        tables: dict[str, Matrix] = {
+            "factors": factors, "mass": mass, "rows": kept, "by_q": by_q, "ways": ways,
+            "free": [sweep.free] if rest else [[1.0] * n],
+        }  # fmt: skip
+        outputs = {name: stored(table) for name, table in tables.items()}
+        program.add(f"prepare{added}", 6, outputs)
         starts = program.outputs(f"prepare{added}")
-        size, stiff = self._state.size, self._stiff
+        size, active = self._state.size, self._chart.machine.closure.active
         for i in range(STAGES):
             tape = Tape()
             right = scale(GAMMA * tape.load(3, 0), tape.loads(0, 0, size))
             right = add(right, scale(GAMMA, mixed(tape, 1, size, _BACKWARD[i])))
-            there = loaded(factors, tape, 2, 0)
-            inertia = loaded(mass, tape, 2, starts.start("mass"))
-            rows = loaded(kept, tape, 2, starts.start("rows"))
+            there = {
+                name: loaded(table, tape, 2, starts.start(name)) for name, table in tables.items()
+            }
             part = self._state.view(right)
-            wanted = [*part.own[:stiff], *times(inertia, part.v_a), *times(rows, part.v_a)]
-            x = substituted(there, wanted)[: stiff + n]
+            pulls = times(there["by_q"], [part.q[column] for column in active])
+            wanted = add([*part.own[:stiff], *times(there["mass"], part.v_a)], pulls)
+            x = substituted(there["factors"], [*wanted, *times(there["rows"], part.v_a)])
+            v_a = [w * y for w, y in zip(there["free"][0], x[stiff : stiff + n], strict=True)]
             own = [*x[:stiff], *part.own[stiff:]]
-            solved = [*part.q, *x[stiff:], *own, *part.work, *part.lost]
-            program.add(f"solve{i}{added}", 4, solved)
+            q = add(part.q, times(there["ways"], v_a))
+            program.add(f"solve{i}{added}", 4, [*q, *v_a, *own, *part.work, *part.lost])
 
-    def _add_sums(self, program: Program) -> None:
-        """combine(s, u) of each stage, and finish(s, u, scales)."""
-        size, stiff = self._state.size, self._stiff
-        for i in range(STAGES):
-            tape = Tape()
-            state = tape.loads(0, 0, size)
-            program.add(f"combine{i}", 2, add(state, mixed(tape, 1, size, _FORWARD[i])))
-        tape = Tape()
-        state = tape.loads(0, 0, size)
-        after = add(state, mixed(tape, 1, size, _FINAL))
-        gap = mixed(tape, 1, size, _FINAL - _SECOND)
-        used = self._state.start("own") + stiff
-        shares = [
-            gap[i] / (1.0 / tape.load(2, i) + _RELATIVE * apply("abs", after[i]))
-            for i in range(used)
-        ]
-        # the integrals count only so far as that NaN and infinity anywhere show
-        error = maximum(largest(shares), largest(scale(1e-30, gap[used:])))
-        usable = minimum(maximum(error, 1e-9), 1e9)
-        change = _SAFETY * apply("exp", (-1.0 / 3.0) * apply("log", usable))
-        change = minimum(maximum(change, _SLOWER), _FASTER)
-        after = wrapped(self._chart, after)
-        program.add("finish", 3, {"state": after, "error": [error], "change": [change]})
+    def _made(self, program: Program, step: Attempt) -> tuple[Way, Way]:
+        """See `ControlledStepper`."""
+        r, size = step.r, self._state.size
+        u, stage = r.array("u", STAGES * size), r.array("stage", size)
+        slope = r.array("slope", program.outputs("rate"))
+        # the last has the most
+        factors = r.array("factors", program.outputs("prepare" + self._rests[-1][0]))
+
+        def attempt(t: Value, length: Value) -> None:
+            step.call("prepare", t, r.state, step.length, factors)
+            for k in range(STAGES):
+                now = step.first
+                if k:
+                    now = slope
+                    r.call(f"combine{k}", r.state, u, stage)
+                    step.call("rate", t + length * float(ALPHA[k].sum()), stage, slope)
+                self._call(r, f"solve{k}", now, u, factors, step.length, u.at(k * size))
+            r.call("finish", r.geometry, r.state, u, r.tol, step.following)
+
+        def interpolate(t: Value, length: Value) -> None:
+            ends = step.first, step.length, step.following, step.ending
+            r.call("dense", r.state, *ends, step.inside)
+
+        return attempt, interpolate

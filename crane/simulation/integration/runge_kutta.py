@@ -41,7 +41,7 @@ class CompiledStepper(Stepper):
     def _build(self, program: Program) -> None:
         for added, rest in self._rests:
             for name in ("observe", "rate"):
-                machine, tau, own_rate = self._driven(Tape())
+                machine, _, tau, own_rate = self._driven(Tape())
                 moved = machine.moved(tau, rest)
                 slopes, powers = machine.sweep.slopes, machine.powers(tau)
                 outputs = {"rate": [*slopes, *moved.a_a, *own_rate, *powers]}

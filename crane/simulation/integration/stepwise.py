@@ -37,15 +37,22 @@ class PythonStepper:
         self.layout = state_layout(chart.machine, own)
         self.limits, self.margin = chart.limits, 1.0
 
-    def settle(self, time: float, state: Array) -> None:
+    def settle(self, time: float, state: Array, seen: Array | None = None) -> None:
         """Find which joints stick at a state, whose velocities are made those of rest.
+
+        Args:
+            time: [s].
+            state: Then.
+            seen: What is observed there, if that is known.
 
         Raises:
             HaltedError: The loops cannot be closed, or the passive joints are not determined.
         """
         at, chart = self.layout.view(state), self._chart
         try:
-            tau, _ = self._asked(time, at, chart.velocities(at.q, at.v_a))
+            tau = np.zeros(0) if seen is None else seen[: len(chart.seen)]
+            if seen is None:
+                tau, _ = self._asked(time, at, chart.velocities(at.q, at.v_a))
             forces = chart.forces(at.q, tau)
             at.v_a[:] = chart.sticking.settle(self._dynamics, at.q, at.v_a, forces)
         except ClosureError as error:

@@ -92,26 +92,26 @@ class Sticking:
         Returns:
             (n,) velocities, in which what is at rest is so to the last bit.
         """
-        closure, here = dynamics.machine.closure, self.columns
-        gamma, v, drift = closure.motion(q, v_a)
-        rest: Indices = np.flatnonzero(np.abs(v[here]) * self._pace <= AT_REST)
-        mass = dynamics.at("mass matrix", q, v_a, tau).reshape(len(v_a), len(v_a))
+        closure, n, k = dynamics.machine.closure, len(v_a), len(self.columns)
+        parts = dynamics.at("resting", q, v_a, tau)
+        mass, rows = parts[: n * n].reshape(n, n), parts[n * n : n * (n + k)].reshape(k, n)
+        v = rows @ v_a
+        rest: Indices = np.flatnonzero(np.abs(v) * self._pace <= AT_REST)
         half = np.linalg.cholesky(mass).astype(np.float64)
-        rows = gamma[here]
         if len(rest) and v_a.any():
-            v_a = self._stopped(closure, half, rest, rows[rest], v[here][rest], v_a)
-            gamma, v, drift = closure.motion(q, v_a)
-        self.slip[:] = np.sign(v[here])
+            v_a = self._stopped(closure, half, rest, rows[rest], v[rest], v_a)
+            v = rows @ v_a
+        self.slip[:] = np.sign(v)
         self.held[:], self.moving = False, True
         self.slip[rest], self.settled = 0.0, True
         self.tell(dynamics)
         if not len(rest):
             return v_a
-        friction = dynamics.at("observation", q, v_a, tau)[: len(v_a)]
-        net = np.linalg.solve(half, tau - dynamics.at("bias", q, v_a, tau) - friction)
+        parts = dynamics.at("resting", q, v_a, tau)
+        drift, net = parts[n * (n + k) : -n], np.linalg.solve(half, parts[-n:])
         limits = self._limits[rest]
         reach = np.linalg.solve(half, rows[rest].T) * limits
-        bent = np.linalg.lstsq(reach.T, limits * drift[here][rest], rcond=None)[0]
+        bent = np.linalg.lstsq(reach.T, limits * drift[rest], rcond=None)[0]
         shares = _bounded(reach, net + bent)
         holding = np.flatnonzero(np.abs(shares) < _FULL)
         independent, rank = _independent(reach[:, holding] * (1.0 - np.abs(shares[holding])))

@@ -82,7 +82,10 @@ class Switching:
         return 0.0
 
     def _step(self, time: float, state: Array, length: float) -> tuple[Array, float]:
-        """The state after one step of some length, and the margin there."""
+        """The state after one step of some length, and the margin there.
+
+        Not needed of methods that find events within their steps.
+        """
         raise NotImplementedError
 
     def _look(self, time: float, state: Array) -> tuple[Array, float]:
@@ -96,16 +99,20 @@ class Switching:
         if not self._sticking.columns:
             return
         if not self._sticking.settled:
-            self.slow.settle(time, state)
+            self._settle(time, state)
+            return
         self._sticking.tell(self._dynamics)
         if self._code is not None:
             self._code.adopt()
 
     def _settle(self, time: float, state: Array) -> None:
         """Find anew what sticks at a state."""
-        self.slow.settle(time, state)
-        if self._code is not None:
-            self._code.adopt()
+        if self._code is None:
+            self.slow.settle(time, state)
+            return
+        self._code.adopt()
+        self.slow.settle(time, state, self._code.observe(time, state)[0])
+        self._code.adopt()
 
     def _switched(self, time: float, state: Array, length: float, step: float) -> float:
         """Go on to where a joint starts or stops within a step.
@@ -122,6 +129,23 @@ class Switching:
         Raises:
             HaltedError: Joints start and stop without end.
         """
+        self._count(time, state, step)
+        before, (_, behind) = self._look(time, state)[1], self._step(time, state, length)
+        if before < -NEAR:
+            later = 0.0
+        else:
+            later, state[:] = located(
+                lambda part: self._step(time, state, part), before, length, behind
+            )
+        self._settle(time + later, state)
+        return later
+
+    def _count(self, time: float, state: Array, step: float) -> None:
+        """Count a joint that starts or stops.
+
+        Raises:
+            HaltedError: Joints start and stop without end.
+        """
         if time > self._since + step:
             self._since, self._switches = time, 0
         self._switches += 1
@@ -132,15 +156,6 @@ class Switching:
                 f" joints stick and slip more than {_MOST} times within {step:g} s",
                 ": forces that jump with the sign of a velocity fight their friction, smooth them",
             )
-        before, (_, behind) = self._look(time, state)[1], self._step(time, state, length)
-        if before < -NEAR:
-            later = 0.0
-        else:
-            later, state[:] = located(
-                lambda part: self._step(time, state, part), before, length, behind
-            )
-        self._settle(time + later, state)
-        return later
 
     def _left(self, offset: float, step: float) -> float:
         """An offset, zero if it is next to nothing."""

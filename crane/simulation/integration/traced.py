@@ -9,6 +9,7 @@ from crane.closure import rotations
 from crane.closure.compiled import FastClosure
 from crane.closure.traced import Constants
 from crane.codegen import Expression, Layout, Number, Parts, Program, Tape, Value
+from crane.codegen.derivative import derivatives
 from crane.codegen.representation import Array as Place
 from crane.codegen.representation import Routine
 from crane.codegen.scalar import add, dot, subtract
@@ -71,6 +72,27 @@ class Traced:
         forces = self.chart.traced_forces(self.sweep.gamma, tau)
         return subtract(add(forces, self.sweep.passive), self.sweep.friction)
 
+    def stiffness(self, own_rate: Sequence[Number], tau: Sequence[Number]) -> list[list[Number]]:
+        """What rates of a controller's states and forces along the chart change with q_B.
+
+        At frozen gamma, without weight and what moves.
+
+        Args:
+            own_rate: (k,) of the controller.
+            tau: (n,) of the controller.
+
+        Returns:
+            (k + n, n).
+        """
+        gamma, seen = self.sweep.gamma, [x for x in self.q_a if isinstance(x, Expression)]
+        outputs = [*own_rate, *self.chart.traced_forces(gamma, tau)]
+        rows = derivatives(outputs, seen)
+        if not self.chart.own:
+            columns = list(zip(*(gamma[i + 1] for i in self.chart.seen.tolist()), strict=True))
+            rows = [[dot(row, column) for column in columns] for row in rows]
+        passive = zip(rows[len(own_rate) :], self.sweep.stiffness, strict=True)
+        return [*rows[: len(own_rate)], *(add(one, other) for one, other in passive)]
+
     def powers(self, tau: Sequence[Number]) -> list[Number]:
         """What a controller's forces put in and friction and dampers take out [W]."""
         return [dot(tau, self.v_a), self.sweep.dissipation]
@@ -125,7 +147,7 @@ class Stepper:
         self._fast, self._numbers = machine.closure.fast, chart.dynamics.numbers
         self._chart, self._control = chart, control
         self.bounds = np.concatenate([self._fast.bounds, chart.limits, [0.0]])
-        self._columns = columns_of(control)
+        self._columns, self._fold = columns_of(control), fold
         self._sticks = bool(chart.sticking.columns)
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
         form = form_of(control, self._columns, len(machine.active), states, fold)
@@ -138,12 +160,15 @@ class Stepper:
         """Add formulas and routines."""
         raise NotImplementedError
 
-    def _driven(self, tape: Tape) -> tuple[Traced, Sequence[Number], Sequence[Number]]:
-        """Machine, forces and rates of the controller; references and state are 3 and 4."""
+    def _driven(self, tape: Tape) -> tuple[Traced, At, Sequence[Number], Sequence[Number]]:
+        """Machine, what the controller sees, its forces and rates.
+
+        References and state are the arguments 3 and 4.
+        """
         machine = machine_at(self._chart, tape, self._state, 4)
-        settings = settings_of(self._control, tape, 2, fold=False)
-        reference = tape.loads(3, 0, self._columns)
-        return machine, *self._control.trace(machine.seen(settings, reference))
+        settings = settings_of(self._control, tape, 2, self._fold)
+        at = machine.seen(settings, tape.loads(3, 0, self._columns))
+        return machine, at, *self._control.trace(at)
 
     @property
     def width(self) -> int:
