@@ -75,7 +75,7 @@ def test_info_has_the_whole_home_posture_and_the_path(mini):
 def test_version_and_units_in_help():
     assert typed("--version").stdout == f"crane {crane.__version__}\n"
     text = " ".join(typed("simulate", "-h").stdout.split())
-    assert "In seconds; that of the task" in text and "integration in seconds" in text
+    assert "In seconds; that of the task" in text and "recorded instants in seconds" in text
 
 
 @pytest.mark.parametrize("arguments", [["list"], ["info", "ur5_robot"], ["--version"]])

@@ -61,7 +61,9 @@ def test_one_law_gives_the_same_in_numbers_and_traced(page, name):
         def __call__(self, *seen):
             return law(*seen)
 
-    runs = [crane.simulate(machine, one, start, duration=0.05) for one in (law, Called())]
+    runs = [
+        crane.simulate(machine, one, start, duration=0.05, method="rk4") for one in (law, Called())
+    ]
     assert np.abs(runs[0].q - runs[1].q).max() < 1e-12
     scale = np.abs(runs[0].tau).max(axis=0)
     assert (np.abs(runs[0].tau - runs[1].tau).max(axis=0) < 1e-9 * scale).all()
@@ -74,13 +76,16 @@ def test_settings_reuse_machine_code_and_other_numbers_do_not(page, monkeypatch)
     monkeypatch.setattr(
         CompiledStepper, "_build", lambda x, program: made.append(x) or build(x, program)
     )
-    tighter = crane.simulate(machine, page["Fast"](machine, trajectory, 0.5 * most), duration=0.2)
+    tighter = crane.simulate(
+        machine, page["Fast"](machine, trajectory, 0.5 * most), duration=0.2, method="rk4"
+    )
     assert not made
     assert (np.abs(tighter.tau).max(axis=0) == 0.5 * most).any()
     start, damping = trajectory.position(0.0), np.diag([0.05, 500.0, 500.0])
     stronger = page["Shaken"](machine, np.array([0.8, 40.0, 40.0]), damping)
     one, two = (
-        crane.simulate(machine, law, start, duration=0.1) for law in (page["shaken"], stronger)
+        crane.simulate(machine, law, start, duration=0.1, method="rk4")
+        for law in (page["shaken"], stronger)
     )
     assert len(made) == 1
     swing = [r.tau[:, 0] + damping[0, 0] * r.v[:, 0] - page["weight"][0] for r in (one, two)]

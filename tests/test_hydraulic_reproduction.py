@@ -310,7 +310,8 @@ def test_circuit_finds_friction(tmp_path):
     circuit.friction_strokes(tmp_path, 0.0)
     result = typed(
         "circuit", "patu655", tmp_path / "logger.csv", "--joint", "X_lift", "--model", "friction",
-        "--set", f"payload.mass={experiment.LOAD}", *LOCKED,
+        "--set", f"payload.mass={experiment.LOAD}", "--set", "friction.X_lift.smoothing=0.001",
+        *LOCKED,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     assert re.search(r"^coulomb +210 ", result.stdout, re.M)

@@ -9,6 +9,12 @@ import crane.codegen.program
 import crane.simulation.integration
 from crane.common.errors import SimulationError
 
+
+def simulate(*arguments, method="rk4", **settings):
+    """By steps that can be counted."""
+    return crane.simulate(*arguments, method=method, **settings)
+
+
 pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 
 
@@ -126,11 +132,11 @@ def test_machine_code_python_and_pinocchio_step_alike(forwarder, path, steps, na
     if name == "pi":  # not at rest, with an offset
         start = path(0.0)[0] + [0.1, 0.001, -0.0005]
         settings["initial"] = (start, np.array([0.3, 0.01, -0.005]))
-    compiled = crane.simulate(forwarder, control, **settings)
+    compiled = simulate(forwarder, control, **settings)
     assert steps == {"compiled": 200, "python": 0}
-    python = crane.simulate(forwarder, InPython(plain), **settings)
+    python = simulate(forwarder, InPython(plain), **settings)
     assert steps == {"compiled": 200, "python": 200}
-    pinocchio = crane.simulate(forwarder, control, **settings, backend="pinocchio")
+    pinocchio = simulate(forwarder, control, **settings, backend="pinocchio")
     assert steps == {"compiled": 200, "python": 400}
     assert np.ptp(compiled.q, axis=0).max() > 1e-4  # it moves
     assert off(compiled, python) < 1e-10
@@ -143,7 +149,7 @@ def test_machine_code_python_and_pinocchio_step_alike(forwarder, path, steps, na
 def test_other_machines_step_alike(name, steps, request):
     machine = crane.load(name) if name == "ur5_robot" else request.getfixturevalue(name)
     runs = [
-        crane.simulate(machine, control, duration=0.05, backend=backend)
+        simulate(machine, control, duration=0.05, backend=backend)
         for control, backend in (
             (None, "compiled"),
             (InPython(crane.control.Free(machine)), "compiled"),
@@ -156,8 +162,8 @@ def test_other_machines_step_alike(name, steps, request):
 
 def test_energies_are_integrated_alike_and_balance(forwarder, path, steps):
     control = crane.PI(forwarder, path)
-    one = crane.simulate(forwarder, control, duration=0.4)
-    two = crane.simulate(forwarder, control, duration=0.4, backend="pinocchio")
+    one = simulate(forwarder, control, duration=0.4)
+    two = simulate(forwarder, control, duration=0.4, backend="pinocchio")
     assert steps == {"compiled": 400, "python": 400}
     for name in ("work", "dissipated", "kinetic", "potential"):
         assert np.ptp(one.channels[name]) > 1e-5
@@ -173,7 +179,7 @@ def test_what_dampers_and_end_stops_take_out_is_integrated_alike(springy, steps)
     machine = springy.replace(end_stops=stops)
     start = (np.array([0.0, 0.0295, 0.0005]), np.array([0.5, 0.3, -0.2]))
     one, two = (
-        crane.simulate(machine, None, start, duration=0.05, step=2e-4, backend=backend)
+        simulate(machine, None, start, duration=0.05, step=2e-4, backend=backend)
         for backend in ("compiled", "pinocchio")
     )
     assert steps == {"compiled": 250, "python": 250}
@@ -184,7 +190,7 @@ def test_what_dampers_and_end_stops_take_out_is_integrated_alike(springy, steps)
     energy = one.channels["kinetic"] + one.channels["potential"]
     assert np.abs(energy - energy[0] + lost).max() < 1e-4 * lost[-1]
     machine = springy.replace(end_stops=tuple(crane.EndStop(s.joint, 2e4) for s in stops))
-    elastic = crane.simulate(machine, None, start, duration=0.05, step=2e-4)
+    elastic = simulate(machine, None, start, duration=0.05, step=2e-4)
     assert elastic.channels["dissipated"][-1] < 0.9 * lost[-1]  # the stops' damping counts
 
 
@@ -192,9 +198,9 @@ def test_a_function_moves_as_the_same_law_built_in(forwarder, path, steps):
     gains = {joint: crane.PIGains(g.kp, 0.0) for joint, g in forwarder.control.items()}
     kp = np.array([gains[joint].kp for joint in forwarder.active])
     start = path(0.0)[0]
-    one = crane.simulate(forwarder, crane.PI(forwarder, path, gains), start, duration=0.2)
+    one = simulate(forwarder, crane.PI(forwarder, path, gains), start, duration=0.2)
     assert steps == {"compiled": 200, "python": 0}
-    two = crane.simulate(forwarder, lambda t, q, v: kp * (path(t)[0] - q), start, duration=0.2)
+    two = simulate(forwarder, lambda t, q, v: kp * (path(t)[0] - q), start, duration=0.2)
     assert steps == {"compiled": 200, "python": 200}
     assert np.abs(one.q - two.q).max() < 1e-12
     np.testing.assert_allclose(one.tau, two.tau, atol=1e-12 * np.abs(one.tau).max(), rtol=0)
@@ -206,12 +212,12 @@ def test_a_function_moves_as_the_same_law_built_in(forwarder, path, steps):
 
 def test_chunks_are_seamless(forwarder, path, steps, monkeypatch):
     control = crane.PI(forwarder, path)
-    whole = crane.simulate(forwarder, control, duration=0.253)
+    whole = simulate(forwarder, control, duration=0.253)
     assert steps["python"] == 0
     for chunk in (1, 7, 11, 252, 253, 254):
         monkeypatch.setattr("crane.simulation.integration.steps._CHUNK", chunk)
         shares = []
-        parts = crane.simulate(forwarder, control, duration=0.253, progress=shares.append)
+        parts = simulate(forwarder, control, duration=0.253, progress=shares.append)
         assert off(parts, whole) < 1e-12
         assert shares == sorted(shares) and shares[-1] == 1.0
         assert len(shares) >= 253 // chunk
@@ -222,16 +228,16 @@ def test_chunks_are_seamless(forwarder, path, steps, monkeypatch):
 def test_durations_around_whole_chunks(springy, steps, count):
     step = 5e-4
     start = [0.1, 0.018, 0.013]
-    recording = crane.simulate(springy, None, start, duration=count * step, step=step)
+    recording = simulate(springy, None, start, duration=count * step, step=step)
     assert steps == {"compiled": count, "python": 0}
     assert len(recording.time) == count + 1 and np.isfinite(traces(recording)).all()
-    half = crane.simulate(springy, None, start, duration=0.2, step=step)
+    half = simulate(springy, None, start, duration=0.2, step=step)
     np.testing.assert_allclose(recording.q[:401], half.q, rtol=0, atol=1e-13)
 
 
 def test_steps_that_machine_code_leaves_are_done_in_python(forwarder, path, monkeypatch):
     control = crane.PI(forwarder, path)
-    whole = crane.simulate(forwarder, control, duration=0.1)
+    whole = simulate(forwarder, control, duration=0.1)
     run = crane.simulation.integration.CompiledStepper.run
     left = []
 
@@ -242,7 +248,7 @@ def test_steps_that_machine_code_leaves_are_done_in_python(forwarder, path, monk
         return run(self, few, *rest)
 
     monkeypatch.setattr(crane.simulation.integration.CompiledStepper, "run", hesitant)
-    parts = crane.simulate(forwarder, control, duration=0.1)
+    parts = simulate(forwarder, control, duration=0.1)
     assert len(left) > 5
     assert off(parts, whole) < 1e-11
 
@@ -257,7 +263,7 @@ def failing(steps, *arguments, **settings):
         assert rounds < 3000, "no step is done any more"
 
     with pytest.raises(SimulationError) as caught:
-        crane.simulate(*arguments, **settings, progress=progress)
+        simulate(*arguments, **settings, progress=progress)
     return str(caught.value)
 
 
@@ -265,7 +271,7 @@ def failing(steps, *arguments, **settings):
 def test_a_branch_that_is_left_is_left_alike(forwarder, steps):
     free = forwarder.replace(friction={}, end_stops=())
     runs = [
-        crane.simulate(free, control, duration=0.1, step=2e-4, backend=backend)
+        simulate(free, control, duration=0.1, step=2e-4, backend=backend)
         for control, backend in (
             (Push(0.0, 200.0, 0.0), "compiled"),
             (InPython(Push(0.0, 200.0, 0.0)), "compiled"),
@@ -316,11 +322,11 @@ def test_long_formulas_step_in_python(steps, monkeypatch):
     start = np.array([0.1, 0.012, 0.016])
     monkeypatch.setattr(crane.codegen.program, "MOST", 10)
     monkeypatch.setattr(crane.closure.compiled, "_SHARED", {})
-    slow = crane.simulate(machine, None, start, duration=0.02)
+    slow = simulate(machine, None, start, duration=0.02)
     assert steps == {"compiled": 0, "python": 20}
     monkeypatch.undo()
     machine = crane.load("mini_forwarder")
-    fast = crane.simulate(machine, None, start, duration=0.02)
+    fast = simulate(machine, None, start, duration=0.02)
     assert off(fast, slow) < 1e-10
 
 
@@ -342,7 +348,7 @@ def test_the_error_against_an_adaptive_method_falls_with_the_fourth_power(spring
     ).y[:, -1]
     errors = []
     for step in (8e-3, 4e-3, 2e-3, 1e-3):
-        recording = crane.simulate(springy, None, START, duration=0.24, step=step)
+        recording = simulate(springy, None, START, duration=0.24, step=step)
         errors.append(np.abs(recording.q[-1] - exact[:3]).max())
         assert np.abs(recording.v[-1] - exact[3:]).max() < 1e3 * errors[-1] + 1e-10
     assert steps["python"] == 0

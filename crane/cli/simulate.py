@@ -52,13 +52,17 @@ def simulate(
     duration: Annotated[
         float | None, typer.Option(help="In seconds; that of the task if not given.")
     ] = None,
-    step: Annotated[float, typer.Option(help="Step of the integration in seconds.")] = 1e-3,
+    step: Annotated[float, typer.Option(help="Between recorded instants in seconds.")] = 1e-3,
     method: Annotated[
         str | None,
         typer.Option(
-            help="rk4, with this step; DOP853, whose steps are as long as their error allows, "
-            "recorded every step; rosenbrock, of circuits; Radau, BDF, LSODA of scipy."
+            help="DOP853, if not given, or Radau for what is stiff: their steps are as long as "
+            "their error allows, and recorded every --step; rosenbrock, of circuits; rk4, with "
+            "this step; BDF, LSODA of scipy."
         ),
+    ] = None,
+    tolerance: Annotated[
+        float | None, typer.Option(help="Error of a step per size of the state, such as 1e-8.")
     ] = None,
     change: Change = None,
     lock: Lock = None,
@@ -83,8 +87,9 @@ def simulate(
             raise InputError(f"{given[0]} does not go with --inputs, leave one out")
         if duration is not None:
             raise InputError("--duration does not go with --inputs, the file ends by itself")
-        if method is not None:
-            raise InputError("--method does not go with --inputs, leave it out")
+        for option, value in {"--method": method, "--tolerance": tolerance}.items():
+            if value is not None:
+                raise InputError(f"{option} does not go with --inputs, leave it out")
         _replay(loaded, inputs, out, step)
         return
     control = _control(loaded, task, controller)
@@ -98,7 +103,7 @@ def simulate(
         with progress_bar("simulating") as progress:
             recording = run(
                 loaded, control, duration=duration, step=step, label=label, method=method,
-                progress=progress,
+                tolerance=tolerance, progress=progress,
             )  # fmt: skip
     except InterruptedRun as cut:
         write_run(out, cut.recording)

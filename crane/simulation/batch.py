@@ -56,6 +56,8 @@ def simulate_batch(
     duration: float | None = None,
     step: float = 1e-3,
     *,
+    method: str | None = None,
+    tolerance: float | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> Batch:
@@ -70,6 +72,8 @@ def simulate_batch(
         initial: B initial states as `simulate` takes them, or None for its default.
         duration: [s]; that of the controller's reference if not given.
         step: [s].
+        method: See `simulate`.
+        tolerance: See `simulate`.
         threads: Number of threads; one per core if not given.
         progress: Called with the finished share, 0 to 1.
 
@@ -102,10 +106,13 @@ def simulate_batch(
         steps = count_steps(control, duration, step)
         if text := reference_beyond(machine, control, steps * step):
             beyond[i] = text
-        time, rows, notes = integrate(Dynamics(machine), control, starts[i], steps, step)
+        dynamics = Dynamics(machine)
+        time, rows, notes = integrate(
+            dynamics, control, starts[i], steps, step, method, tolerance=tolerance
+        )
         energy = np.hstack([rows.kinetic, rows.potential, rows.work, rows.lost])
         q_a = rows.q[:, machine.closure.active]
-        doubts = [*notes, *said(machine, time, rows, step, fixed(control, None))]
+        doubts = [*notes, *said(machine, time, rows, step, fixed(dynamics, control, method))]
         return time, q_a, rows.v_a, rows.tau, energy, "; ".join(doubts)
 
     results: dict[int, _Result] = {}

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +35,7 @@ from crane.simulation.integration.controlled import ControlledStepper
 from crane.simulation.integration.controlled_steps import ControlledSteps
 from crane.simulation.integration.explicit import ExplicitStepper
 from crane.simulation.integration.halt import HaltedError, explained
+from crane.simulation.integration.radau import RadauStepper
 from crane.simulation.integration.rosenbrock import StiffStepper
 from crane.simulation.integration.state import row_layout
 from crane.simulation.integration.steps import Steps
@@ -42,11 +44,16 @@ from crane.simulation.recorded import recorded
 
 _MOST = 4_000_000  # steps of one recording
 _ENERGIES = 2  # of the state: work, lost
+_FINEST, _COARSEST = 1e-13, 1e-2  # tolerances
 
 Force = Callable[[float, Array, Array], Array]
-Stepper = Callable[[Chart, TracedController, int], ControlledStepper]
+Stepper = Callable[..., ControlledStepper]
 Progress = Callable[[float], None]
-_CONTROLLED: dict[str, Stepper] = {"DOP853": ExplicitStepper, "rosenbrock": StiffStepper}
+_CONTROLLED: dict[str, Stepper] = {
+    "DOP853": ExplicitStepper,
+    "Radau": RadauStepper,
+    "rosenbrock": StiffStepper,
+}
 
 
 class InterruptedRun(KeyboardInterrupt):
@@ -71,6 +78,7 @@ def simulate(
     label: str = "",
     backend: str = "compiled",
     method: str | None = None,
+    tolerance: float | None = None,
     formulation: str = "exact",
     progress: Progress | None = None,
 ) -> Recording:
@@ -95,11 +103,14 @@ def simulate(
         step: [s].
         label: Name of the motion to put into the recording, as its `task`.
         backend: "compiled" or "pinocchio", see `Dynamics`.
-        method: "rk4"; "rosenbrock" for hydraulic machines, see `StiffStepper`; "DOP853", whose
-            steps are as long as an error of 1e-11 of the state allows, in machine code where the
-            controller is (`ExplicitStepper`), else scipy's; or another of scipy's adaptive
-            methods ("Radau", "LSODA", ...) with relative tolerance 1e-9. What is between their
-            steps is recorded every `step`. If not given, the one that the controller asks for.
+        method: "DOP853", explicit of order 8 (`ExplicitStepper`); "Radau", implicit of order 5 for
+            what is stiff (`RadauStepper`); "rosenbrock", of order 3, the one for circuits
+            (`StiffStepper`): their steps are as long as the error allows, and what is between them
+            is recorded every `step`. "rk4", of order 4 with this step. "RK23", "RK45", "BDF",
+            "LSODA" are scipy's, as are DOP853 and Radau for controllers in Python. If not given,
+            rosenbrock with valves, DOP853 in machine code, rk4 in Python.
+        tolerance: Error of a step per size of the state; 1e-11 for DOP853, 1e-8 for rosenbrock,
+            1e-9 for others if not given.
         formulation: "exact" or "decoupled", see `Dynamics`.
         progress: Called with the finished share, 0 to 1.
 
@@ -129,7 +140,9 @@ def simulate(
     if text := reference_beyond(machine, control, steps * step):
         warnings.warn(text, CraneWarning, stacklevel=2)
     dynamics = Dynamics(machine, formulation, backend)
-    time, rows, notes = integrate(dynamics, control, initial, steps, step, method, progress)
+    time, rows, notes = integrate(
+        dynamics, control, initial, steps, step, method, progress, tolerance
+    )
     for note in notes:
         warnings.warn(note, CraneWarning, stacklevel=2)
     if len(time) <= steps:
@@ -137,7 +150,9 @@ def simulate(
             warnings.warn(text, CraneWarning, stacklevel=2)
         cut = f"cut at {time[-1]:g} s of {steps * step:g} s"
         raise InterruptedRun(recorded(machine, control, time, rows, f"{label} ({cut})".lstrip()))
-    for text in said(machine, time, rows, step, fixed(control, method), formulation == "exact"):
+    for text in said(
+        machine, time, rows, step, fixed(dynamics, control, method), formulation == "exact"
+    ):
         warnings.warn(text, CraneWarning, stacklevel=2)
     return recorded(machine, control, time, rows, label)
 
@@ -150,6 +165,7 @@ def integrate(
     step: float,
     method: str | None = None,
     progress: Progress | None = None,
+    tolerance: float | None = None,
 ) -> tuple[Array, Parts, list[str]]:
     """What `simulate` computes, without channels; see there for arguments and errors.
 
@@ -161,6 +177,7 @@ def integrate(
         step: [s].
         method: See `simulate`.
         progress: See `simulate`.
+        tolerance: See `simulate`.
 
     Returns:
         Times (N,), what `crane.simulation.integration.row_layout` names, (N, .) each, and what is
@@ -175,7 +192,7 @@ def integrate(
     except ClosureError as error:
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
     state = np.concatenate([posture, v_a, own, np.zeros(_ENERGIES)])
-    make = _integration(machine, control, len(own), method)
+    make = _integration(dynamics, control, len(own), method, tolerance)
     chart = Chart.of(dynamics)
     integration = ChartedSteps(chart, control, len(own), make)
     layout = row_layout(machine, control, len(own))
@@ -203,9 +220,17 @@ def integrate(
     return times, layout.view(rows), [*integration.notes, *chart.sticking.notes]
 
 
-def fixed(control: Controller, method: str | None) -> bool:
+def fixed(dynamics: Dynamics, control: Controller, method: str | None) -> bool:
     """Whether a method makes steps of the recorded length."""
-    return method == "rk4" or (method is None and not isinstance(control, ValveDrive))
+    return (method or _usual(dynamics, control)) == "rk4"
+
+
+def _usual(dynamics: Dynamics, control: Controller) -> str:
+    """The method if none is named."""
+    if isinstance(control, ValveDrive):
+        return "rosenbrock"
+    traced = dynamics.backend == "compiled" and isinstance(control, TracedController)
+    return "DOP853" if traced else "rk4"
 
 
 def _own_start(control: Controller, dynamics: Dynamics, q: Array) -> Array:
@@ -216,40 +241,47 @@ def _own_start(control: Controller, dynamics: Dynamics, q: Array) -> Array:
 
 
 def _integration(
-    machine: Machine, control: Controller, own: int, method: str | None
+    dynamics: Dynamics, control: Controller, own: int, named: str | None, tolerance: float | None
 ) -> Callable[[Chart], Way]:
-    """What integrates by a method, or by that which the controller asks for."""
-    valves = isinstance(control, ValveDrive)
-    method = method or ("rosenbrock" if valves else "rk4")
+    """What integrates by a method, or by the usual one."""
+    valves, method = isinstance(control, ValveDrive), named or _usual(dynamics, control)
     if method not in ("rk4", "rosenbrock", *ADAPTIVE):
-        known_ones = known(("rk4", "rosenbrock", *ADAPTIVE), method)
-        raise InputError(f"method '{method}' is unknown, {known_ones}")
+        every = known(("rk4", "rosenbrock", *ADAPTIVE), method)
+        raise InputError(f"method '{method}' is unknown, {every}")
     if isinstance(control, ValveDrive) and control.period and method != "rosenbrock":
         raise InputError(
             f"method '{method}' does not call the valves' program, leave the method out"
         )
+    options: dict[str, float] = {}
+    if tolerance is not None:
+        options["tolerance"] = as_number(tolerance, "the tolerance", "", above=0)
+        if method == "rk4" or not _FINEST <= tolerance <= _COARSEST:
+            raise InputError(
+                "method 'rk4' has no tolerance, its error is that of its step: name another"
+                if method == "rk4"
+                else f"the tolerance is {tolerance:g}, give {_FINEST:g} to {_COARSEST:g}"
+            )
     if method == "rk4":
         return lambda chart: Steps(chart, control, own)
-    steppers = {"rosenbrock": StiffStepper} if valves else _CONTROLLED
-    return lambda chart: _controlled(chart, control, own, method, steppers.get(method))
+    stepper = _CONTROLLED.get(method) if not valves or method == "rosenbrock" else None
 
+    def make(chart: Chart) -> Way:
+        """Machine code, or scipy where there is none."""
+        compiled = stepper is not None and chart.dynamics.backend == "compiled"
+        if compiled and isinstance(control, TracedController):
+            assert stepper is not None
+            with suppress(TooLongError):
+                return ControlledSteps(chart, control, own, partial(stepper, **options))
+        if isinstance(control, ValveDrive) and control.period:
+            raise InputError("a program with a period runs on the compiled backend alone")
+        if named is None and not valves:
+            return Steps(chart, control, own)
+        if chart.machine.coordinates.floating:
+            raise InputError("scipy's methods do not go round with a body that floats, take rk4")
+        scipys = "BDF" if method == "rosenbrock" else method
+        return AdaptiveSteps(chart, control, own, scipys, **options)
 
-def _controlled(
-    chart: Chart, control: Controller, own: int, method: str, stepper: Stepper | None
-) -> Way:
-    """A method that chooses its steps: machine code, or scipy where there is none."""
-    if (
-        stepper is not None
-        and chart.dynamics.backend == "compiled"
-        and isinstance(control, TracedController)
-    ):
-        with suppress(TooLongError):
-            return ControlledSteps(chart, control, own, stepper)
-    if isinstance(control, ValveDrive) and control.period:
-        raise InputError("a program with a period runs on the compiled backend alone")
-    if chart.machine.coordinates.floating:
-        raise InputError("scipy's methods do not go round with a body that floats, take rk4")
-    return AdaptiveSteps(chart, control, own, "BDF" if method == "rosenbrock" else method)
+    return make
 
 
 def as_controller(controller: Controller | Command | Force | None, machine: Machine) -> Controller:

@@ -51,6 +51,10 @@ class Fourier(Trajectory):
         self.duration = self.periods * self.period + 2 * self.lead
         self.tip = None
 
+    def breaks(self) -> Array:
+        """See `Trajectory`."""
+        return np.array([0.0, self.lead, self.duration - self.lead, self.duration])
+
     def turns(self) -> Array:
         """See `Trajectory`: so dense that the largest is missed by 1e-4 of its harmonic's."""
         shortest = self.period / self.harmonics

@@ -206,8 +206,8 @@ def _slow(machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastes
     for i, joint in enumerate(machine.active):
         law = machine.friction.get(joint)
         if law is not None:
-            slow = law.smoothing or (_RESTING[machine.unit(joint)] if law.sticks else 0.0)
-            near = _SETTLED * (max(law.stribeck, law.smoothing) if law.stiction else slow)
+            turns = law.smoothing or (_RESTING[machine.unit(joint)] if law.sticks else 0.0)
+            near = _SETTLED * (max(law.stribeck, law.smoothing) if law.stiction else turns)
             out[i] = max(out[i], min(near, _MOVING * fastest[i]))
     if isinstance(slow, Mapping):
         for joint, value in slow.items():

@@ -18,7 +18,8 @@ from crane.simulation.integration.switching import Switching
 # of a passive joint in rad and shares of the machine's size per `Closure.pace`: where the branch
 # ends they grow beyond bounds
 _FASTEST = 300.0
-_ACCURACY = 1e-11  # that matters, likewise; of all else in SI units
+TOLERANCE = 1e-9  # error of a step, per size of the state
+_ACCURACY = 1e-2  # of that what matters, likewise; of all else in SI units
 ADAPTIVE = ("RK23", "RK45", "DOP853", "Radau", "BDF", "LSODA")
 
 
@@ -30,9 +31,18 @@ class AdaptiveSteps(Switching):
         control: Its controller.
         own: Number of the controller's states.
         method: One of `ADAPTIVE`.
+        tolerance: Error of a step, per size of the state.
     """
 
-    def __init__(self, chart: Chart, control: Controller, own: int, method: str):
+    def __init__(
+        self,
+        chart: Chart,
+        control: Controller,
+        own: int,
+        method: str,
+        tolerance: float = TOLERANCE,
+    ):
+        self._tolerance = tolerance
         super().__init__(chart, control, own, None)
         self._chart, self._closure, self._method = chart, chart.machine.closure, method
         self._next = 0.0
@@ -77,11 +87,11 @@ class AdaptiveSteps(Switching):
                 q[:] = closure.solve(q[closure.active])
             return self.slow.observe(time, closed)[0]
 
-        enough = np.full(len(state), _ACCURACY)
+        enough = np.full(len(state), _ACCURACY * self._tolerance)
         view(enough).q[:] *= units
         view(enough).v_a[:] *= units[closure.active] / pace
         method: Any = getattr(integrate, self._method)
-        solver = method(rate, begun, state.copy(), end, rtol=1e-9, atol=enough)
+        solver = method(rate, begun, state.copy(), end, rtol=self._tolerance, atol=enough)
         before = self.slow.margin
         while solver.status == "running":
             with np.errstate(all="ignore"):  # where a trial explodes the method gives up by itself

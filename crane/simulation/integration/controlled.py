@@ -10,7 +10,7 @@ import numpy as np
 from crane.codegen import Number, Program, Tape, Value, select
 from crane.codegen.representation import Array as Place
 from crane.codegen.representation import Routine
-from crane.codegen.scalar import add, dot, scale
+from crane.codegen.scalar import add, dot, maximum, scale
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.simulation.integration.charts import Chart
@@ -19,6 +19,7 @@ from crane.simulation.integration.traced import HELD, Stepper, beyond, wrapped
 
 SPACING = 5e-4  # [s] between the instants that references are known at, at most
 SLOWER = 0.2  # change of the step's length from one to the next, at least
+_ROUND = 2.5  # [rad] of a step, of bodies that float
 _ROWS = 1000  # pairs of references of a call
 _FOLLOWED = 0.02  # way of a step beyond whose end the loops may not close: rad, machine's size
 _AFTER = 0.2  # of a step's length, the first behind an event
@@ -186,6 +187,11 @@ class ControlledStepper(Stepper):
         tape = Tape()
         program.add("wrap", 1, wrapped(self._chart, tape.loads(0, 0, size)))
         self._add_run(program)
+
+    def _followed(self, error: Number, move: Number) -> Number:
+        """An error, above 1 where a floating body turns so far that nobody knows how often."""
+        floating = self._chart.machine.coordinates.floating
+        return maximum(error, move * (1.0 / _ROUND)) if floating else error
 
     @abstractmethod
     def _add_method(self, program: Program) -> None:

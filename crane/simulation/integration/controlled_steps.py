@@ -33,7 +33,7 @@ class ControlledSteps(Switching):
         chart: Chart,
         control: TracedController,
         own: int,
-        stepper: Callable[[Chart, TracedController, int], ControlledStepper],
+        stepper: Callable[..., ControlledStepper],
     ):
         self._fast = stepper(chart, control, own)
         super().__init__(chart, control, own, self._fast)

@@ -72,12 +72,13 @@ class ExplicitStepper(ControlledStepper):
             third = third + other * share * (other * share)
         below = maximum(fifth + 0.01 * third, 1e-300)
         error = apply("abs", h) * fifth / apply("sqrt", below * float(used))
-        usable = minimum(maximum(error, 1e-9), 1e9)
-        change = _SAFETY * apply("exp", (-1.0 / 8.0) * apply("log", usable))
-        change = minimum(maximum(change, SLOWER), _FASTER)
         long = [not turns for turns in self._fast.geometry.revolute[1:]]
         rates = tape.loads(2, 0, self._state.parts["q"])
         move = h * largest_share(rates, long, self._fast.per_size(tape))
+        error = self._followed(error, move)
+        usable = minimum(maximum(error, 1e-9), 1e9)
+        change = _SAFETY * apply("exp", (-1.0 / 8.0) * apply("log", usable))
+        change = minimum(maximum(change, SLOWER), _FASTER)
         outputs = {"state": after, "error": [error], "change": [change], "move": [move]}
         program.add("finish", 5, outputs)
         # between the ends: state, slopes there, behind it

@@ -36,14 +36,14 @@ _FORWARD = ALPHA @ _INVERSE
 _BACKWARD = np.diag(np.diag(_INVERSE)) - _INVERSE
 _FINAL, _SECOND = WEIGHTS @ _INVERSE, EMBEDDED @ _INVERSE
 
-_RELATIVE = 1e-8  # accuracy of a step, per size of the state
+TOLERANCE = 1e-8  # error of a step, per size of the state
 # accuracy that matters [rad], [machine's size], that per `Closure.pace`, and of a law's states
 _COORDINATE, _VELOCITY, _OWN = 1e-11, 1e-9, 1e-9
 _FASTER, _SAFETY = 6.0, 0.9  # change of the step's length from one to the next
 
 
 class StiffStepper(ControlledStepper):
-    """Steps of ROS34PW2, of an error below 1e-8.
+    """Steps of ROS34PW2.
 
     The Jacobian of y' = f(y) is exact for the controller's states and for what forces, friction
     and passive forces do to the velocities; of coordinates it has what springs, stops, gas and
@@ -64,12 +64,15 @@ class StiffStepper(ControlledStepper):
         chart: The machine.
         control: Its controller.
         states: Number of the controller's states.
+        tolerance: Error of a step, per size of the state.
 
     Raises:
         TooLongError: It would take too long to compile.
     """
 
-    def __init__(self, chart: Chart, control: TracedController, states: int):
+    def __init__(
+        self, chart: Chart, control: TracedController, states: int, tolerance: float = TOLERANCE
+    ):
         scales = control.scales if isinstance(control, ValveDrive) else np.full(states, _OWN)
         self._stiff = int(np.isfinite(scales).sum())
         closure = chart.machine.closure
@@ -81,7 +84,8 @@ class StiffStepper(ControlledStepper):
             ]
         )
         method = ("stiff", self._stiff)
-        super().__init__(chart, control, states, method, True, 1.0 / accuracies)
+        errors = np.append(TOLERANCE / tolerance / accuracies, tolerance)
+        super().__init__(chart, control, states, method, True, errors)
 
     def _add_method(self, program: Program) -> None:
         """combine(s, u), prepare(..., h), solve(rate, u, factors, h) of stages; finish; dense."""
@@ -97,18 +101,20 @@ class StiffStepper(ControlledStepper):
         after = add(state, mixed(tape, 2, size, _FINAL))
         gap = mixed(tape, 2, size, _FINAL - _SECOND)
         used = self._state.start("own") + self._stiff
+        relative = tape.load(3, size - 2)
         shares = [
-            gap[i] / (1.0 / tape.load(3, i) + _RELATIVE * apply("abs", after[i]))
+            gap[i] / (1.0 / tape.load(3, i) + relative * apply("abs", after[i]))
             for i in range(used)
         ]
         # the integrals count only so far as that NaN and infinity anywhere show
         error = maximum(largest(shares), largest(scale(1e-30, gap[used:])))
-        usable = minimum(maximum(error, 1e-9), 1e9)
-        change = _SAFETY * apply("exp", (-1.0 / 3.0) * apply("log", usable))
-        change = minimum(maximum(change, SLOWER), _FASTER)
         long = [not turns for turns in self._fast.geometry.revolute[1:]]
         way = subtract(after[:q], state[:q])
         move = largest_share(way, long, self._fast.per_size(tape))
+        error = self._followed(error, move)
+        usable = minimum(maximum(error, 1e-9), 1e9)
+        change = _SAFETY * apply("exp", (-1.0 / 3.0) * apply("log", usable))
+        change = minimum(maximum(change, SLOWER), _FASTER)
         outputs = {"state": after, "error": [error], "change": [change], "move": [move]}
         program.add("finish", 4, outputs)
         # the cubic through both ends and their slopes
