@@ -21,6 +21,7 @@ from crane.description.inertia import inertia_problem
 _MARGIN = 1e-4  # smallest eigenvalue of X
 _TOLERANCES = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-9}  # met or nearly
 _CAREFUL = {"max_step_fraction": 0.9, "static_regularization_constant": 1e-7}
+_SLOWLY = {"max_step_fraction": 0.7, "tol_gap_abs": 1e-7, "tol_gap_rel": 1e-7, "tol_feas": 1e-7}
 _SINGULAR = 1e-10  # smallest over largest eigenvalue of a prior, its lengths scaled to one
 
 
@@ -149,7 +150,7 @@ def feasible(
         cost += 2 * prior_weight * scale**2 * (cp.trace(x) - cp.log_det(x) - 4)
         constraints.append(x >> _MARGIN * np.eye(4))
     problem = cp.Problem(cp.Minimize(cp.sum_squares(scale * model) + cost), constraints)
-    for tolerances in (_TOLERANCES, {}, _CAREFUL):  # its own where ours are out of reach
+    for tolerances in (_TOLERANCES, {}, _CAREFUL, _SLOWLY):  # its own where ours are out of reach
         with suppress(cp.SolverError):  # told below
             problem.solve(solver=cp.CLARABEL, **tolerances)
             break
