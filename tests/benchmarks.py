@@ -142,3 +142,29 @@ def governor(folder):
     machine = machine.driven_by(("spin", "collar"))
     stiff = crane.ForceElement("collar", 8e5, -np.cos(lean), 4e4)
     return machine.replace(forces=(stiff,))
+
+
+def bricard(folder, active="j0"):
+    """Six bars of 1 m and 1 kg along the edges of a cube, one of them fixed: overconstrained."""
+    corners = np.array([
+        [0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 1], [0, -1, 1], [0, 0, 1],
+    ], dtype=float)  # fmt: skip
+    axes = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 0]])
+    parts, before, here = [], "base", np.zeros(3)
+    for i in range(5):
+        way = corners[i + 1] - corners[i]
+        across = (1 - way**2) / 12 + 1e-6
+        place_of = " ".join(f"{x:g}" for x in way / 2)
+        parts.append(
+            f'<link name="bar{i}"><inertial><origin xyz="{place_of}"/><mass value="1"/><inertia '
+            f'ixx="{across[0]:.17g}" iyy="{across[1]:.17g}" izz="{across[2]:.17g}" ixy="0" '
+            'ixz="0" iyz="0"/></inertial></link>'
+        )
+        parts.append(joint(f"j{i}", before, f"bar{i}", corners[i] - here, axis=axes[i]))
+        before, here = f"bar{i}", corners[i]
+    parts += [
+        place("far", "bar4", corners[5] - corners[4]),
+        place("near", "base", corners[5]),
+        loop("j5", "near", "far", axes[5]),
+    ]
+    return load(folder, "bricard", parts, {f"j{i}": 0.0 for i in range(5)}, active)

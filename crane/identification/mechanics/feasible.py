@@ -21,7 +21,7 @@ from crane.description.inertia import inertia_problem
 _MARGIN = 1e-4  # smallest eigenvalue of X
 _TOLERANCES = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-9}  # met or nearly
 _CAREFUL = {"max_step_fraction": 0.9, "static_regularization_constant": 1e-7}
-_SLOWLY = {"max_step_fraction": 0.7, "tol_gap_abs": 1e-7, "tol_gap_rel": 1e-7, "tol_feas": 1e-7}
+_SPLITTING = {"eps": 1e-7, "max_iters": 20000}
 _SINGULAR = 1e-10  # smallest over largest eigenvalue of a prior, its lengths scaled to one
 
 
@@ -150,9 +150,12 @@ def feasible(
         cost += 2 * prior_weight * scale**2 * (cp.trace(x) - cp.log_det(x) - 4)
         constraints.append(x >> _MARGIN * np.eye(4))
     problem = cp.Problem(cp.Minimize(cp.sum_squares(scale * model) + cost), constraints)
-    for tolerances in (_TOLERANCES, {}, _CAREFUL, _SLOWLY):  # its own where ours are out of reach
+    # its own tolerances where ours are out of reach, and a solver that needs no factors where
+    # columns do the same
+    ways = *((cp.CLARABEL, x) for x in (_TOLERANCES, {}, _CAREFUL)), (cp.SCS, _SPLITTING)
+    for solver, options in ways:
         with suppress(cp.SolverError):  # told below
-            problem.solve(solver=cp.CLARABEL, **tolerances)
+            problem.solve(solver=solver, **options)
             break
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
         raise CraneError(
