@@ -139,3 +139,22 @@ def test_inverse_dynamics_at_a_dead_centre_is_one_line(tmp_path):
         crane.simulate(machine, controller("computed-torque", machine, path))
     text = str(caught.value)
     assert "'s' comes to a dead centre" in text and "\n" not in text
+
+
+@pytest.mark.parametrize("rod", [2.0, 1.3])
+def test_postures_follow_a_recorded_stroke_through_dead_centres(tmp_path, rod):
+    """From the slider alone: where it turns the crank goes on, three times round."""
+    crank = singular.slider_crank(tmp_path, "a", 1.0, rod)
+    found = run(crank, "a", 3.0, 5.0, step=2e-3)
+    wanted = singular.postures(crank, found)
+    assert np.ptp(wanted[:, crank.column("a")]) > 6 * np.pi
+    slider = crank.seen_from(crank.home, ("s",)).closure
+    stroke = wanted[:, [crank.column("s")]]
+    postures = slider.follow(stroke)
+    assert slider.residual(postures).max() < 1e-12
+    assert np.abs(postures - wanted).max() < 1e-4
+    # a stroke says nothing of the crank to first order there: errors of e are sqrt(e)
+    noise = 1e-6 * np.random.default_rng(0).normal(size=stroke.shape)
+    assert np.abs(slider.follow(stroke + noise) - wanted).max() < 5 * np.sqrt(1e-6)
+    with pytest.raises(crane.CraneError, match="sample 1: the motion does not go on to it"):
+        slider.follow(stroke[:2] - [[0.0], [5.0]])

@@ -211,3 +211,18 @@ def test_methods_and_backends_agree(mini):
         some = fixed.channels[name][:501]
         assert python.channels[name] == pytest.approx(some, abs=1e-9 * np.abs(some).max())
     assert 0 < (fixed.v[:501] == 0).mean() < 1
+
+
+def test_a_boom_on_closed_valves_stays_for_an_hour():
+    """Without leakage, with 211 kg at its tip: nothing moves, and no pressure changes."""
+    tight = {
+        f"cylinder.{joint}.leakage_{side}": 0.0
+        for joint in ("slew", "X_lift", "X_tilt", "X_ext")
+        for side in "ab"
+    }
+    machine = crane.load("patu655", {"payload.mass": 211.4, **tight})
+    found = run(machine, None, None, 3600.0, 0.5)
+    assert (found.q == found.q[0]).all() and (found.v == 0).all()
+    for name, values in found.channels.items():
+        if name.startswith("pressure"):
+            assert np.ptp(values) == 0, name

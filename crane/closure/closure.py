@@ -13,6 +13,7 @@ from crane.closure.branch import Branch
 from crane.closure.choice import Choice, condition, proposals, scales
 from crane.closure.compiled import Cursor, FastClosure
 from crane.closure.equations import LoopEquations
+from crane.closure.following import followed
 from crane.closure.home import Sought, settle
 from crane.closure.structure import Structure
 from crane.codegen import TooLongError, carefully
@@ -214,6 +215,29 @@ class Closure:
             return out
         self._close(np.atleast_2d(targets), np.atleast_2d(out), stacked=targets.ndim == 2)
         return out
+
+    def follow(self, q_a: ArrayLike, guess: ArrayLike | None = None) -> Array:
+        """Closed postures along a recorded motion, also behind its dead centres.
+
+        `solve` keeps to the branch of home. A motion that passes a dead centre of its active
+        joints leaves it, while q_A turns and comes back; here postures go on as the motion does.
+
+        Args:
+            q_a: (N, n) active coordinates, from sample to sample as dense as the motion is smooth.
+            guess: (nq,) near the first posture; home if not given.
+
+        Returns:
+            (N, nq).
+
+        Raises:
+            InputError: Wrong shape or not finite.
+            ClosureError: The loops do not close, or the motion does not go on.
+        """
+        targets = as_samples(q_a, len(self.active), "q_a", self.active_names)
+        if targets.ndim != 2 or not len(targets):
+            raise InputError("q_a is no motion, give (N, n) samples")
+        first = self.solve(targets[0], guess)
+        return followed(self.equations, self.active, scales(self.model), targets, first)
 
     def _close(self, targets: Array, out: Array, stacked: bool) -> None:
         """Close the loops at targets (N, n) into out (N, nq)."""
