@@ -10,7 +10,7 @@ import numpy as np
 from crane.codegen import Number, Program, Tape, Value, select
 from crane.codegen.representation import Array as Place
 from crane.codegen.representation import Routine
-from crane.codegen.scalar import add, dot, maximum, scale
+from crane.codegen.scalar import add, apply, dot, maximum, scale
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.simulation.integration.charts import Chart
@@ -18,6 +18,8 @@ from crane.simulation.integration.sticking import NEAR
 from crane.simulation.integration.traced import HELD, Stepper, beyond, wrapped
 
 SPACING = 5e-4  # [s] between the instants that references are known at, at most
+LEAST = 0.1  # what is taken for no smaller: rad, machine's size, per `Closure.pace`
+ENERGY = 1e3  # times the tolerance, of energies
 SLOWER = 0.2  # change of the step's length from one to the next, at least
 _ROUND = 2.5  # [rad] of a step, of bodies that float
 _ROWS = 1000  # pairs of references of a call
@@ -57,6 +59,25 @@ class Attempt:
     length: Place
     following: Place
     inside: Place
+
+
+def energy_of(chart: Chart) -> float:
+    """Of a machine as heavy and as fast as this one [J]."""
+    closure = chart.machine.closure
+    mass = sum(inertia.mass for inertia in chart.machine.model.inertias)
+    return float(mass * (closure.size / closure.pace) ** 2)
+
+
+def errors_of(chart: Chart, states: int, tolerance: float) -> Array:
+    """(k + 1,) least errors that matter of all states, and the tolerance they are of.
+
+    Work and dissipation, which nothing depends on, count `ENERGY` times less.
+    """
+    closure = chart.machine.closure
+    rates = closure.units[closure.active] / closure.pace
+    energies = np.full(2, ENERGY * energy_of(chart))
+    every = np.concatenate([closure.units, rates, np.ones(states), energies])
+    return tolerance * np.append(LEAST * every, 1.0)
 
 
 def mixed(tape: Tape, array: int, size: int, weights: Array) -> list[Number]:
@@ -187,6 +208,17 @@ class ControlledStepper(Stepper):
         tape = Tape()
         program.add("wrap", 1, wrapped(self._chart, tape.loads(0, 0, size)))
         self._add_run(program)
+
+    def _shares(
+        self, tape: Tape, array: int, one: list[Number], other: list[Number]
+    ) -> list[Number]:
+        """One over the errors that matter of all states between two, by `errors_of`."""
+        out: list[Number] = []
+        for i, (x, y) in enumerate(zip(one, other, strict=True)):
+            size = maximum(apply("abs", x), apply("abs", y))
+            size = size if i < self._state.start("work") else ENERGY * size
+            out.append(1.0 / maximum(tape.load(array, i), tape.load(array, len(one)) * size))
+        return out
 
     def _followed(self, error: Number, move: Number) -> Number:
         """An error, above 1 where a floating body turns so far that nobody knows how often."""

@@ -5,26 +5,27 @@ interpolant of order 7 (Hairer, Norsett and Wanner, Solving Ordinary Differentia
 II.5 and II.6; the coefficients are scipy's).
 """
 
-import numpy as np
-
 from crane.closure.traced import largest_share
 from crane.codegen import Number, Program, Tape, Value
 from crane.codegen.scalar import add, apply, maximum, minimum, scale, subtract
 from crane.control import TracedController
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.controlled import SLOWER, Attempt, ControlledStepper, Way, mixed
+from crane.simulation.integration.controlled import (
+    SLOWER,
+    Attempt,
+    ControlledStepper,
+    Way,
+    errors_of,
+    mixed,
+)
 
 STAGES, MORE = 12, 3  # of a step, and for what is between its ends
 TOLERANCE = 1e-11  # error of a step, per size of the state
-_LEAST = 0.1  # what is taken for no smaller: rad, machine's size, per `Closure.pace`
 _FASTER, _SAFETY = 5.0, 0.9  # change of the step's length from one to the next
 
 
 class ExplicitStepper(ControlledStepper):
-    """See above; `tolerance` is (k + 1,).
-
-    It has the least error that matters of coordinates, velocities and the controller's states,
-    and the error of a step, per size of the state.
+    """See above; `tolerance` is that of `errors_of`.
 
     Args:
         chart: The machine.
@@ -42,10 +43,8 @@ class ExplicitStepper(ControlledStepper):
         from scipy.integrate import DOP853
 
         self._method = DOP853
-        closure = chart.machine.closure
-        rates = closure.units[closure.active] / closure.pace
-        least = _LEAST * np.concatenate([closure.units, rates, np.ones(states), [1.0 / _LEAST]])
-        super().__init__(chart, control, states, ("explicit",), False, tolerance * least)
+        errors = errors_of(chart, states, tolerance)
+        super().__init__(chart, control, states, ("explicit",), False, errors)
 
     def _add_method(self, program: Program) -> None:
         """stage1(s, k, h) to stage11, more0 to more2; finish(numbers, s, k, h, tol); dense."""
@@ -59,19 +58,14 @@ class ExplicitStepper(ControlledStepper):
         tape = Tape()
         state, h = tape.loads(1, 0, size), tape.load(3, 0)
         after = add(state, scale(h, mixed(tape, 2, size, method.B)))
-        used = self._state.start("own") + self._state.parts["own"]
         fifth: Number = 0.0
         third: Number = 0.0
         gaps = mixed(tape, 2, size, method.E5), mixed(tape, 2, size, method.E3)
-        for i, (one, other) in enumerate(zip(*gaps, strict=True)):
-            if i >= used:
-                break
-            size_of = maximum(apply("abs", state[i]), apply("abs", after[i]))
-            share = 1.0 / maximum(tape.load(4, i), tape.load(4, used) * size_of)
+        for one, other, share in zip(*gaps, self._shares(tape, 4, state, after), strict=True):
             fifth = fifth + one * share * (one * share)
             third = third + other * share * (other * share)
         below = maximum(fifth + 0.01 * third, 1e-300)
-        error = apply("abs", h) * fifth / apply("sqrt", below * float(used))
+        error = apply("abs", h) * fifth / apply("sqrt", below * float(size))
         long = [not turns for turns in self._fast.geometry.revolute[1:]]
         rates = tape.loads(2, 0, self._state.parts["q"])
         move = h * largest_share(rates, long, self._fast.per_size(tape))

@@ -14,7 +14,13 @@ from crane.codegen.scalar import add, apply, dot, maximum, minimum, scale, subtr
 from crane.common.samples import Array
 from crane.control import TracedController
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.controlled import SLOWER, Attempt, ControlledStepper, Way
+from crane.simulation.integration.controlled import (
+    SLOWER,
+    Attempt,
+    ControlledStepper,
+    Way,
+    errors_of,
+)
 
 TOLERANCE = 1e-9  # error of a step, per size of the state
 _ROOT = np.sqrt(6.0)
@@ -45,8 +51,7 @@ POWERS = np.array([
 STAGES = 3
 Pair = tuple[Number, Number]
 """A complex number."""
-_LEAST = 0.1  # what is taken for no smaller: rad, machine's size, per `Closure.pace`
-_NUDGE = 1e-7  # of the same, by which derivatives are taken
+_NUDGE = 1e-7  # of rad, machine's size, per `Closure.pace`, by which derivatives are taken
 _TRIES, _CLOSE = 8, 1e-3  # of Newton's method; what is left then, per error of a step
 _QUICK = 1e-3  # rate of its convergence with which derivatives stay as they are
 _FASTER, _SAFETY = 8.0, 0.9  # change of the step's length from one to the next
@@ -54,7 +59,7 @@ _BETWEEN = 0.07  # of how far slopes at the beginning are off, what interpolatio
 
 
 class RadauStepper(ControlledStepper):
-    """See above; `tolerance` is that of `ExplicitStepper`, and the nudges of v_A, q_A, own.
+    """See above; `tolerance` is that of `errors_of`, and the nudges of v_A, q_A, own.
 
     Derivatives are differences of the compiled rates along v_A, along the ways dq/dv_A that it
     moves the joints, and along the controller's states. With T = dq'/dv_A, G = dq'/dq_A and a
@@ -82,10 +87,9 @@ class RadauStepper(ControlledStepper):
         closure = chart.machine.closure
         active = closure.units[closure.active]
         rates = active / closure.pace
-        least = _LEAST * np.concatenate([closure.units, rates, np.ones(states), [1.0 / _LEAST]])
         self._n, self._own = len(active), states
         nudges = _NUDGE * np.concatenate([rates, active, np.ones(states)])
-        both = np.concatenate([tolerance * least, nudges])
+        both = np.concatenate([errors_of(chart, states, tolerance), nudges])
         super().__init__(chart, control, states, ("radau",), False, both)
 
     @property
@@ -141,7 +145,7 @@ class RadauStepper(ControlledStepper):
     @property
     def _start(self) -> int:
         """Where the nudges are in `tolerance`."""
-        return self._state.parts["q"] + self._n + self._own + 1
+        return self._state.size + 1
 
     def _add_jacobian(self, program: Program) -> None:
         """jacobian(first, by v and own, by q, mass, tol)."""
@@ -315,17 +319,6 @@ class RadauStepper(ControlledStepper):
             "Z": [x for row in Z for x in row],
             "stages": [x for row in Z for x in add(state, row)],
         }
-
-    def _shares(
-        self, tape: Tape, array: int, one: list[Number], other: list[Number]
-    ) -> list[Number]:
-        """One over the errors that matter, of coordinates, velocities and own."""
-        used = self._state.start("own") + self._own
-        out: list[Number] = []
-        for i in range(used):
-            size = maximum(apply("abs", one[i]), apply("abs", other[i]))
-            out.append(1.0 / maximum(tape.load(array, i), tape.load(array, used) * size))
-        return out
 
     def _add_ends(self, program: Program) -> None:
         """estimate(J, real, rate, Z, h); finish(numbers, state, Z, e, first, h, tol); dense(Z)."""

@@ -9,7 +9,16 @@ from crane.codegen.factors import Matrix, eliminated, loaded, stored, substitute
 from crane.codegen.scalar import add, apply, minimum, scale, subtract, times
 from crane.control import TracedController, ValveDrive
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.controlled import SLOWER, Attempt, ControlledStepper, Way, mixed
+from crane.simulation.integration.controlled import (
+    ENERGY,
+    LEAST,
+    SLOWER,
+    Attempt,
+    ControlledStepper,
+    Way,
+    energy_of,
+    mixed,
+)
 
 # ROS34PW2 of Rang and Angermann (2005): order 3 with any Jacobian, L-stable, stiffly accurate,
 # with an embedded method of order 2.
@@ -84,7 +93,8 @@ class StiffStepper(ControlledStepper):
             ]
         )
         method = ("stiff", self._stiff)
-        errors = np.append(TOLERANCE / tolerance / accuracies, tolerance)
+        energy = LEAST * ENERGY * tolerance * energy_of(chart)
+        errors = np.append(TOLERANCE / tolerance / accuracies, [tolerance, 1.0 / energy])
         super().__init__(chart, control, states, method, True, errors)
 
     def _add_method(self, program: Program) -> None:
@@ -106,7 +116,13 @@ class StiffStepper(ControlledStepper):
             gap[i] / (1.0 / tape.load(3, i) + relative * apply("abs", after[i]))
             for i in range(used)
         ]
-        # the integrals count only so far as that NaN and infinity anywhere show
+        if not self._short:
+            shares += [
+                gap[i]
+                / (1.0 / tape.load(3, size - 1) + ENERGY * relative * apply("abs", after[i]))
+                for i in range(size - 2, size)
+            ]
+        # the other integrals count only so far as that NaN and infinity anywhere show
         error = maximum(largest(shares), largest(scale(1e-30, gap[used:])))
         long = [not turns for turns in self._fast.geometry.revolute[1:]]
         way = subtract(after[:q], state[:q])
