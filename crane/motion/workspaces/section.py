@@ -76,8 +76,10 @@ def slewing(machine: Machine, frame: str) -> tuple[int, Array] | None:
     at = machine.coordinates.configuration(machine.home)
     jacobian = pin.computeJointJacobians(model, data, at).reshape(6, -1)
     for i, name in enumerate(machine.active):
-        joint = model.getJointId(name)
         column = machine.column(name)
+        if not model.existJointName(name):  # one of those of a body that floats
+            continue
+        joint = model.getJointId(name)
         axis = jacobian[3:, column]
         if (
             model.parents[joint] == 0

@@ -19,7 +19,7 @@ from crane.simulation.integration.traced import HELD, Stepper, beyond, wrapped
 
 SPACING = 5e-4  # [s] between the instants that references are known at, at most
 LEAST = 0.1  # what is taken for no smaller: rad, machine's size, per `Closure.pace`
-ENERGY = 1e3  # times the tolerance, of energies
+ENERGY = 10.0  # times the tolerance, of energies
 SLOWER = 0.2  # change of the step's length from one to the next, at least
 _ROUND = 2.5  # [rad] of a step, of bodies that float
 _ROWS = 1000  # pairs of references of a call

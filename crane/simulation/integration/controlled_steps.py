@@ -6,7 +6,7 @@ from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.controlled import ControlledStepper
+from crane.simulation.integration.controlled import SPACING, ControlledStepper
 from crane.simulation.integration.halt import HaltedError
 from crane.simulation.integration.stepwise import Progress
 from crane.simulation.integration.switching import Switching
@@ -68,7 +68,8 @@ class ControlledSteps(Switching):
             self._next = first + step * self.done
             if self._fast.event:
                 self._count(self._next + self.offset, state, step)
-                self._settle(self._next + self.offset, state)
+                # what refers to time is asked behind a jump, as steps that begin there do
+                self._settle(self._next + self.offset + _SAME * min(step, SPACING), state)
                 self.offset = self._left(self.offset, step)
             elif count < len(chunk) or self.offset < 0:
                 if self.slow.steep(state):

@@ -58,6 +58,28 @@ _FASTER, _SAFETY = 8.0, 0.9  # change of the step's length from one to the next
 _BETWEEN = 0.07  # of how far slopes at the beginning are off, what interpolation is
 
 
+class Shift:
+    """An eigenvalue over the length of a step, as formulas, and one over it.
+
+    Args:
+        name: "real" or "complex".
+        h: Length of the step.
+
+    Attributes:
+        complex: Whether it is.
+        value: Real and imaginary part.
+        inverse: Likewise.
+    """
+
+    def __init__(self, name: str, h: Number):
+        self.complex = name == "complex"
+        a, b = COMPLEX if self.complex else (REAL, 0.0)
+        size = a * a + b * b
+        per: Number = 1.0 / h
+        self.value: Pair = (a * per, b * per)
+        self.inverse: Pair = (a / size * h, -b / size * h)
+
+
 class RadauStepper(ControlledStepper):
     """See above; `tolerance` is that of `errors_of`, and the nudges of v_A, q_A, own.
 
@@ -137,7 +159,7 @@ class RadauStepper(ControlledStepper):
         for name in ("real", "complex"):
             tape = Tape()
             parts = self._loaded(tape, 0)
-            rows = self._matrix(parts, _shift(name, tape.load(1, 0)))
+            rows = self._matrix(parts, Shift(name, tape.load(1, 0)))
             program.add(f"{name}_factors", 2, [x for row in eliminated(rows) for x in row])
         self._add_newton(program)
         self._add_ends(program)
@@ -193,7 +215,7 @@ class RadauStepper(ControlledStepper):
             out[name] = [flat[i : i + width] for i in range(0, count, width)] if width else []
         return out
 
-    def _matrix(self, parts: dict[str, Matrix], shift: "Shift") -> Matrix:
+    def _matrix(self, parts: dict[str, Matrix], shift: Shift) -> Matrix:
         """The rows of own and v_A, real; the complex one as twice as many real ones."""
         n, k = self._n, self._own
         real: Matrix = []
@@ -228,7 +250,7 @@ class RadauStepper(ControlledStepper):
         ]
 
     def _solved(
-        self, parts: dict[str, Matrix], factors: Matrix, shift: "Shift", right: list[list[Number]]
+        self, parts: dict[str, Matrix], factors: Matrix, shift: Shift, right: list[list[Number]]
     ) -> list[list[Number]]:
         """The x of (mu - J) x = r; real and imaginary parts of both where mu is complex."""
         n, k, active = self._n, self._own, self._chart.machine.closure.active.tolist()
@@ -291,7 +313,7 @@ class RadauStepper(ControlledStepper):
         parts = self._loaded(tape, 1)
         rates = [tape.loads(4, i * size, size) for i in range(STAGES)]
         W = [tape.loads(5, i * size, size) for i in range(STAGES)]
-        real, other = _shift("real", h), _shift("complex", h)
+        real, other = Shift("real", h), Shift("complex", h)
         turned = _combined(INVERSE, rates)
         right = subtract(turned[0], scale(real.value[0], W[0]))
         a, b = other.value
@@ -330,7 +352,7 @@ class RadauStepper(ControlledStepper):
         sums = [dot(ERROR.tolist(), column) for column in zip(*Z, strict=True)]
         right = add(rate, scale(1.0 / h, sums))
         parts, factors = self._loaded(tape, 0), self._factors(tape, 1, 1)
-        (error,) = self._solved(parts, factors, _shift("real", h), [right])
+        (error,) = self._solved(parts, factors, Shift("real", h), [right])
         program.add("estimate", 5, error)
         tape = Tape()
         state, h = tape.loads(1, 0, size), tape.load(5, 0)
@@ -447,22 +469,6 @@ class RadauStepper(ControlledStepper):
             r.call("dense", iterate.at("Z"), step.inside)
 
         return attempt, interpolate
-
-
-class Shift:
-    """mu = eigenvalue / h as formulas: (real, imaginary), and 1 / mu."""
-
-    def __init__(self, name: str, h: Number):
-        self.complex = name == "complex"
-        a, b = COMPLEX if self.complex else (REAL, 0.0)
-        size = a * a + b * b
-        per: Number = 1.0 / h
-        self.value: Pair = (a * per, b * per)
-        self.inverse: Pair = (a / size * h, -b / size * h)
-
-
-def _shift(name: str, h: Number) -> Shift:
-    return Shift(name, h)
 
 
 def _plus(one: Pair, other: Pair) -> Pair:

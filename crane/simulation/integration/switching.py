@@ -22,7 +22,7 @@ class Compiled(Protocol):
 
     @property
     def event(self) -> float:
-        """How long a step in which a joint starts or stops was at most [s], 0 if none has."""
+        """Not 0 where a joint has started or stopped."""
 
     def adopt(self) -> None:
         """See `Stepper.adopt`."""
@@ -34,7 +34,7 @@ class Compiled(Protocol):
 class Switching:
     """What all methods have in common.
 
-    A method writes `_step`.
+    A method that makes steps of a given length writes `_step`.
 
     Args:
         chart: The machine.
