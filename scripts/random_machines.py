@@ -45,7 +45,8 @@ def drawn(seed: int, folder: Path) -> Machine | None:
         if random.random() < 0.6:
             stiction = random.uniform(0, 1) * (random.random() < 0.5)
             friction[joint] = crane.Friction(
-                coulomb=random.uniform(0, 3), stiction=stiction, stribeck=random.uniform(0.01, 0.1),
+                coulomb=random.uniform(0, 3), stiction=stiction,
+                stribeck=random.uniform(0.01, 0.1),
                 viscous=random.uniform(0, 0.5), coulomb_offset=random.uniform(-0.3, 0.3),
             )  # fmt: skip
         if random.random() < 0.3:

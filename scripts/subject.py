@@ -8,7 +8,13 @@ import pinocchio as pin
 import crane
 from crane.codegen import Program
 from crane.control import Law, ValveDrive
-from crane.simulation.integration import Chart, CompiledStepper, StiffStepper, row_layout
+from crane.simulation.integration import (
+    Chart,
+    ControlledSteps,
+    Steps,
+    StiffStepper,
+    row_layout,
+)
 
 Array = np.ndarray
 
@@ -47,7 +53,7 @@ def along(count: int) -> tuple[Array, Array]:
 
 
 class Runner:
-    """The simulation's loop in machine code, from one start.
+    """The simulation's loop in steps of a millisecond, circuits in recorded ones, from one start.
 
     Args:
         machine: The machine.
@@ -59,17 +65,18 @@ class Runner:
     def __init__(self, machine: crane.Machine, control: Law, q_a: Array, v_a: Array):
         own = control.start(q_a)
         self._start = np.concatenate([machine.closure.solve(q_a), v_a, own, np.zeros(2)])
-        self._stepper = (
-            StiffStepper(Chart.of(crane.Dynamics(machine)), control)
+        chart = Chart.of(crane.Dynamics(machine))
+        self._way = (
+            ControlledSteps(chart, control, len(own), StiffStepper)
             if isinstance(control, ValveDrive)
-            else CompiledStepper(Chart.of(crane.Dynamics(machine)), control, len(own))
+            else Steps(chart, control, len(own))
         )
         self._columns = row_layout(machine, control, len(own)).size
 
     def run(self, step: float, steps: int) -> Array:
         """The state after so many steps."""
         state, out = self._start.copy(), np.empty((steps, self._columns))
-        done = self._stepper.run(step * np.arange(steps), state, step, out)
+        done = self._way.run(step * np.arange(steps), state, step, out)
         if done < steps:
             raise SystemExit(f"error: the loop stopped at step {done} of {steps}")
         return state
