@@ -103,3 +103,30 @@ def test_tolerances_that_cannot_be(mini):
         with pytest.raises(crane.CraneError) as caught:
             crane.simulate(mini, duration=0.01, method=method, tolerance=tolerance)
         assert text in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("how", "error"),
+    [({}, 4e-9), ({"tolerance": 1e-13}, 2e-10), ({"method": "Radau"}, 1e-8)],
+)
+def test_a_block_between_stops_bounces_as_its_closed_form(tmp_path, how, error):
+    """Straight lines and half sines, for a minute: a stop begins and ends where it does."""
+    stiffness, mass = 1e6, 2.0
+    (tmp_path / "block.urdf").write_text(
+        f"""<robot name="block"><link name="base"/><link name="block"><inertial>
+        <mass value="{mass}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+        </link><joint name="x" type="prismatic"><parent link="base"/><child link="block"/>
+        <axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>"""
+    )
+    machine = crane.load(tmp_path / "block.urdf")
+    machine = machine.replace(end_stops=(crane.EndStop("x", stiffness),))
+    found = crane.simulate(machine, None, (np.zeros(1), np.ones(1)), 60.0, 0.1, **how)
+    omega = np.sqrt(stiffness / mass)
+    contact = np.pi / omega
+    t = np.mod(found.time - 1.0, 2 * (contact + 2.0))  # since the first contact
+    side = np.where(t < contact + 2.0, 1.0, -1.0)
+    t = np.mod(t, contact + 2.0)
+    pressed = 1.0 + np.sin(omega * t) / omega
+    wanted = side * np.where(t < contact, pressed, 1.0 - (t - contact))
+    assert np.abs(found.q[:, 0] - wanted).max() < error
+    assert np.ptp(found.channels["kinetic"] + found.channels["potential"]) < error

@@ -32,6 +32,7 @@ from crane.dynamics.moving import Moving
 from crane.dynamics.recursion import Plan, accelerations
 from crane.machine import Machine
 
+_STOP = 14  # likewise of its stops: stiffness, damping, lower, upper
 _SLIP = 7  # of the numbers of a joint, the first of those that change with the motion
 BODY, JOINT = 10, 22  # numbers per body, and of the law of a joint or distance
 Effects = tuple[Number, Number, Number, Number, Number]
@@ -340,8 +341,8 @@ class Sweep:
         return [(0.0,) * 5, *laws]
 
     @cached_property
-    def _at_lengths(self) -> list[tuple[dict[int, Number], Effects]]:
-        """Of every distance dl/dv by joint, and `_law`; see `crane.dynamics.lengths`.
+    def _at_lengths(self) -> list[tuple[dict[int, Number], Effects, Number]]:
+        """Of every distance dl/dv by joint, `_law`, and itself; see `crane.dynamics.lengths`.
 
         The force along it is a wrench [u; p_2 x u] on the second body, and its reaction on the
         first, so what carries both feels nothing.
@@ -364,14 +365,14 @@ class Sweep:
                 slope = dot(direction, linear) + dot(moment, angular)
                 slopes[i] = slope if i in behind else -slope
             rate = dot(list(slopes.values()), [self.rates[i] for i in slopes])
-            out.append((slopes, self._law(law, length, rate)))
+            out.append((slopes, self._law(law, length, rate), length))
         return out
 
     @cached_property
     def _passive(self) -> Vector:
         """f, passive forces along the joints (nb + 1,)."""
         out = [effects[0] for effects in self._at_joints]
-        for slopes, (force, *_) in self._at_lengths:
+        for slopes, (force, *_), _ in self._at_lengths:
             for i, slope in slopes.items():
                 out[i] = out[i] + force * slope
         return out
@@ -384,7 +385,7 @@ class Sweep:
     def _sum(self, which: int) -> Number:
         """Of what `_law` gives, over all joints and distances."""
         total: Number = 0.0
-        for effects in (*self._at_joints, *(effects for _, effects in self._at_lengths)):
+        for effects in (*self._at_joints, *(effects for _, effects, _ in self._at_lengths)):
             total = total + effects[which]
         return total
 
@@ -392,7 +393,7 @@ class Sweep:
     def stiffness(self) -> list[Vector]:
         """d(gamma^T f)/dq_A of springs, gas, end stops and ropes at frozen gamma (n, n)."""
         along = [(self.gamma[i], self._at_joints[i][4]) for i in range(1, self._size)]
-        for slopes, effects in self._at_lengths:
+        for slopes, effects, _ in self._at_lengths:
             row: Vector = [0.0] * self._n
             for i, slope in slopes.items():
                 row = add(row, scale(slope, self.gamma[i]))
@@ -401,6 +402,21 @@ class Sweep:
         for row, stiffness in along:
             for k, entry in enumerate(row):
                 out[k] = add(out[k], scale(entry * stiffness, row))
+        return out
+
+    def edges(self, units: Sequence[float]) -> Vector:
+        """How far what stops is beyond where it begins to, each over its unit.
+
+        Args:
+            units: (nb,) of the joints; ropes count like the first.
+        """
+        out: Vector = []
+        for law, q, unit in zip(self._laws, self._q, units, strict=True):
+            if law[_STOP] != 0.0:
+                out += [(q - law[_STOP + 3]) * (1.0 / unit), (law[_STOP + 2] - q) * (1.0 / unit)]
+        for numbers, (_, _, length) in zip(self._span_numbers, self._at_lengths, strict=True):
+            if numbers[_STOP] != 0.0:
+                out.append((length - numbers[_STOP + 3]) * (1.0 / units[0]))
         return out
 
     @property

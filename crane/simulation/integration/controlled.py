@@ -10,7 +10,7 @@ import numpy as np
 from crane.codegen import Number, Program, Tape, Value, select
 from crane.codegen.representation import Array as Place
 from crane.codegen.representation import Routine
-from crane.codegen.scalar import add, apply, dot, maximum, scale
+from crane.codegen.scalar import add, apply, dot, maximum, minimum, scale, with_sign_of
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.simulation.integration.charts import Chart
@@ -189,7 +189,10 @@ class ControlledStepper(Stepper):
             machine, _, tau, own_rate = self._driven(Tape())
             moved, slopes = machine.moved(tau, rest), machine.sweep.slopes
             rate = [*slopes, *moved.a_a, *own_rate, *machine.powers(tau)]
-            program.add("rate" + added, 5, {"rate": rate, "margin": [moved.margin]})
+            edges = machine.sweep.edges(self._chart.machine.closure.units.tolist())
+            outputs = {"rate": rate, "margin": [moved.margin], "edges": edges}
+            program.add("rate" + added, 5, outputs)
+        self._add_edges(program, len(edges))
         # the parabola through rows at 0, 1/2, 1
         tape = Tape()
         s, columns = tape.load(1, 0), self._columns
@@ -224,6 +227,20 @@ class ControlledStepper(Stepper):
         """An error, above 1 where a floating body turns so far that nobody knows how often."""
         floating = self._chart.machine.coordinates.floating
         return maximum(error, move * (1.0 / _ROUND)) if floating else error
+
+    def _add_edges(self, program: Program, count: int) -> None:
+        """sides(rate): the signs of edges; crossed(rate, sides): the least of edge times sign."""
+        start = program.outputs("rate").start("edges")
+        if not count:
+            return
+        tape = Tape()
+        signs = [with_sign_of(1.0, x) for x in tape.loads(0, start, count)]
+        program.add("sides", 1, signs)
+        tape = Tape()
+        least: Number = 1.0
+        for edge, side in zip(tape.loads(0, start, count), tape.loads(1, 0, count), strict=True):
+            least = minimum(least, edge * side)
+        program.add("crossed", 2, [least])
 
     @abstractmethod
     def _add_method(self, program: Program) -> None:
@@ -289,8 +306,13 @@ class ControlledStepper(Stepper):
             step = Attempt(r, call, first, ending, part, following, inside)
             attempt, interpolate = self._made(program, step)
             call("rate", t, r.state, first)
-            # where a joint has started or stopped: how far ahead, margins here and there
+            # where a joint starts or stops, or a stop begins or ends: how far ahead, and margins
+            # here and there
             ahead, low, high, tries = r.let(0.0), r.let(1.0), r.let(0.0), r.let(0)
+            edges = program.outputs("rate").parts["edges"]
+            sides, crossed = r.array("sides", max(1, edges)), r.array("crossed", 1)
+            if edges:
+                r.call("sides", first, sides)
             if self._sticks:
                 r.set(low, first["margin"])
                 with r.when(low < -NEAR):
@@ -309,6 +331,7 @@ class ControlledStepper(Stepper):
                 if self._sticks:
                     with r.when((r.bounds[HELD] > 0.5) & (proposed > whole)):
                         r.set(proposed, whole)  # what is at rest does not tell how soon it starts
+                if self._sticks or edges:
                     with r.when(ahead > 0.0):
                         share = r.let((low + 1.5 * NEAR) / (low - high))
                         with r.when(tries > _BISECTED):
@@ -346,13 +369,21 @@ class ControlledStepper(Stepper):
                     with r.otherwise():
                         call("rate", t + length, following, ending)
                         beyond_it, event = r.let(0), r.let(0)
+                        worst = r.let(1.0)
                         if self._sticks:
-                            with r.when(ending["margin"] < -NEAR):
+                            r.set(worst, ending["margin"])
+                            with r.when(worst < -NEAR):
                                 r.set(event, 1)
-                                with r.when((ending["margin"] < -2.0 * NEAR) & (sure < 1)):
-                                    r.set(beyond_it, 1)
-                                    r.set(ahead, length)
-                                    r.set(high, ending["margin"])
+                        if edges:
+                            r.call("crossed", ending, sides, crossed)
+                            with r.when(crossed[0] < worst):
+                                r.set(worst, crossed[0])
+                        if self._sticks or edges:
+                            with r.when((worst < -2.0 * NEAR) & (sure < 1)):
+                                r.set(beyond_it, 1)
+                                r.set(event, 0)
+                                r.set(ahead, length)
+                                r.set(high, worst)
                         count, since = r.let(recorded), r.let(due)
                         with r.when((beyond_it < 1) & (due < (t + length) * _NEARLY)):
                             interpolate(t, length)
@@ -396,7 +427,13 @@ class ControlledStepper(Stepper):
                                 stop()
                             with r.when(ahead > 0.0):
                                 r.set(ahead, ahead - length)
-                                r.set(low, ending["margin"] if self._sticks else 1.0)
+                                r.set(low, worst)
+                            if edges:
+                                r.call("sides", ending, sides)
+                                with r.when(worst < -NEAR):  # an edge, behind which it goes on
+                                    r.set(ahead, 0.0)
+                                    r.set(tries, 0)
+                                    r.set(low, 1.0)
                             with r.when(beyond(r, result)):
                                 stop()
                 with r.otherwise():

@@ -92,8 +92,9 @@ class ExplicitStepper(ControlledStepper):
     def _made(self, program: Program, step: Attempt) -> tuple[Way, Way]:
         """See `ControlledStepper`."""
         r, size, method = step.r, self._state.size, self._method
-        # a rate has its margin behind it, which the next one replaces
-        k, stage = r.array("k", (STAGES + 1 + MORE) * size + 1), r.array("stage", size)
+        # a rate has more behind it, which the next one replaces
+        more = program.outputs("rate").size - size
+        k, stage = r.array("k", (STAGES + 1 + MORE) * size + more), r.array("stage", size)
 
         def attempt(t: Value, length: Value) -> None:
             r.copy(k, step.first, size)

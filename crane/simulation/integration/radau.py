@@ -393,12 +393,14 @@ class RadauStepper(ControlledStepper):
         columns, m = n + k, n + k
         directions = r.array("directions", columns * size)
         bent = r.array("bent", max(1, n * size))
-        # a rate has its margin behind it, which the next one replaces
-        bumped, curved = (r.array(x, columns * size + 1) for x in ("bumped", "curved"))
+        # a rate has more behind it, which the next one replaces
+        more = program.outputs("rate").size - size
+        bumped, curved = (r.array(x, columns * size + more) for x in ("bumped", "curved"))
         mass, stage = r.array("mass", n * n + n), r.array("stage", size)
         jacobian = r.array("jacobian", program.outputs("jacobian"))
         real, pair = r.array("real", m * m), r.array("pair", 4 * m * m)
-        rates, slope = r.array("rates", STAGES * size + 1), r.array("slope", size + 1)
+        rates = r.array("rates", STAGES * size + more)
+        slope = r.array("slope", size + more)
         iterate = r.array("iterate", program.outputs("newton"))
         kept, ratio = r.array("kept", STAGES * size), r.array("ratio", 1)
         wrong = r.array("wrong", size)
