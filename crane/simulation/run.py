@@ -109,7 +109,7 @@ def simulate(
             is recorded every `step`. "rk4", of order 4 with this step. "RK23", "RK45", "BDF",
             "LSODA" are scipy's, as are DOP853 and Radau for controllers in Python. If not given,
             rosenbrock with valves, DOP853 in machine code, rk4 in Python.
-        tolerance: Error of a step per size of the state; 1e-11 for DOP853, 1e-8 for rosenbrock,
+        tolerance: Error of a step per size of the state; 1e-12 for DOP853, 1e-8 for rosenbrock,
             1e-9 for others if not given.
         formulation: "exact" or "decoupled", see `Dynamics`.
         progress: Called with the finished share, 0 to 1.

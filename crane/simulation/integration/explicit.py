@@ -20,7 +20,7 @@ from crane.simulation.integration.controlled import (
 )
 
 STAGES, MORE = 12, 3  # of a step, and for what is between its ends
-TOLERANCE = 1e-11  # error of a step, per size of the state
+TOLERANCE = 1e-12  # error of a step, per size of the state
 _FASTER, _SAFETY = 5.0, 0.9  # change of the step's length from one to the next
 
 
