@@ -800,3 +800,26 @@ def test_motion_equals_mujoco(mini):
             worst = max(worst, np.abs(gap).max())
     print(f"largest distance of the tips within {duration} s: {worst:.3g} m")
     assert worst < 1e-5  # the connections give way by micrometres
+
+
+@pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
+def test_from_rest_friction_that_sticks_is_against_the_acceleration(mini, backend):
+    """Offsets act always; Coulomb friction where something is to move, passive joints too."""
+    laws = {**mini.friction, "q4": crane.Friction(coulomb=0.2, stiction=0.1)}
+    machine = mini.replace(friction=laws)
+    rough = crane.Dynamics(machine, backend=backend)
+    bare = crane.Dynamics(mini.replace(friction={}), backend=backend)
+    q_a, rest = np.array([0.3, 0.012, 0.015]), np.zeros(3)
+    gamma = machine.closure.gamma(machine.closure.solve(q_a))
+    offsets = np.array([laws[joint].coulomb_offset for joint in mini.active])
+    assert rough.inverse(q_a, rest, rest, friction=True) == pytest.approx(
+        bare.inverse(q_a, rest, rest) + offsets, abs=1e-12
+    )
+    a_a = np.array([0.5, -0.02, 0.03])
+    wanted = bare.inverse(q_a, rest, a_a) + offsets
+    for joint, law in laws.items():
+        row = gamma[machine.column(joint)]
+        wanted += row * law.breakaway * np.sign(row @ a_a)
+    found = rough.inverse(q_a, rest, a_a, friction=True)
+    assert found == pytest.approx(wanted, abs=1e-9)
+    assert np.abs(found - bare.inverse(q_a, rest, a_a) - offsets).max() > 1.0

@@ -100,7 +100,8 @@ class Dynamics:
             q_a: (n,) or (N, n) [m], [rad].
             v_a: The same shape [m/s], [rad/s].
             a_a: The same shape [m/s2], [rad/s2].
-            friction: Whether the drives also overcome friction.
+            friction: Whether the drives also overcome friction. From rest, where it sticks, it is
+                against the acceleration of the joint, and its offset where there is none.
 
         Returns:
             tau_A, (n,) or (N, n) [N], [N m].
@@ -117,7 +118,8 @@ class Dynamics:
             q_a: (n,) or (N, n) [m], [rad].
             v_a: The same shape [m/s], [rad/s].
             tau_a: The same shape [N], [N m].
-            friction: Whether friction brakes.
+            friction: Whether friction brakes; at rest, where it sticks, only its offset: what holds
+                a joint is found by `simulate`.
 
         Returns:
             a_A, (n,) or (N, n) [m/s2], [rad/s2].
