@@ -118,7 +118,7 @@ class Dynamics:
             q_a: (n,) or (N, n) [m], [rad].
             v_a: The same shape [m/s], [rad/s].
             tau_a: The same shape [N], [N m].
-            friction: Whether friction brakes; at rest, where it sticks, only its offset: what holds
+            friction: Whether friction brakes; at rest, where it sticks, by its offset: what holds
                 a joint is found by `simulate`.
 
         Returns:
