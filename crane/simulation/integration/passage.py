@@ -17,9 +17,10 @@ from crane.machine import Machine
 
 NODES = 7  # instants before the crossing
 BEFORE, BEHIND = 2, 4  # steps between the last of them and the crossing, and behind it
+AFTER = 3  # nodes behind it
 FINE = 1e-2  # way of the fastest joint in a step [rad], share of the machine's size
 CROSSING = 0.05  # rank of the loop equations there, as a share of that at home
-_CORRECTIONS = 3
+_CORRECTIONS = 6
 
 Rate = Callable[[float, Array], tuple[Array, Array]]
 """(time, state) -> rate of the state, observations."""
@@ -80,12 +81,18 @@ def ahead(times: Array, states: Array, rate: Rate) -> Path:
 
 
 def corrected(path: Path, time: float, rate: Rate) -> Path:
-    """The path with the rate at an instant [s] behind the crossing among its nodes."""
-    first, times = path, np.append(path.times, time)
+    """The path with the rates at an instant [s] behind the crossing and after it among its nodes.
+
+    Then it is interpolation that leads across, not extrapolation, which errors grow in.
+    """
+    first, unit = path, path.times[1] - path.times[0]
+    behind = time + unit * np.arange(AFTER)
+    times = np.append(path.times, behind)
     for _ in range(_CORRECTIONS):
-        found, seen = rate(time, path.state(time))
+        found = [rate(one, path.state(one)) for one in behind]
+        rates, seen = (np.array(part) for part in zip(*found, strict=True))
         path = Path(
-            times, first.start, np.vstack([first.rates, found]), np.vstack([first.seen, seen]),
+            times, first.start, np.vstack([first.rates, rates]), np.vstack([first.seen, seen]),
             first.before,
         )  # fmt: skip
     return path
