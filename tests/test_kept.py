@@ -316,7 +316,7 @@ def another(*_):
 @pytest.mark.parametrize(
     "owner, name, value",
     [
-        (Sweep, "_law", another),
+        (crane.dynamics.traced, "effects", another),
         (Sweep, "mass", property(another)),
         (Bodies, "frame", staticmethod(another)),
         (Sweep, "kinetic", cached_property(another)),

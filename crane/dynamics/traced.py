@@ -27,15 +27,13 @@ from crane.common.samples import Array
 from crane.dynamics.composite import Composite
 from crane.dynamics.inertia import Pair
 from crane.dynamics.joint_forces import AT_REST, STILL, JointForces
+from crane.dynamics.law import NONE, NUMBERS, SLIP, STOP, Effects, effects
 from crane.dynamics.lengths import LEAST
 from crane.dynamics.moving import Moving
 from crane.dynamics.recursion import Plan, accelerations
 from crane.machine import Machine
 
-_STOP = 14  # likewise of its stops: stiffness, damping, lower, upper
-_SLIP = 7  # of the numbers of a joint, the first of those that change with the motion
-BODY, JOINT = 10, 22  # numbers per body, and of the law of a joint or distance
-Effects = tuple[Number, Number, Number, Number, Number]
+BODY = 10  # numbers of a body
 _SOLVED = 7  # freedoms up to which solving with M_A takes fewer operations than recursion
 _UPPER = np.triu_indices(3)
 Spans = tuple[tuple[int, int], ...]  # by distance the bodies of both ends; 0 is the world
@@ -71,9 +69,9 @@ def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Arr
 def modes_at(machine: Machine, forces: JointForces) -> list[int]:
     """Where `numbers_of` has what `JointForces.set_modes` says, joint by joint."""
     bodies = machine.model.nv
-    first = BODY * bodies + _SLIP
-    last = (BODY + JOINT + 1) * bodies + 3 + (JOINT + 6) * len(forces.lengths.ends)
-    return [first + JOINT * i + k for i in forces.sticking for k in range(3)] + [last]
+    first = BODY * bodies + SLIP
+    last = (BODY + NUMBERS + 1) * bodies + 3 + (NUMBERS + 6) * len(forces.lengths.ends)
+    return [first + NUMBERS * i + k for i in forces.sticking for k in range(3)] + [last]
 
 
 def spans_of(machine: Machine, forces: JointForces) -> Spans:
@@ -142,15 +140,16 @@ class Sweep:
         self._n = len(v_a)
         bodies = self._size - 1
         self._inertias = [constants.vector(BODY * i, BODY) for i in range(bodies)]
-        self._laws = [constants.vector(BODY * bodies + JOINT * i, JOINT) for i in range(bodies)]
-        gravity = constants.vector((BODY + JOINT) * bodies)
+        first = BODY * bodies
+        self._laws = [constants.vector(first + NUMBERS * i, NUMBERS) for i in range(bodies)]
+        gravity = constants.vector((BODY + NUMBERS) * bodies)
         self._gravity = times(posture.rotation[0], gravity)
-        self._rotors: Vector = [0.0, *constants.vector((BODY + JOINT) * bodies + 3, bodies)]
-        after = (BODY + JOINT + 1) * bodies + 3
+        self._rotors: Vector = [0.0, *constants.vector((BODY + NUMBERS) * bodies + 3, bodies)]
+        after = (BODY + NUMBERS + 1) * bodies + 3
         self._span_numbers = [
-            constants.vector(after + (JOINT + 6) * k, JOINT + 6) for k in range(len(spans))
+            constants.vector(after + (NUMBERS + 6) * k, NUMBERS + 6) for k in range(len(spans))
         ]
-        self._moving = constants[after + (JOINT + 6) * len(spans)]
+        self._moving = constants[after + (NUMBERS + 6) * len(spans)]
         self.gamma = loops.gamma
         self.rates: Vector = [0.0, *(dot(self.gamma[i], v_a) for i in range(1, self._size))]
         # the loops' drift is that of the whole machine whatever carries a body
@@ -289,67 +288,24 @@ class Sweep:
         ]
         return self._projected(self._along_tree(wrenches))
 
-    def _law(self, law: Vector, q: Number, rate: Number, modes: bool = False) -> Effects:
-        """Of a joint or distance: passive force, friction, power taken out, energy, stiffness.
-
-        Written apart from `JointForces`, which has the same in numpy, so that each checks the
-        other.
-        """
-        (
-            coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck,
-            slip, _, _, stiffness, damping, constant, slack, stop, stop_damping, lower, upper,
-            gas, gas_share, gas_rest, gas_exponent,
-        ) = law  # fmt: skip
-        friction = viscous * rate + coulomb_offset
-        if coulomb != 0.0 or viscous_offset != 0.0 or stiction != 0.0:
-            sign = slip if modes else apply("tanh", sharpness * rate)
-            if stiction != 0.0:
-                slow = stribeck * rate
-                coulomb = coulomb + stiction * apply("exp", -1.0 * (slow * slow))
-            friction = friction + (coulomb + viscous_offset * rate) * sign
-        force = constant - stiffness * q - damping * rate
-        slope = -1.0 * stiffness
-        stored = 0.5 * stiffness * q * q - constant * q + slack
-        lost = (friction + damping * rate) * rate
-        if gas != 0.0:
-            swollen = 1.0 + gas_share * (q - gas_rest)
-            if gas_exponent == 1.0:
-                pressed = gas / swollen
-                stored = stored - gas / gas_share * apply("log", swollen)
-            else:
-                less = 1.0 - gas_exponent
-                power = apply("exp", less * apply("log", swollen))
-                pressed = gas * power / swollen
-                stored = stored - gas / gas_share * ((power - 1.0) / less)
-            force = force + pressed
-            slope = slope - gas_exponent * gas_share * pressed / swollen
-        if stop != 0.0:
-            over, under = maximum(q - upper, 0.0), maximum(lower - q, 0.0)
-            harder, softer = (maximum(1.0 + s * stop_damping * rate, 0.0) for s in (1.0, -1.0))
-            push, pull = stop * over * harder, stop * under * softer
-            slope = slope - stop * where_positive(over, harder, where_positive(under, softer, 0.0))
-            force = force + pull - push
-            stored = stored + 0.5 * stop * (over * over + under * under)
-            lost = lost + (push - stop * over - pull + stop * under) * rate
-        return force, friction, lost, stored, slope
-
     @cached_property
     def _at_joints(self) -> list[Effects]:
-        """`_law` of all joints (nb + 1,)."""
+        """What happens at all joints (nb + 1,)."""
         every = zip(self._laws, self._q, self.rates[1:], strict=True)
-        laws = (self._law(*x, self._modes and i in self._sticking) for i, x in enumerate(every))
-        return [(0.0,) * 5, *laws]
+        laws = (effects(*x, self._modes and i in self._sticking) for i, x in enumerate(every))
+        return [NONE, *laws]
 
     @cached_property
     def _at_lengths(self) -> list[tuple[dict[int, Number], Effects, Number]]:
-        """Of every distance dl/dv by joint, `_law`, and itself; see `crane.dynamics.lengths`.
+        """Of every distance dl/dv by joint, what happens along it, and itself.
 
+        See `crane.dynamics.lengths`.
         The force along it is a wrench [u; p_2 x u] on the second body, and its reaction on the
         first, so what carries both feels nothing.
         """
         posture, out = self._posture, []
         for bodies, numbers in zip(self._spans, self._span_numbers, strict=True):
-            law, places = numbers[:JOINT], (numbers[JOINT:-3], numbers[-3:])
+            law, places = numbers[:NUMBERS], (numbers[NUMBERS:-3], numbers[-3:])
             one, two = (
                 add(posture.origin[body], times(posture.rotation[body], place))
                 for body, place in zip(bodies, places, strict=True)
@@ -365,58 +321,57 @@ class Sweep:
                 slope = dot(direction, linear) + dot(moment, angular)
                 slopes[i] = slope if i in behind else -slope
             rate = dot(list(slopes.values()), [self.rates[i] for i in slopes])
-            out.append((slopes, self._law(law, length, rate), length))
+            out.append((slopes, effects(law, length, rate), length))
         return out
 
     @cached_property
     def _passive(self) -> Vector:
         """f, passive forces along the joints (nb + 1,)."""
-        out = [effects[0] for effects in self._at_joints]
-        for slopes, (force, *_), _ in self._at_lengths:
+        out = [found.force for found in self._at_joints]
+        for slopes, found, _ in self._at_lengths:
             for i, slope in slopes.items():
-                out[i] = out[i] + force * slope
+                out[i] = out[i] + found.force * slope
         return out
 
     @property
     def _friction(self) -> Vector:
         """tau_F, friction along the joints (nb + 1,)."""
-        return [effects[1] for effects in self._at_joints]
+        return [found.friction for found in self._at_joints]
 
-    def _sum(self, which: int) -> Number:
-        """Of what `_law` gives, over all joints and distances."""
-        total: Number = 0.0
-        for effects in (*self._at_joints, *(effects for _, effects, _ in self._at_lengths)):
-            total = total + effects[which]
-        return total
+    @property
+    def _everywhere(self) -> list[Effects]:
+        """What happens at all joints and along all distances."""
+        return [*self._at_joints, *(found for _, found, _ in self._at_lengths)]
 
     @property
     def stiffness(self) -> list[Vector]:
         """d(gamma^T f)/dq_A of springs, gas, end stops and ropes at frozen gamma (n, n)."""
-        along = [(self.gamma[i], self._at_joints[i][4]) for i in range(1, self._size)]
-        for slopes, effects, _ in self._at_lengths:
+        along = [(self.gamma[i], self._at_joints[i].slope) for i in range(1, self._size)]
+        for slopes, found, _ in self._at_lengths:
             row: Vector = [0.0] * self._n
             for i, slope in slopes.items():
                 row = add(row, scale(slope, self.gamma[i]))
-            along.append((row, effects[4]))
+            along.append((row, found.slope))
         out: list[Vector] = [[0.0] * self._n for _ in range(self._n)]
         for row, stiffness in along:
             for k, entry in enumerate(row):
                 out[k] = add(out[k], scale(entry * stiffness, row))
         return out
 
-    def edges(self, units: Sequence[float]) -> Vector:
+    def edges(self, units: Sequence[float], size: float) -> Vector:
         """How far what stops is beyond where it begins to, each over its unit.
 
         Args:
-            units: (nb,) of the joints; ropes count like the first.
+            units: (nb,) of the joints.
+            size: Of the machine, that of ropes [m].
         """
         out: Vector = []
         for law, q, unit in zip(self._laws, self._q, units, strict=True):
-            if law[_STOP] != 0.0:
-                out += [(q - law[_STOP + 3]) * (1.0 / unit), (law[_STOP + 2] - q) * (1.0 / unit)]
+            if law[STOP] != 0.0:
+                out += [(q - law[STOP + 3]) * (1.0 / unit), (law[STOP + 2] - q) * (1.0 / unit)]
         for numbers, (_, _, length) in zip(self._span_numbers, self._at_lengths, strict=True):
-            if numbers[_STOP] != 0.0:
-                out.append((length - numbers[_STOP + 3]) * (1.0 / units[0]))
+            if numbers[STOP] != 0.0:
+                out.append((length - numbers[STOP + 3]) * (1.0 / size))
         return out
 
     @property
@@ -430,7 +385,7 @@ class Sweep:
     def free(self) -> Vector:
         """(n,) 0 of active joints that are at rest to the last bit, else 1."""
         out: Vector = [self._moving] * self._n
-        held = {i: self._laws[i][_SLIP + 1] for i in self._sticking}
+        held = {i: self._laws[i][SLIP + 1] for i in self._sticking}
         for k, joint in enumerate(self._loops.active_joints):
             if joint - 1 in held:
                 out[k] = self._moving * (1.0 - held[joint - 1])
@@ -460,7 +415,10 @@ class Sweep:
     @property
     def dissipation(self) -> Number:
         """Power that friction, dampers, end stops and ropes take out [W]."""
-        return self._sum(2)
+        total: Number = 0.0
+        for found in self._everywhere:
+            total = total + found.lost
+        return total
 
     @cached_property
     def kinetic(self) -> Number:
@@ -479,7 +437,9 @@ class Sweep:
     @cached_property
     def potential(self) -> Number:
         """Weights, springs, constant forces, gas, end stops, ropes [J]."""
-        total = self._sum(3)
+        total: Number = 0.0
+        for found in self._everywhere:
+            total = total + found.stored
         for mass, centre, _ in self._bodies:
             height = subtract(centre, self._posture.origin[0])
             total = total - mass * dot(self._gravity, height)
@@ -491,7 +451,7 @@ class Sweep:
         along = subtract(self._along_inertial(rates), self._forces(friction))
         for i in self._sticking if friction else ():
             law, rate = self._laws[i], rates[i + 1]
-            sign = law[_SLIP] if self._modes else apply("tanh", law[4] * self.rates[i + 1])
+            sign = law[SLIP] if self._modes else apply("tanh", law[4] * self.rates[i + 1])
             back = where_positive(-STILL - rate, -1.0, 0.0)
             start = (law[0] + law[5]) * (where_positive(rate - STILL, 1.0, back) - sign)
             along[i + 1] = along[i + 1] + where_positive(1.0 - apply("abs", sign), start, 0.0)
@@ -524,7 +484,7 @@ class Sweep:
     @property
     def held(self) -> list[tuple[Number, Vector]]:
         """Of each joint that can stick, whether it is held, and its row of gamma."""
-        return [(self._laws[i][_SLIP + 1], self.gamma[i + 1]) for i in self._sticking]
+        return [(self._laws[i][SLIP + 1], self.gamma[i + 1]) for i in self._sticking]
 
     def moved(self, tau: Sequence[Number], rest: bool) -> Moved:
         """Accelerations under active forces, with joints at rest or without.
@@ -539,7 +499,7 @@ class Sweep:
             rest: Whether some joint is at rest.
         """
         laws = [self._laws[i] for i in self._sticking]
-        slip, held, pace = ([law[_SLIP + k] for law in laws] for k in range(3))
+        slip, held, pace = ([law[SLIP + k] for law in laws] for k in range(3))
         limits = [law[0] + law[5] for law in laws]
         rates = [self.rates[i + 1] for i in self._sticking]
         slips = [s * v * p for s, v, p in zip(slip, rates, pace, strict=True)]

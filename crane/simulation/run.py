@@ -85,12 +85,12 @@ def simulate(
     """Simulate a machine with its friction, passive forces and end stops.
 
     M_A a_A = tau_A - bias - friction, integrated as an ordinary differential equation in
-    (q_A, v_A), the controller's states and the energies by the classical fourth-order
-    Runge-Kutta method with a fixed step (as the reduced-scale forwarder paper does). Within a
-    step the passive joints move with gamma v_A; after every step the loops are closed to
-    rounding. Where the active coordinates come to a dead centre the run goes on in others, with
-    the forces of the same drives, and where branches of motion cross it keeps to its own; both are
-    told in a warning (see `crane.simulation.integration.charts` and `passage`).
+    (q_A, v_A), the controller's states and the energies. Within a step the passive joints move
+    with gamma v_A; after every step the loops are closed to rounding.
+
+    Where the active coordinates come to a dead centre the run goes on in others, with the forces
+    of the same drives, and where branches of motion cross it keeps to its own; both are told in a
+    warning (see `crane.simulation.integration.charts` and `passage`).
 
     Args:
         machine: The machine, or what `crane.load` takes.
@@ -116,7 +116,8 @@ def simulate(
 
     Returns:
         Recording with channels for every passive joint, the tip, the references,
-        friction_<joint>, and the energies kinetic, potential, work (of the active forces) and
+        friction_<joint>, rest_<joint> where friction sticks (what holds the joint at rest, 0
+        where it slips), and the energies kinetic, potential, work (of the active forces) and
         dissipated [J]; work = change of (kinetic + potential) + dissipated, of the exact
         formulation only.
 

@@ -78,7 +78,8 @@ def identify(
             potentiometer.
         slow: Velocities below which rows are left out, (n,) or by joint: a few times that over
             which friction at rest fades. If not given, 4 times the description's smoothing and
-            Stribeck velocity, or 2 % of a joint's largest.
+            Stribeck velocity, of friction that sticks with neither 0.01 rad/s and 1 mm/s, or 2 %
+            of a joint's largest.
         trust: Whether a recording that is most likely wrong is taken nevertheless: why it is so
             is told as a warning, and outliers are left in.
         progress: Takes the finished share.

@@ -92,6 +92,7 @@ class AdaptiveSteps(Switching):
         view(enough).v_a[:] *= units[closure.active] / pace
         method: Any = getattr(integrate, self._method)
         solver = method(rate, begun, state.copy(), end, rtol=self._tolerance, atol=enough)
+        rate(begun, state)  # the solver's last look may have been beside
         before = self.slow.margin
         while solver.status == "running":
             with np.errstate(all="ignore"):  # where a trial explodes the method gives up by itself

@@ -189,7 +189,8 @@ class ControlledStepper(Stepper):
             machine, _, tau, own_rate = self._driven(Tape())
             moved, slopes = machine.moved(tau, rest), machine.sweep.slopes
             rate = [*slopes, *moved.a_a, *own_rate, *machine.powers(tau)]
-            edges = machine.sweep.edges(self._chart.machine.closure.units.tolist())
+            closure = self._chart.machine.closure
+            edges = machine.sweep.edges(closure.units.tolist(), closure.size)
             outputs = {"rate": rate, "margin": [moved.margin], "edges": edges}
             program.add("rate" + added, 5, outputs)
         self._add_edges(program, len(edges))
