@@ -11,6 +11,7 @@ import argparse
 import warnings
 from pathlib import Path
 
+from derivatives import derivatives
 from engines import work_precision
 from evaluations import agree, forward_dynamics, one_step, task
 from hydraulic_crane import hydraulic_crane
@@ -38,6 +39,7 @@ def main() -> None:
     parts = [conditions(), agree(bare)]
     for title, part in (
         ("Forward dynamics", lambda: forward_dynamics(bare, options.rounds)),
+        ("Derivatives", lambda: derivatives(options.rounds)),
         ("One step", lambda: one_step(mini, bare, options.rounds)),
         ("A controlled task", lambda: task(mini, few)),
         ("Stacks", lambda: stacks(mini, few)),

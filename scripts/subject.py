@@ -83,7 +83,7 @@ class Runner:
 
 
 class FormulaLoop:
-    """The formula of forward dynamics in a loop of machine code, over closed postures.
+    """A formula, that of forward dynamics, in a loop of machine code, over closed postures.
 
     It is called through its address, so that nothing of it can leave the loop.
 
@@ -92,13 +92,21 @@ class FormulaLoop:
         q: (N, nq) closed postures.
         v_a: (N, n).
         tau: (N, n) forces.
+        quantity: Which.
 
     Attributes:
-        out: (N, n) accelerations.
+        out: (N, n) accelerations, or what else it gives.
     """
 
-    def __init__(self, dynamics: crane.Dynamics, q: Array, v_a: Array, tau: Array):
-        formula = dynamics._formula("forward")
+    def __init__(
+        self,
+        dynamics: crane.Dynamics,
+        q: Array,
+        v_a: Array,
+        tau: Array,
+        quantity: str = "forward",
+    ):
+        formula = dynamics._formula(quantity)
         self.out = np.empty((len(q), formula.size))
         self._q, self._x = q, np.hstack([v_a, tau])
         program = Program()

@@ -102,8 +102,8 @@ def formula(dynamics, quantity, q, v_a, x):
     posture = Bodies(fast.geometry, Floats(fast.geometry.numbers), q.tolist())
     loops = Loops(fast._equations, fast._structure, fast._active, fast._passive, posture)
     sweep = Sweep(
-        posture, loops, Floats(dynamics.numbers), q.tolist(), v_a.tolist(), dynamics.carriers,
-        dynamics.plan, dynamics.spans, dynamics.forces.sticking, quantity in MOVES,
+        posture, loops, Floats(dynamics.numbers), q.tolist(), v_a.tolist(), dynamics.form,
+        quantity in MOVES,
     )  # fmt: skip
     return np.array(QUANTITIES[quantity](sweep, x.tolist()), dtype=float)
 
@@ -173,7 +173,7 @@ def test_large_machines(family, joints, tmp_path):
     """By recursion over clusters, across which the elements act."""
     machine = clad(crane.load(families.write(family, joints, tmp_path)), 5)
     dynamics = same_on_both_backends(machine, samples_of(machine, 0.05))
-    assert dynamics.plan and len(machine.active) > 7
+    assert dynamics.form.plan and len(machine.active) > 7
 
 
 # --- work and energy -------------------------------------------------------------------------
@@ -269,9 +269,7 @@ def test_the_jacobian_over_velocities_is_that_of_differences(mini):
     tape = Tape()
     q, posture, loops = closure.fast.trace(tape, 0, 2)
     constants, v_a = Constants(tape, 1, dynamics.numbers), tape.loads(3, 0, n)
-    sweep = Sweep(
-        posture, loops, constants, q, v_a, dynamics.carriers, dynamics.plan, dynamics.spans
-    )
+    sweep = Sweep(posture, loops, constants, q, v_a, dynamics.form)
     rows = derivatives(sweep.passive, v_a)
     program = Program()
     program.add("f", 4, [entry for row in rows for entry in row])
@@ -667,7 +665,7 @@ def test_operations_of_machines_without_elements_read_none():
     """Those of a machine end behind its joints': 10, 22 and 1 each, gravity, whether it moves."""
     machine = crane.load("mini_forwarder")
     dynamics = crane.Dynamics(machine)
-    assert len(dynamics.numbers) == 33 * machine.model.nv + 4 and dynamics.spans == ()
+    assert len(dynamics.numbers) == 33 * machine.model.nv + 4 and dynamics.form.spans == ()
     sizes = [
         len(crane.Dynamics(machine.replace(ropes=ropes)).numbers)
         for ropes in ((), (crane.Rope(BOOM, 1, 1),), (crane.Rope(BOOM, 1, 1),) * 2)

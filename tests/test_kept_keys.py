@@ -77,10 +77,7 @@ def formulas(machine, fast):
     n = len(machine.active)
     yield "loops", lambda program: fast._build(program, fast._signs(fast._home))
     for name in quantities.QUANTITIES:
-        rest = (
-            dynamics.pattern, n, dynamics.carriers, dynamics.plan, dynamics.spans,
-            dynamics.forces.sticking,
-        )  # fmt: skip
+        rest = dynamics.pattern, n, dynamics.form
         yield name, lambda p, name=name, rest=rest: quantities._build(p, name, fast, *rest)
     if machine.tip:
         for kind in (_FastPoint, _FastFrame):
@@ -213,10 +210,7 @@ def text_with(name, fast, dynamics, values):
             return text(lambda program: other._build(program, fast._signs(fast._home)))
         except ZeroDivisionError:  # no machine
             return "singular"
-    rest = (
-        values, len(dynamics.machine.active), dynamics.carriers, dynamics.plan, dynamics.spans,
-        dynamics.forces.sticking,
-    )  # fmt: skip
+    rest = values, len(dynamics.machine.active), dynamics.form
     return text(lambda program: quantities._build(program, name, fast, *rest))
 
 

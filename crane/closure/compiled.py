@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from weakref import WeakValueDictionary
 
 import numpy as np
 
 from crane.closure.branch import Posture
-from crane.closure.clusters import clusters_of
+from crane.closure.clusters import Cluster, clusters_of
 from crane.closure.equations import LoopEquations
 from crane.closure.structure import Indices, Structure
 from crane.closure.traced import (
@@ -117,13 +118,18 @@ class FastClosure:
     def _moving(self) -> tuple[Indices, Indices]:
         """Passive joints and active ones that move them: others of their cluster."""
         rows, columns = [], []
-        for cluster in clusters_of(self._equations):
+        for cluster in self.clusters:
             joints = np.array(cluster.joints) - 1
             passive = np.flatnonzero(np.isin(self._passive, joints))
             active = np.flatnonzero(np.isin(self._active, joints))
             rows.append(np.repeat(passive, len(active)))
             columns.append(np.tile(active, len(passive)))
         return np.concatenate(rows), np.concatenate(columns)
+
+    @cached_property
+    def clusters(self) -> list[Cluster]:
+        """Of its joints, each behind the one that carries it."""
+        return clusters_of(self._equations)
 
     @property
     def _pairs(self) -> list[tuple[int, int]]:
@@ -224,10 +230,20 @@ class FastClosure:
         q = np.ascontiguousarray(q)
         return self._loops.call("gammas", len(q), self.geometry.numbers, q, out)
 
-    def trace(self, tape: Tape, geometry: int, q: int) -> tuple[list[Number], Bodies, Loops]:
-        """Coordinates, bodies and loops, read from two arguments of a function to be."""
+    def trace(
+        self, tape: Tape, geometry: int, q: int, folding: Array | None = None
+    ) -> tuple[list[Number], Bodies, Loops]:
+        """Coordinates, bodies and loops, read from two arguments of a function to be.
+
+        Args:
+            tape: Where to.
+            geometry: Which argument has the geometry's numbers.
+            q: Which has the coordinates.
+            folding: The geometry's numbers, NaN where none may become part of the formulas.
+        """
         coordinates = tape.loads(q, 0, self._nq)
-        constants = Constants(tape, geometry, self.geometry.numbers)
+        numbers = self.geometry.numbers if folding is None else folding
+        constants = Constants(tape, geometry, numbers)
         posture = Bodies(self.geometry, constants, coordinates)
         loops = Loops(self._equations, self._structure, self._active, self._passive, posture)
         return coordinates, posture, loops

@@ -8,7 +8,9 @@ import numpy as np
 import pinocchio as pin
 
 from crane.closure.equations import LoopEquations, aligned_axes, turned
+from crane.closure.exactness import CLOSED
 from crane.closure.rotations import turned_by
+from crane.closure.screws import Pair, Vector, minus, paired
 from crane.closure.structure import Indices, Structure
 from crane.codegen.scalar import (
     Number,
@@ -27,8 +29,8 @@ from crane.codegen.scalar import (
     transposed,
 )  # fmt: skip
 from crane.common.samples import Array
+from crane.description import LOOP_TYPES
 
-Vector = list[Number]
 _ROUNDING = 1e-15  # of a rotation by a right angle
 
 
@@ -238,15 +240,39 @@ class Bodies:
 
 @dataclass(frozen=True)
 class Row:
-    """One traced loop equation; see `LoopEquations`."""
+    """One traced loop equation; see `LoopEquations`.
+
+    Attributes:
+        bodies: On which the two frames are.
+        moves: Whether it is about a length.
+        steady: Whether its axis may as well stand still: the two origins stay together.
+        axis: Of the first frame.
+        arm: Axis or origin of the second.
+        wrench: That is measured by phi.
+        phi: Zero where it holds.
+        slopes: dphi/dq by joint.
+    """
 
     bodies: tuple[int, int]
     moves: bool
+    steady: bool
     axis: Vector
     arm: Vector
-    wrench: tuple[Vector, Vector]
+    wrench: Pair
     phi: Number
-    slopes: dict[int, Number]  # joint -> dphi/dq
+    slopes: dict[int, Number]
+
+    def rates(self, one: Pair, two: Pair) -> tuple[Vector, Vector]:
+        """Of axis and arm, whose bodies move so."""
+        axis: Vector = [0.0] * 3 if self.steady else cross(one[1], self.axis)
+        arm = cross(two[1], self.arm)
+        return axis, add(arm, two[0]) if self.moves else arm
+
+    def rate(self, one: Pair, two: Pair) -> Pair:
+        """Of the wrench."""
+        axis, arm = self.rates(one, two)
+        moment = add(cross(arm, self.axis), cross(self.arm, axis))
+        return (axis if self.moves else [0.0] * 3), moment
 
 
 def _coupled(factors: Array, offset: float, q: Sequence[Number]) -> Row:
@@ -254,7 +280,7 @@ def _coupled(factors: Array, offset: float, q: Sequence[Number]) -> Row:
     still: Vector = [0.0] * 3
     slopes: dict[int, Number] = {i + 1: float(x) for i, x in enumerate(factors) if x}
     phi = dot([float(x) for x in factors], q) - float(offset)
-    return Row((0, 0), False, still, still, (still, still), phi, slopes)
+    return Row((0, 0), False, False, still, still, (still, still), phi, slopes)
 
 
 def largest_share(values: Sequence[Number], long: Sequence[bool], per_size: Number) -> Number:
@@ -328,17 +354,19 @@ class Loops:
                 slope = dot(wrench[0], linear) + dot(wrench[1], angular)
                 slopes[column + 1] = float(sign) * slope
         bodies = posture.geometry.frame_bodies
-        return Row((bodies[one], bodies[one + 1]), moves, axis, arm, wrench, phi, slopes)
+        together = all(LOOP_TYPES[equations.loops[one // 2].type][:3])
+        steady = moves and together and self._structure.surplus.allowed <= CLOSED
+        pair = bodies[one], bodies[one + 1]
+        return Row(pair, moves, steady, axis, arm, wrench, phi, slopes)
 
     def solve(
-        self, known: dict[int, Vector], right: Sequence[Number], width: int
+        self, known: dict[int, Vector], right: Sequence[Vector]
     ) -> tuple[dict[int, Vector], list[Number]]:
         """Solve J x = right for the passive joints, block after block.
 
         Args:
-            known: Rows of x (width,) of the active joints, by joint.
-            right: Right side of the last column; the others have zero.
-            width: Number of columns.
+            known: Rows of x of the active joints, by joint.
+            right: Right sides, by row.
 
         Returns:
             Rows of x of all joints, and the determinants of the blocks.
@@ -350,7 +378,7 @@ class Loops:
             matrix = [[self.rows[r].slopes.get(joint, 0.0) for joint in joints] for r in rows]
             # the order of the blocks knows which slopes vanish everywhere
             before = {joint: row for joint, row in x.items() if joint not in joints}
-            sides = [self._right_side(r, before, [0.0] * (width - 1) + [right[r]]) for r in rows]
+            sides = [self._right_side(r, before, right[r]) for r in rows]
             found, determinant = solve(matrix, sides)
             determinants.append(determinant)
             x |= dict(zip(joints, found, strict=True))
@@ -369,7 +397,7 @@ class Loops:
         known: dict[int, Vector] = {
             joint: [float(i == k) for k in range(n)] for i, joint in enumerate(self.active_joints)
         }
-        return self.solve(known, [0.0] * len(self.rows), n)
+        return self.solve(known, [[0.0] * n for _ in self.rows])
 
     @property
     def gamma(self) -> dict[int, Vector]:
@@ -385,7 +413,7 @@ class Loops:
     def correction(self) -> dict[int, Number]:
         """Newton's step of the passive joints, by joint."""
         held: dict[int, Vector] = {joint: [0.0] for joint in self.active_joints}
-        x, _ = self.solve(held, [-row.phi for row in self.rows], 1)
+        x, _ = self.solve(held, [[-row.phi] for row in self.rows])
         return {joint: x[joint][0] for joint in self.passive_joints}
 
     @property
@@ -445,20 +473,12 @@ class MovingBodies:
     def drift(self) -> Vector:
         """(nb + 1,) accelerations of the joints at a_A = 0."""
         held: dict[int, Vector] = {joint: [0.0] for joint in self._loops.active_joints}
-        x, _ = self._loops.solve(held, [-self.bend(row) for row in self._loops.rows], 1)
+        x, _ = self._loops.solve(held, [[-self.bend(row)] for row in self._loops.rows])
         return [0.0] + [x[i][0] for i in range(1, len(self._posture.columns))]
 
     def bend(self, row: Row) -> Number:
         """Second derivative of phi at zero joint acceleration; see `LoopEquations.curvature`."""
         one, two = row.bodies
-        (v1, w1), (v2, w2) = self.velocity[one], self.velocity[two]
-        axis_rate, arm_rate = cross(w1, row.axis), cross(w2, row.arm)
-        total: Number = 0.0
-        if row.moves:
-            arm_rate = add(arm_rate, v2)
-            total = dot(axis_rate, subtract(v2, v1))
-        turning = add(cross(arm_rate, row.axis), cross(row.arm, axis_rate))
-        total = total + dot(turning, subtract(w2, w1))
-        (a1, e1), (a2, e2) = self.acceleration[one], self.acceleration[two]
-        linear, angular = row.wrench
-        return total + dot(linear, subtract(a2, a1)) + dot(angular, subtract(e2, e1))
+        first, second = self.velocity[one], self.velocity[two]
+        turned = paired(row.rate(first, second), minus(second, first))
+        return turned + paired(row.wrench, minus(self.acceleration[two], self.acceleration[one]))

@@ -1,6 +1,6 @@
 """Derivatives of traced formulas, as formulas."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from crane.codegen.scalar import Expression, Number, Tape, apply, where_positive, with_sign_of
 
@@ -30,24 +30,39 @@ def derivatives(outputs: Sequence[Number], by: Sequence[Expression]) -> list[lis
     """
     if not by:
         return [[] for _ in outputs]
-    tape = by[0].tape
-    columns = [_along(tape, outputs, variable.index) for variable in by]
+    columns = [along(outputs, {variable.index: 1.0}) for variable in by]
     return [list(row) for row in zip(*columns, strict=True)]
 
 
-def _along(tape: Tape, outputs: Sequence[Number], variable: int) -> list[Number]:
-    last = max((x.index for x in outputs if isinstance(x, Expression)), default=-1)
-    slope: dict[int, Number] = {variable: 1.0}
-    for index in range(variable + 1, last + 1):
+def along(outputs: Sequence[Number], seeds: Mapping[int, Number]) -> list[Number]:
+    """Derivatives of formulas along a direction; see `derivatives`.
+
+    Args:
+        outputs: (m,) formulas on one tape.
+        seeds: How expressions on it change that count as independent, by their index.
+
+    Returns:
+        (m,) formulas on the same tape.
+    """
+    found = [x for x in outputs if isinstance(x, Expression)]
+    slope = {i: change for i, change in seeds.items() if not _none(change)}
+    if not found or not slope:
+        return [0.0] * len(outputs)
+    tape, last = found[0].tape, max(x.index for x in found)
+    for index in range(min(slope) + 1, last + 1):
         kind, *operands = tape.operations[index]
-        if kind == "load":
+        if kind == "load" or index in seeds:
             continue
         if not any(type(x) is int and x in slope for x in operands):
             continue
         change = _change(tape, index, kind, operands, slope)
-        if isinstance(change, Expression) or change != 0:
+        if not _none(change):
             slope[index] = change
     return [slope.get(x.index, 0.0) if isinstance(x, Expression) else 0.0 for x in outputs]
+
+
+def _none(change: Number) -> bool:
+    return not isinstance(change, Expression) and change == 0
 
 
 def _change(tape: Tape, index: int, kind: str, operands: list, slope: dict[int, Number]) -> Number:

@@ -36,6 +36,18 @@ class Positive:
             x.append(value - dot(row[: len(x)], x))
         return x
 
+    @property
+    def inverted(self) -> Matrix:
+        """A^-1 = L^-T D^-1 L^-1."""
+        size = len(self._lower)
+        columns = [self.halved([float(i == k) for i in range(size)]) for k in range(size)]
+        out: Matrix = [[0.0] * size for _ in range(size)]
+        for k, column in enumerate(columns):
+            weighed = [x * d for x, d in zip(column, self.inverse, strict=True)]
+            for j in range(k + 1):
+                out[j][k] = out[k][j] = dot(weighed[k:], columns[j][k:])
+        return out
+
     def solve(self, right: Sequence[Number]) -> list[Number]:
         """A^-1 b."""
         x = [value * d for value, d in zip(self.halved(right), self.inverse, strict=True)]

@@ -119,7 +119,7 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
     replaced: dict[str, dict[str, float]] = {}
     for name in sorted(changes, key=lambda name: name == PAYLOAD):  # last: it adds to a link
         if name not in names:
-            raise InputError(f"parameter '{name}' is unknown, {_nearest(spec, names, name)}")
+            raise InputError(unknown_parameter(spec, names, name))
         value = as_number(changes[name], f"parameter '{name}'", "")
         head, _, rest = name.partition(".")
         if name.endswith(".mass") and value < 0:
@@ -163,14 +163,15 @@ def _changed(part: Link | Joint, way: _Way, value: float, name: str) -> Link | J
     return dataclasses.replace(part, limits=limits)
 
 
-def _nearest(spec: MachineSpec, names: Iterable[str], wanted: str) -> str:
-    """What an error about an unknown parameter ends with: names like it, and where all are."""
+def unknown_parameter(spec: MachineSpec, names: Iterable[str], wanted: str) -> str:
+    """What is said of a parameter that is none: names like it, and where all are."""
     near = get_close_matches(wanted, names, 3, 0.6)
     meant = f"did you mean '{near[0]}'? " if near else ""
     if len(near) > 1:
         meant += f"like it are {' and '.join(map(repr, near[1:]))}; "
     at = spec.path.stem if bundled().get(spec.path.stem) == spec.path else spec.path
-    return f"{meant}crane info {at} --parameters lists all names"
+    what = f"parameter '{wanted}' is unknown"
+    return f"{what}, {meant}crane info {at} --parameters lists all names"
 
 
 def _warn_of_units(spec: MachineSpec, part: str, values: Mapping[str, float]) -> None:

@@ -1,16 +1,19 @@
-"""Equations of motion in machine code made for one machine."""
+"""Equations of motion and their derivatives in machine code made for one machine."""
 
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from crane.closure.bending import Bending
 from crane.closure.compiled import FastClosure
 from crane.closure.traced import Constants, folded
-from crane.codegen import Number, Program, Tape, largest
+from crane.codegen import Expression, Number, Program, Tape, largest
+from crane.codegen.derivative import along
 from crane.common.samples import Array
-from crane.dynamics.recursion import Plan
-from crane.dynamics.traced import Moved, Spans, Sweep
+from crane.dynamics.inertia import Matrix
+from crane.dynamics.sensitivity import Sensitivity
+from crane.dynamics.traced import Form, Moved, Sweep
 from crane.machine import Machine
 
 
@@ -22,14 +25,15 @@ def _observed(sweep: Sweep, moved: Moved) -> list[Number]:
     return [*moved.friction, sweep.kinetic, sweep.potential, *moved.rest]
 
 
+FRICTION = " with friction"
 MOVES = ("rates", "observation", "resting")  # what depends on `JointForces.set_modes`
 # What can be asked of a sweep, given a second argument x (n,): a_A for inverse and regressor,
 # tau_A for the others.
 QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
     "inverse": lambda sweep, x: sweep.inverse(x, friction=False),
-    "inverse with friction": lambda sweep, x: sweep.inverse(x, friction=True),
+    "inverse" + FRICTION: lambda sweep, x: sweep.inverse(x, friction=True),
     "forward": lambda sweep, x: sweep.forward(x, friction=False),
-    "forward with friction": lambda sweep, x: sweep.forward(x, friction=True),
+    "forward" + FRICTION: lambda sweep, x: sweep.forward(x, friction=True),
     "mass matrix": lambda sweep, x: [entry for row in sweep.mass for entry in row],
     "bias": lambda sweep, x: [
         b - f for b, f in zip(sweep.inertial_bias, sweep.passive, strict=True)
@@ -43,6 +47,16 @@ QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
     "resting": lambda sweep, x: sweep.resting(x),
     "regressor": lambda sweep, x: [entry for row in sweep.regressor(x) for entry in row],
 }
+_Analytic = Callable[[Sensitivity, list[Number]], tuple[Matrix, Matrix, Matrix]]
+_INVERSE: _Analytic = lambda found, x: (*found.inverse(x), found.mass)  # noqa: E731
+_FORWARD: _Analytic = lambda found, x: found.forward(x)  # noqa: E731
+_ANALYTIC: dict[str, _Analytic] = {
+    "inverse": _INVERSE,
+    "inverse" + FRICTION: _INVERSE,
+    "forward": _FORWARD,
+    "forward" + FRICTION: _FORWARD,
+}
+SLOPES = "slopes of "  # before a quantity: its derivatives by q_A, v_A and the second argument
 _FLOAT = np.dtype(np.float64)
 
 
@@ -50,14 +64,11 @@ class QuantityCode:
     """One quantity as machine code.
 
     Args:
-        quantity: A key of `QUANTITIES`.
+        quantity: A key of `QUANTITIES`, perhaps behind `SLOPES`.
         machine: The machine.
         numbers: See `numbers_of`; read when a quantity is asked for.
         pattern: What of them is part of the formulas.
-        carriers: See `crane.dynamics.formulation`.
-        plan: See `crane.dynamics.recursion`.
-        spans: See `crane.dynamics.traced.spans_of`.
-        sticking: Of `JointForces`.
+        form: What they depend on besides.
 
     Attributes:
         size: Length of the result of one sample.
@@ -73,21 +84,16 @@ class QuantityCode:
         machine: Machine,
         numbers: Array,
         pattern: Array,
-        carriers: tuple[int, ...],
-        plan: Plan,
-        spans: Spans,
-        sticking: tuple[int, ...],
+        form: Form,
     ):
         fast = self._fast = machine.closure.fast
         self._numbers = numbers
         nq, n = machine.model.nv, len(machine.active)
-        key = (quantity, folded(pattern), carriers, plan, spans, sticking)
+        key = (quantity, folded(pattern), form)
         if key not in fast.programs:
             fast.programs[key] = fast.kept(
                 ("quantity", *key),
-                lambda program: _build(
-                    program, quantity, fast, pattern, n, carriers, plan, spans, sticking
-                ),
+                lambda program: _build(program, quantity, fast, pattern, n, form),
             )
         self._program = program = fast.programs[key]
         self.size = program.outputs("formula").size
@@ -151,22 +157,116 @@ def _build(
     fast: FastClosure,
     numbers: Array,
     n: int,
-    carriers: tuple[int, ...],
-    plan: Plan,
-    spans: Spans,
-    sticking: tuple[int, ...],
+    form: Form,
 ) -> None:
     tape = Tape()
     q, posture, loops = fast.trace(tape, 0, 2)
     constants = Constants(tape, 1, numbers)
-    v_a = tape.loads(3, 0, n)
-    modes = quantity in MOVES
-    sweep = Sweep(posture, loops, constants, q, v_a, carriers, plan, spans, sticking, modes)
-    outputs = QUANTITIES[quantity](sweep, tape.loads(3, n, n))
+    v_a, x = tape.loads(3, 0, n), tape.loads(3, n, n)
+    modes, of = quantity in MOVES, quantity.removeprefix(SLOPES)
+    geometry = fast.geometry
+    holonomic = not geometry.flyers and form.carriers == geometry.parents
+    if of != quantity and of in _ANALYTIC and holonomic:
+        bending = Bending(posture, loops, fast.clusters, v_a)
+        sweep = Sweep(posture, loops, constants, q, v_a, form, drift=bending.drift)
+        matrices = _ANALYTIC[of](Sensitivity(sweep, bending, of.endswith(FRICTION)), x)
+        outputs = [entry for matrix in matrices for row in matrix for entry in row]
+    else:
+        sweep = Sweep(posture, loops, constants, q, v_a, form, modes)
+        outputs = QUANTITIES[of](sweep, x)
+        if of != quantity:
+            outputs = _slopes(sweep, outputs, x)
     program.add("formula", 4, outputs)
     tape = Tape()  # what is not finite is left to the checks that name it
     program.add("scan", 2, [largest([*tape.loads(0, 0, n), *tape.loads(1, 0, 2 * n)])])
     _add_loop(program, len(q), n)
+
+
+class NamedCode:
+    """Derivatives of one quantity by numbers of the machine, as machine code.
+
+    With numbers p of the machine, and phi(q, p) = 0 of its loops, at given q_A, v_A and second
+    argument,
+
+        d y / d p = dy/dp + dy/dq dq/dp,    J_P dq_P/dp = -dphi/dp.
+
+    Args:
+        quantity: A key of `QUANTITIES`.
+        machine: The machine.
+        numbers: See `numbers_of`.
+        pattern: What of them is part of the formulas.
+        form: What the formulas depend on besides.
+        geometry: (k, .) how the geometry's numbers change with each number of the machine.
+        slopes: (k, .) how `numbers` do.
+
+    Raises:
+        TooLongError: It would take too long to compile.
+    """
+
+    def __init__(
+        self,
+        quantity: str,
+        machine: Machine,
+        numbers: Array,
+        pattern: Array,
+        form: Form,
+        geometry: Array,
+        slopes: Array,
+    ):
+        fast = self._fast = machine.closure.fast
+        self._numbers, self._geometry, self._slopes = numbers, geometry, slopes
+        bent, moved = np.any(geometry != 0, axis=0), np.any(slopes != 0, axis=0)
+        folds = np.where(bent, np.nan, fast.geometry.numbers), np.where(moved, np.nan, pattern)
+        key = ("named", quantity, *map(folded, folds), bent.tobytes(), moved.tobytes(), form)
+        n = len(machine.active)
+
+        def build(program: Program) -> None:
+            tape = Tape()
+            q, posture, loops = fast.trace(tape, 0, 2, folds[0])
+            constants, v_a = Constants(tape, 1, folds[1]), tape.loads(3, 0, n)
+            sweep = Sweep(posture, loops, constants, q, v_a, form)
+            values = QUANTITIES[quantity](sweep, tape.loads(3, n, n))
+            seeds: dict[int, Number] = {}
+            for i in np.flatnonzero(bent).tolist():
+                seeds[tape.load(0, i).index] = tape.load(4, i)
+            opened = along([row.phi for row in loops.rows], seeds)
+            held: dict[int, list[Number]] = {joint: [0.0] for joint in loops.active_joints}
+            moving, _ = loops.solve(held, [[-1.0 * x] for x in opened])
+            seeds |= {_index(q[i - 1]): rate for i, (rate,) in moving.items()}
+            for i in np.flatnonzero(moved).tolist():
+                seeds[tape.load(1, i).index] = tape.load(5, i)
+            program.add("formula", 6, along(values, seeds))
+
+        if key not in fast.programs:
+            fast.programs[key] = fast.kept(key, build)
+        self._program = fast.programs[key]
+        self.size = self._program.outputs("formula").size
+
+    def at(self, q: Array, inputs: Array) -> Array:
+        """(size, k) at one closed posture (nq,), inputs [v_A, x] (2 n,)."""
+        out = np.empty((len(self._slopes), self.size))
+        geometry = self._fast.geometry.numbers
+        for row, bent, moved in zip(out, self._geometry, self._slopes, strict=True):
+            self._program.call("formula", geometry, self._numbers, q, inputs, bent, moved, row)
+        return out.T
+
+
+def _slopes(sweep: Sweep, values: list[Number], x: list[Number]) -> list[Number]:
+    """Derivatives (3, k, n) of values (k,) by q_A, v_A and x."""
+    n = len(x)
+    seeds = [dict(zip(map(_index, sweep.q), sweep.way(k), strict=True)) for k in range(n)]
+    for entry in (*sweep.v_a, *x):
+        seeds.append({_index(entry): 1.0})
+    columns = [along(values, seed) for seed in seeds]
+    return [
+        columns[n * part + k][i] for part in range(3) for i in range(len(values)) for k in range(n)
+    ]
+
+
+def _index(loaded: Number) -> int:
+    """Of a number that was loaded."""
+    assert isinstance(loaded, Expression)
+    return loaded.index
 
 
 def _add_loop(program: Program, nq: int, n: int) -> None:

@@ -9,10 +9,10 @@ has entries.
 from collections.abc import Iterator, Mapping, Sequence
 
 from crane.closure.clusters import Cluster
+from crane.closure.screws import NONE, Pair, Vector, by, carried, paired, plus
 from crane.closure.traced import Bodies, Loops
 from crane.codegen.scalar import Number, dot
-from crane.dynamics.inertia import Inertia, Pair, Vector, by, carried, paired, plus
-from crane.dynamics.moving import NONE
+from crane.dynamics.inertia import Inertia
 
 
 class Columns:

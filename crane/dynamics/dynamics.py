@@ -1,23 +1,34 @@
 """The equations of motion in the active coordinates."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.closure.traced import geometry_of
 from crane.codegen import TooLongError, carefully
 from crane.common.errors import InputError, MechanismError, known
 from crane.common.samples import Array, as_number, as_samples, per_sample
-from crane.dynamics.compiled import QuantityCode
-from crane.dynamics.formulation import carriers
+from crane.dynamics.compiled import FRICTION, SLOPES, NamedCode, QuantityCode
 from crane.dynamics.joint_forces import JointForces
-from crane.dynamics.recursion import planned
-from crane.dynamics.traced import modes_at, numbers_of, spans_of
+from crane.dynamics.named import Named
+from crane.dynamics.traced import Form, modes_at, numbers_of
 from crane.dynamics.tree import TreeDynamics
 from crane.machine import Machine
 from crane.machine.masses import has_mass
 
 BACKENDS = ("compiled", "pinocchio")
+_ARGUMENTS = {  # of the quantities that `derivatives` takes
+    "inverse": ("q_a", "v_a", "a_a"),
+    "forward": ("q_a", "v_a", "tau_a"),
+    "mass_matrix": ("q_a",),
+    "bias": ("q_a", "v_a"),
+    "gravity": ("q_a",),
+    "friction": ("q_a", "v_a"),
+    "passive": ("q_a", "v_a"),
+    "energy": ("q_a", "v_a"),
+    "regressor": ("q_a", "v_a", "a_a"),
+}
 
 
 class Dynamics:
@@ -61,13 +72,12 @@ class Dynamics:
                 "without masses there is kinematics, and no dynamics"
             )
         self.machine, self.formulation = machine, formulation
-        self.carriers = carriers(machine, formulation)
-        self.plan = planned(machine) if formulation == "exact" else ()
         self.forces = JointForces(machine)
-        self.spans = spans_of(machine, self.forces)
+        self.form = Form.of(machine, formulation, self.forces)
         self.backend = backend if machine.closure.compiled else "pinocchio"
-        self.tree = TreeDynamics(machine, self.forces, self.carriers)
+        self.tree = TreeDynamics(machine, self.forces, self.form.carriers)
         self._formulas: dict[str, QuantityCode | None] = {}
+        self._named_codes: dict[tuple[str, tuple[str, ...]], NamedCode] = {}
         self.numbers = np.zeros(0)
         if self.backend == "compiled":
             geometry = machine.closure.fast.geometry
@@ -213,6 +223,137 @@ class Dynamics:
         size = 10 * (model.njoints - 1) + np.count_nonzero(model.armature)
         return self._evaluate("regressor", (self._n, size), q_a, v_a, a_a, "a_a")
 
+    def derivatives(
+        self,
+        quantity: str,
+        q_a: ArrayLike,
+        v_a: ArrayLike | None = None,
+        x: ArrayLike | None = None,
+        *,
+        friction: bool = False,
+        by: Sequence[str] | None = None,
+    ) -> dict[str, Array]:
+        """Exact derivatives of a quantity through the closed loops.
+
+        By the state and the second argument, along the motions of the active joints:
+        dq = gamma dq_A (of a floating base along its twist). By numbers of the machine at the same
+        q_A, v_A and second argument: J_P dq_P = -(dphi/dp) dp. Inverse and forward dynamics
+        without floating bases have formulas of their own (`crane.dynamics.sensitivity`), which
+        cost a few evaluations; everything else is differentiated operation by operation. Friction
+        that sticks has, at rest, the derivatives of its offset alone; an end stop those of the
+        side that it is on.
+
+        Args:
+            quantity: "inverse", "forward", "mass_matrix", "bias", "gravity", "friction",
+                "passive", "energy" (kinetic, then potential) or "regressor".
+            q_a: (n,) or (N, n) [m], [rad].
+            v_a: The same shape [m/s], [rad/s], where the quantity depends on it.
+            x: The second argument of inverse and regressor (a_A) and of forward (tau_A), the same
+                shape.
+            friction: Whether friction is in, of inverse and forward.
+            by: Of "q_a", "v_a", "a_a", "tau_a", and names of
+                `crane.description.parameters` such as "boom.mass", "lift_eye.x",
+                "friction.lift.viscous". All the arguments there are if not given.
+
+        Returns:
+            By name, arrays of the quantity's shape and one more axis (n,) for the arguments; of
+            the quantity's shape for numbers.
+
+        Raises:
+            InputError: An unknown quantity or name, a missing argument, or a machine whose
+                formulas take too long to compile.
+        """
+        if quantity not in _ARGUMENTS:
+            raise InputError(f"quantity '{quantity}' is unknown, {known(_ARGUMENTS, quantity)}")
+        n, asked = self._n, _ARGUMENTS[quantity]
+        if friction and quantity not in ("inverse", "forward"):
+            raise InputError(
+                f"'{quantity}' is without friction or with its own, leave friction out"
+            )
+        rows: dict[str, Array] = {}
+        for name, given in zip(asked, (q_a, v_a, x), strict=False):
+            if given is None:
+                raise InputError(f"derivatives of '{quantity}' need {name}, give it")
+            rows[name] = as_samples(given, n, name, self.machine.active)
+        by = asked if by is None else by
+        lengths = {len(array) for array in rows.values() if array.ndim == 2}
+        if len(lengths) > 1:
+            raise InputError(
+                f"stacks of {sorted(lengths)} samples do not go together, give equal N"
+            )
+        count = lengths.pop() if lengths else 1
+        stacked = any(array.ndim == 2 for array in rows.values())
+        q = self.machine.closure.solve(np.broadcast_to(rows["q_a"], (count, n)))
+        inputs = np.zeros((count, 2 * n))
+        for i, name in enumerate(asked[1:]):
+            inputs[:, i * n : (i + 1) * n] = rows[name]
+        key = quantity.replace("_", " ") + (FRICTION if friction else "")
+        shape = self._shape(quantity)
+        states = [name for name in by if name in asked]
+        numbers = [name for name in by if name not in ("q_a", "v_a", "a_a", "tau_a")]
+        if wrong := [name for name in by if name not in (*states, *numbers)]:
+            raise InputError(
+                f"'{quantity}' does not depend on {wrong[0]}, take {', '.join(asked)}"
+            )
+        found: dict[str, Array] = {}
+        if states:
+            formula = self._compiled(SLOPES + key)
+            flat = np.empty((count, formula.size))
+            formula.along(np.ascontiguousarray(q), inputs, flat)
+            parts = flat.reshape(count, 3, *shape, n)
+            found = {name: parts[:, asked.index(name)].copy() for name in states}
+        if numbers:
+            code = self._named_code(key, numbers)
+            every = np.array([code.at(*row) for row in zip(q, inputs, strict=True)])
+            every = every.reshape(count, *shape, len(numbers))
+            found |= {name: every[..., i].copy() for i, name in enumerate(numbers)}
+        return {name: found[name] if stacked else found[name][0] for name in by}
+
+    def _shape(self, quantity: str) -> tuple[int, ...]:
+        n, model = self._n, self.machine.model
+        shapes = {
+            "mass_matrix": (n, n),
+            "energy": (2,),
+            "regressor": (n, 10 * (model.njoints - 1) + np.count_nonzero(model.armature)),
+        }
+        return shapes.get(quantity, (n,))
+
+    def _compiled(self, quantity: str) -> QuantityCode:
+        formula = self._formula(quantity)
+        if formula is None:
+            raise InputError(
+                f"'{self.machine.name}' has no formulas to differentiate, "
+                + (
+                    "take the compiled backend"
+                    if self.machine.closure.compiled and self.backend != "compiled"
+                    else "it is too large: lock joints"
+                )
+            )
+        return formula
+
+    def _named_code(self, quantity: str, names: Sequence[str]) -> NamedCode:
+        """Machine code of derivatives by numbers of the machine."""
+        self._compiled(quantity)
+        key = quantity, tuple(names)
+        if key not in self._named_codes:
+            closure = self.machine.closure
+            constants = Named(self.machine).slopes(names, self.constants)
+            geometry, numbers = np.split(constants, [len(closure.fast.geometry.numbers)], axis=1)
+            geometry[:, -1] = 0.0  # the size that residuals are measured by
+            self._named_codes[key] = NamedCode(
+                quantity, self.machine, self.numbers, self.pattern, self.form, geometry, numbers
+            )
+        return self._named_codes[key]
+
+    def constants(self, variant: Machine) -> Array:
+        """Those of its formulas: geometry, then `numbers`."""
+        geometry = geometry_of(variant.closure.equations)
+        if geometry.parents != self.machine.closure.fast.geometry.parents:
+            raise InputError("the tree is not the same")
+        return np.concatenate(
+            [geometry.numbers, numbers_of(variant, geometry, JointForces(variant))]
+        )
+
     def drive_forces(
         self, q_a: ArrayLike, tau_a: ArrayLike, sharing: Mapping[str, float] | None = None
     ) -> Array:
@@ -322,16 +463,7 @@ class Dynamics:
         if quantity not in self._formulas:
             try:
                 self._formulas[quantity] = (
-                    QuantityCode(
-                        quantity,
-                        self.machine,
-                        self.numbers,
-                        self.pattern,
-                        self.carriers,
-                        self.plan,
-                        self.spans,
-                        self.forces.sticking,
-                    )
+                    QuantityCode(quantity, self.machine, self.numbers, self.pattern, self.form)
                     if self.backend == "compiled"
                     else None
                 )

@@ -9,11 +9,11 @@ M and I are symmetric. Wrenches and inertias refer to that point.
 
 from collections.abc import Callable, Sequence
 
+from crane.closure.screws import Pair, Vector
 from crane.codegen.factors import Positive
 from crane.codegen.scalar import (
     Number,
     add,
-    cross,
     dot,
     product,
     scale,
@@ -22,24 +22,7 @@ from crane.codegen.scalar import (
     transposed,
 )
 
-Vector = list[Number]
 Matrix = list[Vector]
-Pair = tuple[Vector, Vector]  # linear and angular part
-
-
-def paired(one: Pair, two: Pair) -> Number:
-    """Power of a wrench on a motion."""
-    return dot(one[0], two[0]) + dot(one[1], two[1])
-
-
-def plus(*pairs: Pair) -> Pair:
-    """Sum of pairs."""
-    return add(*(pair[0] for pair in pairs)), add(*(pair[1] for pair in pairs))
-
-
-def by(factor: Number, pair: Pair) -> Pair:
-    """A factor times a pair."""
-    return scale(factor, pair[0]), scale(factor, pair[1])
 
 
 def halved(factors: Positive, pairs: Sequence[Pair]) -> list[Pair]:
@@ -50,18 +33,6 @@ def halved(factors: Positive, pairs: Sequence[Pair]) -> list[Pair]:
 
 def _flat(pair: Pair) -> Vector:
     return [*pair[0], *pair[1]]
-
-
-def shifted(motion: Pair, arm: Vector) -> Pair:
-    """How a point that `arm` leads to moves with one that moves so."""
-    linear, angular = motion
-    return add(linear, cross(angular, arm)), angular
-
-
-def carried(wrench: Pair, arm: Vector) -> Pair:
-    """A wrench at a point, referred to the point from which `arm` leads there."""
-    force, moment = wrench
-    return force, add(moment, cross(arm, force))
 
 
 class Inertia:

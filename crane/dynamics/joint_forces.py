@@ -5,7 +5,7 @@ from collections import Counter
 import numpy as np
 
 from crane.common.samples import Array
-from crane.description import ForceElement, GasSpring, Rope
+from crane.description import ForceElement, Friction, GasSpring, Rope
 from crane.dynamics.lengths import Lengths, Pair
 from crane.machine import Machine
 
@@ -31,8 +31,8 @@ class JointForces:
     A passive force acts along a coordinate: that of a joint, or the distance of two frames. The
     law is the same; what acts along a distance l acts on the joints with F dl/dv.
 
-    The laws stand here in numpy and once more as formulas, `Sweep._law` of
-    `crane.dynamics.traced`, on purpose: each is what checks the other.
+    The laws stand here in numpy and once more as formulas, `effects` of
+    `crane.dynamics.law`, on purpose: each is what checks the other.
 
     Args:
         machine: The machine whose `friction`, `forces`, `gas_springs`, `ropes` and `end_stops`
@@ -55,9 +55,9 @@ class JointForces:
         rows, pairs = _rows(machine)
         self._joints, self.lengths = machine.model.nv, Lengths(machine, pairs)
         table = self.table = np.zeros((self._joints + len(pairs), len(_LAW)))
-        table[:, _LAW.index("sharpness")] = 1.0
         self.sticking, self.moving = sticking(machine), 1.0
-        for joint, friction in machine.friction.items():
+        every = dict.fromkeys(machine.joints, Friction()) | dict(machine.friction)
+        for joint, friction in every.items():
             table[machine.column(joint), :7] = (
                 friction.coulomb,
                 friction.coulomb_offset,

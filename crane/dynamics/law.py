@@ -2,10 +2,11 @@
 
 from typing import NamedTuple
 
-from crane.closure.traced import Vector
+from crane.closure.screws import Vector
 from crane.codegen.scalar import Number, apply, maximum, where_positive
 
 NUMBERS = 22  # of a law, see `JointForces.table`
+_SHARPNESS = 4
 SLIP = 7  # where the three are that change with the motion: slip, held, pace
 STOP = 14  # where those of its stops are: stiffness, damping, lower, upper
 
@@ -31,7 +32,22 @@ class Effects(NamedTuple):
 NONE = Effects(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def effects(law: Vector, q: Number, rate: Number, modes: bool = False) -> Effects:
+def sign_of(law: Vector, rate: Number, sticks: bool, modes: bool) -> Number:
+    """Of a joint's friction: that of the slip where it sticks, else smoothed.
+
+    Args:
+        law: (22,), see `JointForces.table`.
+        rate: Velocity.
+        sticks: Whether friction sticks there.
+        modes: Whether the law's numbers say the sign of what sticks, not the velocity.
+    """
+    if sticks:
+        back = where_positive(-1.0 * rate, -1.0, 0.0)
+        return law[SLIP] if modes else where_positive(rate, 1.0, back)
+    return apply("tanh", law[_SHARPNESS] * rate)
+
+
+def effects(law: Vector, q: Number, rate: Number, sticks: bool, modes: bool) -> Effects:
     """What the law does.
 
     Written apart from `JointForces`, which has the same in numpy, so that each checks the other.
@@ -40,16 +56,17 @@ def effects(law: Vector, q: Number, rate: Number, modes: bool = False) -> Effect
         law: (22,), see `JointForces.table`.
         q: Position.
         rate: Velocity.
-        modes: Whether its numbers say the sign of friction, not the velocity.
+        sticks: See `sign_of`.
+        modes: Likewise.
     """
     (
-        coulomb, coulomb_offset, viscous, viscous_offset, sharpness, stiction, stribeck,
-        slip, _, _, stiffness, damping, constant, slack, stop, stop_damping, lower, upper,
+        coulomb, coulomb_offset, viscous, viscous_offset, _, stiction, stribeck,
+        _, _, _, stiffness, damping, constant, slack, stop, stop_damping, lower, upper,
         gas, gas_share, gas_rest, gas_exponent,
     ) = law  # fmt: skip
     friction = viscous * rate + coulomb_offset
     if coulomb != 0.0 or viscous_offset != 0.0 or stiction != 0.0:
-        sign = slip if modes else apply("tanh", sharpness * rate)
+        sign = sign_of(law, rate, sticks, modes)
         if stiction != 0.0:
             slow = stribeck * rate
             coulomb = coulomb + stiction * apply("exp", -1.0 * (slow * slow))

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from crane.closure.screws import Pair, Vector, by, carried, plus, shifted
 from crane.closure.traced import Bodies, Loops, MovingBodies
 from crane.codegen.scalar import Number
-from crane.dynamics.inertia import Inertia, Pair, Vector, by, carried, plus, shifted
+from crane.dynamics.inertia import Inertia
 
 Hanging = tuple[Inertia, Pair]  # an inertia, and the wrench that it asks for at rest
 Hung = dict[int, Hanging]  # what hangs on bodies, by their number, at their origin
-NONE: Pair = ([0.0] * 3, [0.0] * 3)
 
 
 @dataclass(frozen=True)

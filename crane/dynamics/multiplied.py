@@ -4,10 +4,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from crane.closure.clusters import Cluster
+from crane.closure.screws import NONE, Pair, Vector, by, carried, paired, plus, shifted
 from crane.codegen.factors import Positive
 from crane.codegen.scalar import Number, dot
-from crane.dynamics.inertia import Pair, Vector, by, carried, halved, paired, plus, shifted
-from crane.dynamics.moving import NONE, Hung, Moving, hang
+from crane.dynamics.inertia import halved
+from crane.dynamics.moving import Hung, Moving, hang
 
 
 class Multiplied:

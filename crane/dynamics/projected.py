@@ -3,10 +3,11 @@
 from collections.abc import Iterator, Sequence
 
 from crane.closure.clusters import Cluster
+from crane.closure.screws import Pair, by, carried, paired, plus
 from crane.codegen.factors import Positive
 from crane.codegen.scalar import Number, dot
 from crane.dynamics.composite import Columns
-from crane.dynamics.inertia import Inertia, Pair, by, carried, halved, paired, plus
+from crane.dynamics.inertia import Inertia, halved
 from crane.dynamics.moving import Hung, Moving, hang
 
 

@@ -24,8 +24,8 @@ import numpy as np
 import pinocchio as pin
 
 from crane.closure.clusters import Cluster, clusters_of
-from crane.dynamics.inertia import Vector
-from crane.dynamics.moving import NONE, Hung, Moving, hang
+from crane.closure.screws import NONE, Vector
+from crane.dynamics.moving import Hung, Moving, hang
 from crane.dynamics.multiplied import Multiplied
 from crane.dynamics.projected import Projected
 from crane.machine import Machine

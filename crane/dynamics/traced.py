@@ -7,7 +7,8 @@ from functools import cached_property
 import numpy as np
 
 from crane.closure.rotations import turned_by, vector_rate
-from crane.closure.traced import Bodies, Constants, Geometry, Loops, MovingBodies, Vector
+from crane.closure.screws import Pair, Vector
+from crane.closure.traced import Bodies, Constants, Geometry, Loops, MovingBodies
 from crane.codegen.factors import Positive
 from crane.codegen.scalar import (
     Number,
@@ -25,12 +26,12 @@ from crane.codegen.scalar import (
 )  # fmt: skip
 from crane.common.samples import Array
 from crane.dynamics.composite import Composite
-from crane.dynamics.inertia import Pair
+from crane.dynamics.formulation import carriers
 from crane.dynamics.joint_forces import AT_REST, STILL, JointForces
-from crane.dynamics.law import NONE, NUMBERS, SLIP, STOP, Effects, effects
+from crane.dynamics.law import NONE, NUMBERS, SLIP, STOP, Effects, effects, sign_of
 from crane.dynamics.lengths import LEAST
 from crane.dynamics.moving import Moving
-from crane.dynamics.recursion import Plan, accelerations
+from crane.dynamics.recursion import Plan, accelerations, planned
 from crane.machine import Machine
 
 BODY = 10  # numbers of a body
@@ -74,10 +75,34 @@ def modes_at(machine: Machine, forces: JointForces) -> list[int]:
     return [first + NUMBERS * i + k for i in forces.sticking for k in range(3)] + [last]
 
 
-def spans_of(machine: Machine, forces: JointForces) -> Spans:
-    """The bodies that the ends of each distance of `JointForces.lengths` are on."""
-    bodies = machine.coordinates.bodies
-    return tuple((bodies[one], bodies[two]) for (one, _), (two, _) in forces.lengths.ends)
+@dataclass(frozen=True)
+class Form:
+    """What a machine's formulas depend on besides its loops and numbers.
+
+    Attributes:
+        carriers: See `crane.dynamics.formulation`.
+        plan: How forward dynamics goes through the machine's clusters; see
+            `crane.dynamics.recursion`.
+        spans: By distance of `JointForces.lengths` the bodies that its ends are on.
+        sticking: Columns of the joints whose friction sticks.
+    """
+
+    carriers: tuple[int, ...]
+    plan: Plan
+    spans: Spans
+    sticking: tuple[int, ...]
+
+    @classmethod
+    def of(cls, machine: Machine, formulation: str, forces: JointForces) -> "Form":
+        """That of a machine.
+
+        Raises:
+            InputError: Unknown formulation.
+        """
+        bodies = machine.coordinates.bodies
+        spans = ((bodies[one], bodies[two]) for (one, _), (two, _) in forces.lengths.ends)
+        plan = planned(machine) if formulation == "exact" else ()
+        return cls(carriers(machine, formulation), plan, tuple(spans), forces.sticking)
 
 
 @dataclass(frozen=True)
@@ -107,14 +132,17 @@ class Sweep:
         constants: See `numbers_of`.
         q: (nb,).
         v_a: (n,).
-        carriers: See `crane.dynamics.formulation`.
-        plan: How forward dynamics goes through the machine's clusters; see
-            `crane.dynamics.recursion`.
-        spans: See `spans_of`.
-        sticking: Columns of the joints whose friction sticks.
-        modes: Whether `JointForces.set_modes` says what these do, not their velocities.
+        form: What goes where.
+        modes: Whether `JointForces.set_modes` says what joints do whose friction sticks, not their
+            velocities.
+        drift: If it is known already.
 
     Attributes:
+        posture: Bodies.
+        loops: Loops.
+        q: (nb,).
+        v_a: (n,).
+        rotors: (nb + 1,) rotor inertias, 0 for the world.
         gamma: Rows of gamma by joint.
         rates: (nb + 1,) joint velocities, 0 for the world.
         drift: (nb + 1,) accelerations of the joints at a_A = 0.
@@ -127,15 +155,13 @@ class Sweep:
         constants: Constants,
         q: Sequence[Number],
         v_a: Sequence[Number],
-        carriers: Sequence[int],
-        plan: Plan = (),
-        spans: Spans = (),
-        sticking: Sequence[int] = (),
+        form: Form,
         modes: bool = False,
+        drift: Vector | None = None,
     ):
-        self._sticking, self._modes = sticking, modes
-        self._carriers, self._plan, self._spans = carriers, plan, spans
-        self._posture, self._loops, self._q = posture, loops, q
+        self.form, self._modes = form, modes
+        self.v_a = list(v_a)
+        self.posture, self.loops, self.q = posture, loops, q
         self._size = len(posture.geometry.parents)
         self._n = len(v_a)
         bodies = self._size - 1
@@ -144,29 +170,31 @@ class Sweep:
         self._laws = [constants.vector(first + NUMBERS * i, NUMBERS) for i in range(bodies)]
         gravity = constants.vector((BODY + NUMBERS) * bodies)
         self._gravity = times(posture.rotation[0], gravity)
-        self._rotors: Vector = [0.0, *constants.vector((BODY + NUMBERS) * bodies + 3, bodies)]
+        self.rotors: Vector = [0.0, *constants.vector((BODY + NUMBERS) * bodies + 3, bodies)]
         after = (BODY + NUMBERS + 1) * bodies + 3
         self._span_numbers = [
-            constants.vector(after + (NUMBERS + 6) * k, NUMBERS + 6) for k in range(len(spans))
+            constants.vector(after + (NUMBERS + 6) * k, NUMBERS + 6)
+            for k in range(len(form.spans))
         ]
-        self._moving = constants[after + (NUMBERS + 6) * len(spans)]
+        self._moving = constants[after + (NUMBERS + 6) * len(form.spans)]
         self.gamma = loops.gamma
         self.rates: Vector = [0.0, *(dot(self.gamma[i], v_a) for i in range(1, self._size))]
         # the loops' drift is that of the whole machine whatever carries a body
         whole, alone = (
             MovingBodies(posture, loops, self.rates, self._gravity, parents)
-            for parents in (posture.geometry.parents, carriers)
+            for parents in (posture.geometry.parents, form.carriers)
         )
-        self.drift, self._whole, self._motion = whole.drift, whole, alone
+        self.drift = whole.drift if drift is None else drift
+        self._whole, self._motion = whole, alone
 
     @cached_property
     def _columns(self) -> list[list[tuple[Vector, Vector]]]:
         """Per body dV/dv_A (linear at the trunk's origin, angular) by column, then the drift."""
         columns: list[list[tuple[Vector, Vector]]] = [[([0.0] * 3, [0.0] * 3)] * (self._n + 1)]
         for i in range(1, self._size):
-            linear, angular = self._posture.columns[i]
+            linear, angular = self.posture.columns[i]
             factors = [*self.gamma[i], self.drift[i]]
-            carried = columns[self._carriers[i]]
+            carried = columns[self.form.carriers[i]]
             columns.append(
                 [
                     (add(v, scale(factor, linear)), add(w, scale(factor, angular)))
@@ -181,7 +209,7 @@ class Sweep:
         out: list[tuple[Number, Vector, list[Vector]]] = []
         for i in range(1, self._size):
             mass, *rest = self._inertias[i - 1]
-            rotation = self._posture.rotation[i]
+            rotation = self.posture.rotation[i]
             xx, xy, xz, yy, yz, zz = rest[3:]
             half = product(rotation, [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             tensor: list[Vector] = [[0.0] * 3 for _ in range(3)]
@@ -192,9 +220,9 @@ class Sweep:
         return out
 
     @cached_property
-    def _bodies(self) -> list[tuple[Number, Vector, list[Vector]]]:
+    def bodies(self) -> list[tuple[Number, Vector, list[Vector]]]:
         """Per body mass, COM, inertia about it, in the trunk's frame."""
-        origins = self._posture.origin[1:]
+        origins = self.posture.origin[1:]
         return [
             (mass, add(origin, lever), tensor)
             for origin, (mass, lever, tensor) in zip(origins, self._masses, strict=True)
@@ -202,19 +230,19 @@ class Sweep:
 
     def _at_centre(self, i: int) -> list[tuple[Vector, Vector]]:
         """Columns of body i: linear at its COM, angular."""
-        _, centre, _ = self._bodies[i - 1]
+        _, centre, _ = self.bodies[i - 1]
         return [(add(v, cross(w, centre)), w) for v, w in self._columns[i][: self._n]]
 
     @cached_property
     def mass(self) -> list[Vector]:
         """M_A = sum J_b^T I_b J_b + sum gamma_i^T I_r,i gamma_i."""
-        if self._plan:
-            clusters = [cluster for cluster, _ in self._plan]
-            masses, rotors = self._masses, self._rotors
-            return Composite(self._posture, self._loops, masses, rotors, clusters).mass
+        if self.form.plan:
+            clusters = [cluster for cluster, _ in self.form.plan]
+            masses, rotors = self._masses, self.rotors
+            return Composite(self.posture, self.loops, masses, rotors, clusters).mass
         out: list[Vector] = [[0.0] * self._n for _ in range(self._n)]
         for i in range(1, self._size):
-            mass, _, tensor = self._bodies[i - 1]
+            mass, _, tensor = self.bodies[i - 1]
             columns = self._at_centre(i)
             for k, (v, w) in enumerate(columns):
                 momentum, spin = scale(mass, v), times(tensor, w)
@@ -224,10 +252,10 @@ class Sweep:
         for i, row in self.gamma.items():
             for k in range(self._n):
                 for j in range(k + 1):
-                    out[j][k] = out[k][j] = out[k][j] + self._rotors[i] * row[k] * row[j]
+                    out[j][k] = out[k][j] = out[k][j] + self.rotors[i] * row[k] * row[j]
         return out
 
-    def _projected(self, along: Sequence[Number]) -> Vector:
+    def projected(self, along: Sequence[Number]) -> Vector:
         """gamma^T of forces along the joints (nb + 1,)."""
         out: Vector = [0.0] * self._n
         for i, row in self.gamma.items():
@@ -244,41 +272,51 @@ class Sweep:
         out: Vector = [0.0] * self._size
         for i in range(self._size - 1, 0, -1):
             force, moment = forces[i - 1], moments[i - 1]
-            axis = self._posture.axis(i)
-            out[i] = dot(axis, moment if self._posture.geometry.revolute[i] else force)
-            carrier = self._carriers[i]
+            axis = self.posture.axis(i)
+            out[i] = dot(axis, moment if self.posture.geometry.revolute[i] else force)
+            carrier = self.form.carriers[i]
             if carrier:
-                arm = self._posture.arms[i]
+                arm = self.posture.arms[i]
                 forces[carrier - 1] = add(forces[carrier - 1], force)
                 moments[carrier - 1] = add(moments[carrier - 1], moment, cross(arm, force))
         return out
 
-    def _wrenches(self, rates: Sequence[Number]) -> list[Pair]:
-        """Wrenches about the COMs that accelerate the joints so (nb + 1,), weights included."""
+    def motions(self, rates: Sequence[Number]) -> tuple[list[Pair], list[Pair]]:
+        """Velocities and accelerations of the bodies whose joints accelerate so (nb + 1,).
+
+        Linear at the trunk's origin, angular; the world accelerates with -gravity.
+        """
         gained: list[Pair] = [([0.0] * 3, [0.0] * 3)]
-        wrenches: list[Pair] = []
         for i in range(1, self._size):
-            mass, centre, tensor = self._bodies[i - 1]
-            linear, angular = (scale(rates[i], part) for part in self._posture.columns[i])
-            before = gained[self._carriers[i]]
+            linear, angular = (scale(rates[i], part) for part in self.posture.columns[i])
+            before = gained[self.form.carriers[i]]
             gained.append((add(before[0], linear), add(before[1], angular)))
-            v, w = self._motion.velocity[i]
-            a, e = (
-                add(*parts) for parts in zip(self._motion.acceleration[i], gained[i], strict=True)
-            )
+        accelerations = [
+            (add(a, more), add(e, turned))
+            for (a, e), (more, turned) in zip(self._motion.acceleration, gained, strict=True)
+        ]
+        return self._motion.velocity, accelerations
+
+    def wrenches(self, rates: Sequence[Number]) -> list[Pair]:
+        """Wrenches about the COMs that accelerate the joints so (nb + 1,), weights included."""
+        wrenches: list[Pair] = []
+        velocities, accelerations = self.motions(rates)
+        for i in range(1, self._size):
+            mass, centre, tensor = self.bodies[i - 1]
+            (v, w), (a, e) = velocities[i], accelerations[i]
             at = add(a, cross(e, centre), cross(w, add(v, cross(w, centre))))
             wrenches.append((scale(mass, at), add(times(tensor, e), cross(w, times(tensor, w)))))
         return wrenches
 
     def _along_inertial(self, rates: Sequence[Number]) -> Vector:
         """Forces along the joints (nb + 1,) that accelerate them so, weights included."""
-        rotors = [inertia * rate for inertia, rate in zip(self._rotors, rates, strict=True)]
-        return add(self._along_tree(self._wrenches(rates)), rotors)
+        rotors = [inertia * rate for inertia, rate in zip(self.rotors, rates, strict=True)]
+        return add(self._along_tree(self.wrenches(rates)), rotors)
 
     @cached_property
     def inertial_bias(self) -> Vector:
         """Sum J_b^T (I_b a_b + v_b x* I_b v_b) at a_A = 0, weights and rotors included."""
-        return self._projected(self._along_inertial(self.drift))
+        return self.projected(self._along_inertial(self.drift))
 
     @cached_property
     def weight(self) -> Vector:
@@ -286,13 +324,14 @@ class Sweep:
         wrenches: list[Pair] = [
             (scale(-mass, self._gravity), [0.0] * 3) for mass, _, _ in self._masses
         ]
-        return self._projected(self._along_tree(wrenches))
+        return self.projected(self._along_tree(wrenches))
 
     @cached_property
     def _at_joints(self) -> list[Effects]:
         """What happens at all joints (nb + 1,)."""
-        every = zip(self._laws, self._q, self.rates[1:], strict=True)
-        laws = (effects(*x, self._modes and i in self._sticking) for i, x in enumerate(every))
+        every = zip(self._laws, self.q, self.rates[1:], strict=True)
+        sticking = self.form.sticking
+        laws = (effects(*x, i in sticking, self._modes) for i, x in enumerate(every))
         return [NONE, *laws]
 
     @cached_property
@@ -303,8 +342,8 @@ class Sweep:
         The force along it is a wrench [u; p_2 x u] on the second body, and its reaction on the
         first, so what carries both feels nothing.
         """
-        posture, out = self._posture, []
-        for bodies, numbers in zip(self._spans, self._span_numbers, strict=True):
+        posture, out = self.posture, []
+        for bodies, numbers in zip(self.form.spans, self._span_numbers, strict=True):
             law, places = numbers[:NUMBERS], (numbers[NUMBERS:-3], numbers[-3:])
             one, two = (
                 add(posture.origin[body], times(posture.rotation[body], place))
@@ -321,7 +360,7 @@ class Sweep:
                 slope = dot(direction, linear) + dot(moment, angular)
                 slopes[i] = slope if i in behind else -slope
             rate = dot(list(slopes.values()), [self.rates[i] for i in slopes])
-            out.append((slopes, effects(law, length, rate), length))
+            out.append((slopes, effects(law, length, rate, False, False), length))
         return out
 
     @cached_property
@@ -366,7 +405,7 @@ class Sweep:
             size: Of the machine, that of ropes [m].
         """
         out: Vector = []
-        for law, q, unit in zip(self._laws, self._q, units, strict=True):
+        for law, q, unit in zip(self._laws, self.q, units, strict=True):
             if law[STOP] != 0.0:
                 out += [(q - law[STOP + 3]) * (1.0 / unit), (law[STOP + 2] - q) * (1.0 / unit)]
         for numbers, (_, _, length) in zip(self._span_numbers, self._at_lengths, strict=True):
@@ -377,7 +416,7 @@ class Sweep:
     @property
     def ways(self) -> list[Vector]:
         """d(slopes)/dv_A (nb, n), none of free-flyers."""
-        flying = {i + k for i in self._posture.geometry.flyers for k in range(6)}
+        flying = {i + k for i in self.posture.geometry.flyers for k in range(6)}
         none: Vector = [0.0] * self._n
         return [none if i in flying else self.gamma[i] for i in range(1, self._size)]
 
@@ -385,8 +424,8 @@ class Sweep:
     def free(self) -> Vector:
         """(n,) 0 of active joints that are at rest to the last bit, else 1."""
         out: Vector = [self._moving] * self._n
-        held = {i: self._laws[i][SLIP + 1] for i in self._sticking}
-        for k, joint in enumerate(self._loops.active_joints):
+        held = {i: self._laws[i][SLIP + 1] for i in self.form.sticking}
+        for k, joint in enumerate(self.loops.active_joints):
             if joint - 1 in held:
                 out[k] = self._moving * (1.0 - held[joint - 1])
         return out
@@ -394,10 +433,17 @@ class Sweep:
     @property
     def slopes(self) -> Vector:
         """Time derivatives of the coordinates (nb,): the rates, but of rotation vectors."""
-        out = list(self.rates[1:])
-        for i in self._posture.geometry.flyers:
+        return self._slopes(self.rates)
+
+    def way(self, k: int) -> Vector:
+        """How the coordinates (nb,) change with the motion v_k = 1."""
+        return self._slopes([0.0, *(self.gamma[i][k] for i in range(1, self._size))])
+
+    def _slopes(self, rates: Vector) -> Vector:
+        out = list(rates[1:])
+        for i in self.posture.geometry.flyers:
             linear, angular = out[i - 1 : i + 2], out[i + 2 : i + 5]
-            vector = self._q[i + 2 : i + 5]
+            vector = self.q[i + 2 : i + 5]
             out[i - 1 : i + 2] = times(turned_by(vector), linear)
             out[i + 2 : i + 5] = vector_rate(vector, angular)
         return out
@@ -405,12 +451,12 @@ class Sweep:
     @property
     def passive(self) -> Vector:
         """gamma^T f."""
-        return self._projected(self._passive)
+        return self.projected(self._passive)
 
     @property
     def friction(self) -> Vector:
         """gamma^T tau_F."""
-        return self._projected(self._friction)
+        return self.projected(self._friction)
 
     @property
     def dissipation(self) -> Number:
@@ -426,11 +472,11 @@ class Sweep:
         velocity = self._motion.velocity
         total: Number = 0.0
         for i in range(1, self._size):
-            mass, centre, tensor = self._bodies[i - 1]
+            mass, centre, tensor = self.bodies[i - 1]
             v, w = velocity[i]
             at = add(v, cross(w, centre))
             total = total + 0.5 * mass * dot(at, at) + 0.5 * dot(w, times(tensor, w))
-        for inertia, rate in zip(self._rotors, self.rates, strict=True):
+        for inertia, rate in zip(self.rotors, self.rates, strict=True):
             total = total + 0.5 * inertia * rate * rate
         return total
 
@@ -440,32 +486,32 @@ class Sweep:
         total: Number = 0.0
         for found in self._everywhere:
             total = total + found.stored
-        for mass, centre, _ in self._bodies:
-            height = subtract(centre, self._posture.origin[0])
+        for mass, centre, _ in self.bodies:
+            height = subtract(centre, self.posture.origin[0])
             total = total - mass * dot(self._gravity, height)
         return total
 
     def inverse(self, a_a: Sequence[Number], friction: bool) -> Vector:
         """M_A a_A + bias - passive [+ friction]; friction at rest is against the acceleration."""
         rates = [0.0, *(dot(row, a_a) + self.drift[i] for i, row in sorted(self.gamma.items()))]
-        along = subtract(self._along_inertial(rates), self._forces(friction))
-        for i in self._sticking if friction else ():
+        along = subtract(self._along_inertial(rates), self.forces(friction))
+        for i in self.form.sticking if friction else ():
             law, rate = self._laws[i], rates[i + 1]
-            sign = law[SLIP] if self._modes else apply("tanh", law[4] * self.rates[i + 1])
+            sign = sign_of(law, self.rates[i + 1], True, self._modes)
             back = where_positive(-STILL - rate, -1.0, 0.0)
             start = (law[0] + law[5]) * (where_positive(rate - STILL, 1.0, back) - sign)
             along[i + 1] = along[i + 1] + where_positive(1.0 - apply("abs", sign), start, 0.0)
-        return self._projected(along)
+        return self.projected(along)
 
-    def _forces(self, friction: bool) -> Vector:
+    def forces(self, friction: bool) -> Vector:
         """Forces along the joints (nb + 1,) that nobody commands."""
         return subtract(self._passive, self._friction) if friction else self._passive
 
     def forward(self, tau: Sequence[Number], friction: bool) -> Vector:
         """M_A^-1 (tau - bias + passive [- friction])."""
-        if self._plan and self._n > _SOLVED:
+        if self.form.plan and self._n > _SOLVED:
             return self._recursive(tau, friction)
-        right = add(tau, self._projected(self._forces(friction)))
+        right = add(tau, self.projected(self.forces(friction)))
         return Positive(self.mass).solve(subtract(right, self.inertial_bias))
 
     def resting(self, tau: Sequence[Number]) -> Vector:
@@ -473,18 +519,18 @@ class Sweep:
 
         Of the joints whose friction sticks; net is what tau leaves behind bias and friction.
         """
-        rows = [entry for i in self._sticking for entry in self.gamma[i + 1]]
-        drift = [self.drift[i + 1] for i in self._sticking]
+        rows = [entry for i in self.form.sticking for entry in self.gamma[i + 1]]
+        drift = [self.drift[i + 1] for i in self.form.sticking]
         return [*(entry for row in self.mass for entry in row), *rows, *drift, *self._net(tau)]
 
     def _net(self, tau: Sequence[Number]) -> Vector:
         """What is left of tau behind bias and friction."""
-        return subtract(add(tau, self._projected(self._forces(True))), self.inertial_bias)
+        return subtract(add(tau, self.projected(self.forces(True))), self.inertial_bias)
 
     @property
     def held(self) -> list[tuple[Number, Vector]]:
         """Of each joint that can stick, whether it is held, and its row of gamma."""
-        return [(self._laws[i][SLIP + 1], self.gamma[i + 1]) for i in self._sticking]
+        return [(self._laws[i][SLIP + 1], self.gamma[i + 1]) for i in self.form.sticking]
 
     def moved(self, tau: Sequence[Number], rest: bool) -> Moved:
         """Accelerations under active forces, with joints at rest or without.
@@ -498,15 +544,15 @@ class Sweep:
             tau: (n,).
             rest: Whether some joint is at rest.
         """
-        laws = [self._laws[i] for i in self._sticking]
+        laws = [self._laws[i] for i in self.form.sticking]
         slip, held, pace = ([law[SLIP + k] for law in laws] for k in range(3))
         limits = [law[0] + law[5] for law in laws]
-        rates = [self.rates[i + 1] for i in self._sticking]
+        rates = [self.rates[i + 1] for i in self.form.sticking]
         slips = [s * v * p for s, v, p in zip(slip, rates, pace, strict=True)]
         if not rest:
             none: Vector = [0.0] * len(laws)
             return Moved(self.forward(tau, True), none, self.friction, _least(slips))
-        rows = [self.gamma[i + 1] for i in self._sticking]
+        rows = [self.gamma[i + 1] for i in self.form.sticking]
         right = self._net(tau)
         mass = Positive(self.mass)
         half = [scale(w, mass.halved(row)) for w, row in zip(held, rows, strict=True)]
@@ -514,7 +560,7 @@ class Sweep:
         ahead = mass.halved(right)
         matrix = [[dot(one, other) for other in half] for one in weighed]
         asked: Vector = []
-        for k, (i, w) in enumerate(zip(self._sticking, held, strict=True)):
+        for k, (i, w) in enumerate(zip(self.form.sticking, held, strict=True)):
             matrix[k][k] = matrix[k][k] + (1.0 - w)
             asked.append(dot(weighed[k], ahead) + w * self.drift[i + 1])
         reach = Positive(matrix).solve(asked)
@@ -542,27 +588,27 @@ class Sweep:
 
     def _recursive(self, tau: Sequence[Number], friction: bool) -> Vector:
         """The same without M_A."""
-        forces = list(self._forces(friction))
-        for joint, force in zip(self._loops.active_joints, tau, strict=True):
+        forces = list(self.forces(friction))
+        for joint, force in zip(self.loops.active_joints, tau, strict=True):
             forces[joint] = forces[joint] + force
-        still = {i for cluster, by_forces in self._plan if by_forces for i in cluster.joints}
+        still = {i for cluster, by_forces in self.form.plan if by_forces for i in cluster.joints}
         reference = [0.0 if i in still else x for i, x in enumerate(self.drift)]
         moving = Moving(
-            self._posture, self._loops, self._whole, reference, self._masses,
-            self._wrenches(reference), self._rotors, forces,
+            self.posture, self.loops, self._whole, reference, self._masses,
+            self.wrenches(reference), self.rotors, forces,
         )  # fmt: skip
-        rates = accelerations(moving, self._plan)
-        return [rates[joint] for joint in self._loops.active_joints]
+        rates = accelerations(moving, self.form.plan)
+        return [rates[joint] for joint in self.loops.active_joints]
 
     def regressor(self, a_a: Sequence[Number]) -> list[Vector]:
         """Y_A (n, 10 nb + nr), inertial parameters in Pinocchio's joint frames, then rotors'."""
         velocity, acceleration = self._motion.velocity, self._motion.acceleration
         out: list[Vector] = [[] for _ in range(self._n)]
-        for i in sorted(set(range(1, self._size)) - self._posture.geometry.massless):
-            turn = self._posture.geometry.turns[i]
-            axes = product(self._posture.rotation[i], turn.T.tolist())  # columns: joint's axes
+        for i in sorted(set(range(1, self._size)) - self.posture.geometry.massless):
+            turn = self.posture.geometry.turns[i]
+            axes = product(self.posture.rotation[i], turn.T.tolist())  # columns: joint's axes
             local = list(zip(*axes, strict=True))  # rows: trunk to joint
-            origin = self._posture.origin[i]
+            origin = self.posture.origin[i]
             v, w = velocity[i]
             a, e = acceleration[i]
             for k in range(self._n + 1):
@@ -576,7 +622,7 @@ class Sweep:
                 u = times(local, add(linear, cross(angular, origin)))
                 out[k] += _body_row(u, times(local, angular), w, e, at)
         for i, row in sorted(self.gamma.items()):
-            if self._rotors[i] != 0.0:
+            if self.rotors[i] != 0.0:
                 rate = dot(row, a_a) + self.drift[i]
                 for k in range(self._n):
                     out[k].append(row[k] * rate)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -9,7 +10,7 @@ from types import MappingProxyType
 from crane.common.counted import few_warnings
 from crane.common.errors import DescriptionError, InputError
 from crane.common.packages import giving, package_folders, values_by_name
-from crane.description import changed, driven, locked
+from crane.description import MachineSpec, changed, driven, locked
 from crane.description.floating import floated
 from crane.description.sources import WITH, find
 from crane.formats.ambiguity import warn_of_assemblies
@@ -65,6 +66,44 @@ def load(
         return replace(machine, packages=said.packages, arguments=MappingProxyType(said.arguments))
 
 
+class Variants:
+    """The machines that differ from one in their numbers alone.
+
+    Its files are read once.
+
+    Args:
+        machine: As it was loaded; what was put onto it or replaced since is not in its files.
+
+    Attributes:
+        spec: Its description, with its own changes.
+    """
+
+    def __init__(self, machine: Machine):
+        self._machine = machine
+        with few_warnings(), self._giving():
+            unchanged = _described(
+                machine.reference,
+                machine.chosen.get("active"),
+                machine.chosen.get("free"),
+                machine.floats,
+            )
+            self.spec = changed(unchanged, machine.changes)
+        self._unchanged = unchanged
+
+    def machine(self, changes: Mapping[str, float]) -> Machine:
+        """The machine with some of its numbers changed, see `load`."""
+        was, every = self._machine, {**self._machine.changes, **changes}
+        chosen = was.chosen.get("active"), was.chosen.get("free")
+        with few_warnings(), self._giving():
+            made = _assembled(self._unchanged, every, was.locks, *chosen, was.floats)
+        return replace(made, packages=was.packages, arguments=was.arguments)
+
+    def _giving(self) -> AbstractContextManager[object]:
+        was = self._machine
+        folders, values = package_folders(was.packages), values_by_name(was.arguments)
+        return giving(folders, values, was.floats)
+
+
 def _load(
     name: str | Path,
     changes: Mapping[str, float] | None,
@@ -73,11 +112,30 @@ def _load(
     free: Sequence[str] | None,
     floating: bool,
 ) -> Machine:
-    spec, said = read(name), {"active": active, "free": free}
+    spec = _described(name, active, free, floating)
+    return _assembled(spec, changes, lock, active, free, floating)
+
+
+def _described(
+    name: str | Path, active: Sequence[str] | None, free: Sequence[str] | None, floating: bool
+) -> MachineSpec:
+    spec = read(name)
     if floating:
         spec = floated(spec)
     if active is not None or free is not None:
         spec = driven(spec, _names(active, "active"), _names(free, "free"))
+    return spec
+
+
+def _assembled(
+    spec: MachineSpec,
+    changes: Mapping[str, float] | None,
+    lock: Mapping[str, float] | None,
+    active: Sequence[str] | None,
+    free: Sequence[str] | None,
+    floating: bool,
+) -> Machine:
+    said = {"active": active, "free": free}
     if changes:
         spec = changed(spec, changes)
     if lock:

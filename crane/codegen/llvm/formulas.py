@@ -11,7 +11,7 @@ from crane.codegen.llvm.functions import VECTOR, WIDEST, real
 from crane.codegen.representation import Formula
 from crane.codegen.scalar import Expression, Number, needed
 
-WHOLE = 5000  # operations of a formula that stays one function, which runs faster
+WHOLE = 6500  # operations of a formula that stays one function, which runs faster
 PIECE = 1000  # of one of several
 # Products may be fused with sums. Reordering sums would gain nothing and let NaN cancel.
 _FAST = "nsz arcp contract"

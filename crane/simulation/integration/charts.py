@@ -67,9 +67,7 @@ class Chart:
     def formulas(self) -> tuple:
         """What formulas of the chart depend on besides its loops."""
         dynamics = self.dynamics
-        parts = dynamics.carriers, dynamics.plan, dynamics.spans
-        forces = dynamics.forces
-        return folded(dynamics.pattern), *parts, forces.sticking, tuple(self.seen.tolist())
+        return folded(dynamics.pattern), dynamics.form, tuple(self.seen.tolist())
 
     def turns(self, q: Array) -> Array:
         """C (n, n) of closed postures (nq,) or (N, nq): v_A = C v_B."""

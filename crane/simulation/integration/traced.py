@@ -111,10 +111,7 @@ def machine_at(chart: Chart, tape: Tape, layout: Layout, state: int) -> Traced:
     q, posture, loops = closure.fast.trace(tape, 0, state)
     parts = layout.view(tape.loads(state, 0, layout.size))
     constants = Constants(tape, 1, dynamics.pattern)
-    sweep = Sweep(
-        posture, loops, constants, q, parts.v_a, dynamics.carriers, dynamics.plan,
-        dynamics.spans, dynamics.forces.sticking, True,
-    )  # fmt: skip
+    sweep = Sweep(posture, loops, constants, q, parts.v_a, dynamics.form, modes=True)
     v_a = parts.v_a if chart.own else [sweep.rates[i + 1] for i in chart.seen]
     return Traced(chart, sweep, parts, [q[i] for i in chart.seen], v_a)
 
