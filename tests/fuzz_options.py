@@ -97,6 +97,7 @@ CALLS = {
     ],
     "live": ["slider.yaml", "motion.csv"],
     "sketch": ["slider.yaml --out {out}.png", "rig.yaml --out {out}.svg"],
+    "modes": ["slider.yaml --out {out}", "rig.yaml --vary x=0.1:0.3:2 --out {out}"],
     "simulate": [
         "slider.yaml --task swing --out {out}",
         "slider.yaml --duration 0.1 --out {out}",

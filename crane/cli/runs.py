@@ -1,6 +1,7 @@
 """Folders of results: one run is a recording with its summary, figure and page."""
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,7 @@ from crane.studies.table import Study
 if TYPE_CHECKING:
     from crane.identification.mechanics.result import Identification
     from crane.motion.workspaces import Workspace
+    from crane.simulation.linear import LinearModel
 
 RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
 COMPARISON = "comparison.md"
@@ -142,6 +144,34 @@ def write_workspace(folder: Path, space: "Workspace") -> str:
         (part / "workspace.md").write_text(text, encoding="utf-8")
         plot_workspace(space, part / "workspace.png")
     return text
+
+
+def write_modes(
+    folder: Path, model: "LinearModel", over: "Sequence[tuple[dict[str, float], LinearModel]]"
+) -> None:
+    """Write a linear model, its table, picture and page into a folder.
+
+    Args:
+        folder: Created where there is none.
+        model: The model.
+        over: Of what was varied, drawn in a picture of their own.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.page.build import report
+    from crane.view.plots.modes import plot_modes, plot_modes_over
+
+    with staging(folder) as part:
+        model.save(part / "model.mat")
+        model.save(part / "model.npz")
+        (part / "modes.md").write_text(model.to_text() + "\n", encoding="utf-8")
+        plot_modes(model, part / "modes.png")
+        if over:
+            plot_modes_over(over, part / "over.png")
+        motion = model.motion()
+        if motion is not None:
+            report(model.machine, motion, part / PAGE)
 
 
 def write_identification(

@@ -67,6 +67,7 @@ class Circuit:
         numbers: Of the circuit, as the formulas read them.
         stiff: Number of states that need an implicit method; the others are integrals.
         size: Number of all states.
+        states: Names and units of the stiff ones, pressures counting from that of vapour.
         starts: (m,) where the states of each cylinder begin, with the pressures of A and B.
         scales: (size,) accuracy that matters in each state.
     """
@@ -101,7 +102,18 @@ class Circuit:
             scales += [max(_PRESSURE, modulus * _OIL / volume) for volume in halves]
             scales += [1e-10] * self._compliant[i] + [1e-7, 1e-5] * self._sluggish[i]
         line = [max(_PRESSURE, modulus * _OIL / hydraulics.supply.volume)] * self._limited
+        self.states = self._named()
         self.scales = np.array(scales + line + [np.inf] * len(BALANCES))
+
+    def _named(self) -> dict[str, str]:
+        states: dict[str, str] = {}
+        for joint, compliant, sluggish in zip(
+            self.joints, self._compliant, self._sluggish, strict=True
+        ):
+            states |= {f"pressure_{joint}_{side}": "Pa" for side in "ab"}
+            states |= {f"spring_{joint}": "m"} if compliant else {}
+            states |= {f"spool_{joint}": "", f"spool_rate_{joint}": "1/s"} if sluggish else {}
+        return states | ({"pressure_supply": "Pa"} if self._limited else {})
 
     def _common(self) -> list[float]:
         oil, supply = self.hydraulics.oil, self.hydraulics.supply

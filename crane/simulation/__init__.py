@@ -1,10 +1,11 @@
 """Machines in time: runs, batches of them, recordings replayed."""
 
 from crane.simulation.batch import Batch, simulate_batch
+from crane.simulation.linear import LinearModel, Mode, linear_models, linearize
 from crane.simulation.replays import Comparison, replay
 from crane.simulation.run import Force, InterruptedRun, Progress, integrate, simulate
 
 __all__ = [
-    "Batch", "Comparison", "Force", "InterruptedRun", "Progress", "integrate",
-    "replay", "simulate", "simulate_batch",
+    "Batch", "Comparison", "Force", "InterruptedRun", "LinearModel", "Mode", "Progress",
+    "integrate", "linear_models", "linearize", "replay", "simulate", "simulate_batch",
 ]  # fmt: skip

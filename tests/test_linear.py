@@ -1,0 +1,272 @@
+"""Linear models: closed forms, small steps of the simulation, other programs' formats."""
+
+import warnings
+
+import numpy as np
+import pytest
+from hydraulic_rig import AREA_A, AREA_B, COMPENSATED, HOSE, STROKE, rig
+from typed import typed
+
+import crane
+from crane.common.errors import CraneError, CraneWarning
+
+
+def quiet(call, *args, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        return call(*args, **options)
+
+
+@pytest.fixture(scope="module")
+def patu():
+    machine = crane.load("patu655")
+    return machine.replace(friction={})
+
+
+def test_a_load_on_its_oil(tmp_path):
+    """w^2 = k / m, k = K (A_a^2 / V_a + A_b^2 / V_b), of closed valves."""
+    machine = rig(tmp_path, COMPENSATED, friction={"viscous": 300.0}, supply={"tank": 2e5})
+    place = 0.2
+    model = crane.linearize(machine)
+    assert model.inputs == ("voltage_x",) and model.states[:2] == ("x", "x_velocity")
+    stiffness = 1.2e9 * (
+        AREA_A**2 / (HOSE + AREA_A * place) + AREA_B**2 / (HOSE + AREA_B * (STROKE - place))
+    )
+    rings = [mode for mode in model.modes if mode.pole.imag > 0]
+    assert len(rings) == 1
+    # p^2 + c/m p + k/m = 0
+    poles = np.roots([1.0, 300.0 / 2000.0, stiffness / 2000.0])
+    np.testing.assert_allclose(rings[0].pole, poles[poles.imag > 0][0], rtol=1e-11)
+    assert rings[0].frequency == pytest.approx(np.sqrt(stiffness / 2000.0) / (2 * np.pi), rel=1e-9)
+    assert rings[0].damping == pytest.approx(300.0 / 2 / np.sqrt(stiffness * 2000.0), rel=1e-9)
+    # the cushion of oil is all that holds it: pressures balance the weight
+    pressures = model.y[list(model.outputs).index("pressure_x_a") :][:2]
+    assert AREA_A * pressures[0] - AREA_B * pressures[1] == pytest.approx(2000.0 * 9.81, rel=1e-3)
+    np.testing.assert_allclose(model.rate, 0.0, atol=1e-6)
+
+
+def test_a_mass_on_a_spring_under_a_force(tmp_path):
+    machine = rig(tmp_path, friction={"viscous": 300.0})
+    machine = machine.replace(forces=(crane.ForceElement("x", stiffness=5e4, rest=0.1),))
+    model = crane.linearize(machine, drive="forces", outputs=["x", "x_velocity", "x_force"])
+    np.testing.assert_allclose(model.A, [[0, 1], [-5e4 / 2000, -300 / 2000]], rtol=1e-13)
+    np.testing.assert_allclose(model.B, [[0], [1 / 2000]], rtol=1e-13)
+    np.testing.assert_allclose(model.C, [[1, 0], [0, 1], [0, 0]], atol=0)
+    np.testing.assert_allclose(model.D, [[0], [0], [1]], atol=0)
+    assert model.u[0] == pytest.approx(2000 * 9.81 + 5e4 * 0.1, rel=1e-4)
+    s = 2j * np.pi * 0.7
+    wanted = 1.0 / (2000 * s * s + 300 * s + 5e4)
+    np.testing.assert_allclose(model.response([0.7])[0, 0, 0], wanted, rtol=1e-12)
+
+
+def deviations(machine, model, controller, start, moved, times):
+    """Recorded outputs that a simulation differs by, times (N,) in even steps from 0."""
+    step = times[1] - times[0]
+    runs = [
+        quiet(crane.simulate, machine, made, initial, times[-1], step, tolerance=1e-12)
+        for made, initial in ((controller[0], start), (controller[1], moved))
+    ]
+
+    def column(run, name):
+        return run.q[:, run.joints.index(name)] if name in run.joints else run.channels[name]
+
+    return np.column_stack(
+        [column(runs[1], name) - column(runs[0], name) for name in model.outputs]
+    )
+
+
+@pytest.mark.parametrize("velocity", (None, {"slew": 0.2, "X_lift": 0.03}))
+def test_small_motions_under_forces_are_the_simulation(patu, velocity):
+    """Of a crane that stands or moves: the model is of first order in what is moved."""
+    at = {"X_lift": 0.25, "X_tilt": 0.35}
+    model = crane.linearize(
+        patu, at, velocity=velocity, drive="forces",
+        outputs=["X_lift", "X_tilt", "slew", "q2", "tip_x", "tip_z"],
+    )  # fmt: skip
+    n, times = 4, np.linspace(0.0, 0.05, 11)
+    q_a, v_a = model.x[:n], model.x[n:]
+    state, push = np.array([1e-3, 2e-4, -1e-4, 3e-4, 1e-3, 1e-3, -2e-3, 1e-3]), 50.0
+    gaps = []
+    for share in (1e-2, 1e-3):
+        moved, inputs = share * state, share * np.array([0.0, push, 0.0, 0.0])
+
+        class Given(crane.Law):
+            def __init__(self, forces):
+                super().__init__(patu)
+                self.settings = forces
+
+            def law(self, at):
+                return at.settings, ()
+
+        controllers = Given(model.u), Given(model.u + inputs)
+        found = deviations(
+            patu, model, controllers, (q_a, v_a), (q_a + moved[:n], v_a + moved[n:]), times
+        )
+        wanted = model.simulate(times, moved, inputs)
+        gaps.append(np.abs(found - wanted).max() / np.abs(wanted).max())
+    if velocity is None:  # else the operating point moves on
+        assert gaps[1] < 1e-5 and gaps[1] < 0.2 * gaps[0]
+    else:
+        assert gaps[1] < 2e-2
+
+
+def test_small_motions_on_the_valves_are_the_simulation(patu):
+    """The boom rings on its oil after a push; a valve that is open answers its signal."""
+    # both chambers well above the tank, whose valves let oil in below
+    high = {joint: (60e5, 60e5) for joint in patu.active}
+    model = quiet(crane.linearize, patu, {"X_lift": 0.25, "X_tilt": 0.35}, pressures=high)
+    n, times = 4, np.linspace(0.0, 0.3, 31)
+    q_a = model.x[:n]
+    inputs = np.zeros(4)
+    start = np.zeros(len(model.x))
+    start[n + 1 : n + 3] = 1e-4, -2e-4
+    at = dict(zip(model.states, model.x, strict=True))
+    held = {j: (at[f"pressure_{j}_a"], at[f"pressure_{j}_b"]) for j in patu.active}
+    controllers = (crane.ValveDrive(patu, crane.Signals(patu, [0.0], {}), held),) * 2
+    found = deviations(
+        patu, model, controllers, (q_a, np.zeros(n)), (q_a, start[n : 2 * n]), times
+    )
+    wanted = model.simulate(times, start, inputs)
+    for i, name in enumerate(model.outputs):
+        scale = np.abs(wanted[:, i]).max()
+        if scale > 1e-12:
+            assert np.abs(found[:, i] - wanted[:, i]).max() < 2e-3 * scale, name
+    ring = next(mode for mode in model.modes if mode.pole.imag > 0)
+    assert 3.0 < ring.frequency < 5.0
+
+
+def test_a_valve_that_is_open_answers_its_signal(tmp_path):
+    """A slow stroke of a load: trimmed pressures and signal, then a step of the signal."""
+    machine = rig(tmp_path, COMPENSATED | {"bandwidth": 40.0, "damping": 0.9})
+    model = quiet(crane.linearize, machine, velocity={"x": 0.04})
+    assert model.x[model.states.index("spool_x")] > 0.1143
+    np.testing.assert_allclose(model.rate[1], 0.0, atol=1e-7)
+    # flow / area of the compensated valve is the speed: flow at full stroke is 40 l/min
+    names = model.outputs
+    assert "pressure_x_a" in names
+    times, step = np.linspace(0.0, 0.1, 51), 1e-4
+    u = float(model.u[0])
+    pressures = [model.x[model.states.index(f"pressure_x_{side}")] for side in "ab"]
+    drives = [
+        crane.ValveDrive(
+            machine,
+            crane.Signals(machine, [0.0, 1e-9, 1.0], {"x": [u, u + more, u + more]}),
+            {"x": tuple(pressures)},
+        )
+        for more in (0.0, step)
+    ]
+    start = model.x[:1], model.x[1:2]
+    found = deviations(machine, model, drives, start, start, times)
+    wanted = model.simulate(times, np.zeros(len(model.x)), [step])
+    for i, name in enumerate(names):
+        scale = np.abs(wanted[:, i]).max()
+        if scale > 0:
+            assert np.abs(found[:, i] - wanted[:, i]).max() < 2e-2 * scale, name
+
+
+def test_over_strokes_and_loads(patu):
+    """More load rings slower; what is loaded anew has the same model."""
+    machine = crane.load("patu655")
+    found = quiet(
+        crane.linear_models, machine, {"payload.mass": [0.0, 400.0], "X_lift": [0.15, 0.3]}
+    )
+    assert [tuple(values.values()) for values, _ in found] == [
+        (0.0, 0.15), (0.0, 0.3), (400.0, 0.15), (400.0, 0.3)
+    ]  # fmt: skip
+    rings = [min(m.frequency for m in model.modes if m.pole.imag > 1) for _, model in found]
+    assert rings[2] < rings[0] and rings[3] < rings[1]
+    loaded = crane.load("patu655", changes={"payload.mass": 400.0})
+    again = quiet(crane.linearize, loaded, {"X_lift": 0.3})
+    np.testing.assert_allclose(again.A, found[3][1].A, rtol=0, atol=1e-9 * np.abs(again.A).max())
+
+
+def test_modes_solve_the_eigenvalue_problem(patu):
+    model = quiet(crane.linearize, patu)
+    for mode in model.modes:
+        left = model.A @ mode.state - mode.pole * mode.state
+        assert np.abs(left).max() < 1e-6 * np.abs(model.A).max() * np.abs(mode.state).max()
+    ring = next(mode for mode in model.modes if mode.pole.imag > 0)
+    units = patu.closure.units
+    assert np.abs(ring.shape / units).max() == pytest.approx(1.0)
+
+
+def test_files_and_python_control(patu, tmp_path):
+    control = pytest.importorskip("control")
+    from scipy.io import loadmat
+
+    model = quiet(crane.linearize, patu, drive="forces")
+    read = loadmat(model.save(tmp_path / "model.mat"))
+    for name in "ABCD":
+        np.testing.assert_array_equal(read[name], getattr(model, name))
+    assert [str(x[0]) for x in read["states"].ravel()] == list(model.states)
+    with np.load(model.save(tmp_path / "model.npz")) as kept:
+        np.testing.assert_array_equal(kept["A"], model.A)
+        assert tuple(kept["inputs"]) == model.inputs
+    system = model.to_control()
+    assert isinstance(system, control.StateSpace)
+    assert system.state_labels == list(model.states)
+    frequency = 1.3
+    wanted = model.response([frequency])[0]
+    found = system(2j * np.pi * frequency)
+    np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        ({"drive": "valve"}, "drive 'valve' is unknown"),
+        ({"at": {"X_lft": 0.2}}, "at: 'X_lft' is no active joint"),
+        ({"at": {"X_lift": 2.0}}, "outside of its limits"),
+        ({"outputs": ["tip_w"]}, "output 'tip_w' is unknown"),
+        ({"velocity": {"X_ext": 5.0}}, "cannot be trimmed there"),
+    ],
+)
+def test_what_cannot_be_is_said(patu, options, said):
+    with pytest.raises(CraneError) as error:
+        crane.linearize(patu, **options)
+    assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_no_valves_and_files(tmp_path):
+    with pytest.raises(CraneError, match="has no valves, take the drive 'forces'"):
+        crane.linearize("mini_forwarder", drive="valves")
+    with pytest.raises(CraneError, match=r"written as .mat or .npz"):
+        crane.linearize("tx40").save(tmp_path / "model.txt")
+    with pytest.raises(CraneError, match="parameter 'payload.mas' is unknown"):
+        crane.linear_models("patu655", {"payload.mas": [1.0]})
+
+
+def test_a_free_joint_that_hangs_still_and_one_that_does_not():
+    machine = crane.load("tx40", free=["q5"])
+    with pytest.raises(CraneError, match="free joint 'q5' does not stay there"):
+        crane.linearize(machine, {"q2": 0.4, "q3": 0.7, "q5": 0.8})
+
+
+def test_the_command_writes_model_pictures_and_page(tmp_path):
+    done = typed(
+        "modes", "patu655", "--vary", "X_lift=0.1:0.4:3", "--vary", "payload.mass=0:300:2",
+        "--velocity", "X_tilt=0.02", "--out", tmp_path / "modes",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "| frequency [Hz] | damping [%] |" in done.stdout
+    written = {path.name for path in (tmp_path / "modes").iterdir()}
+    assert written == {
+        "model.mat", "model.npz", "modes.md", "modes.png", "over.png", "view.html"
+    }  # fmt: skip
+    with np.load(tmp_path / "modes" / "model.npz") as model:
+        assert model["A"].shape[0] == len(model["states"]) == 25
+    done = typed("modes", "patu655", "--out", tmp_path / "modes")
+    assert done.returncode == 2 and "--force" in done.stderr
+    done = typed("modes", "patu655", "--vary", "X_lft=0.1:0.4:3")
+    assert done.returncode == 2 and "parameter 'X_lft' is unknown" in done.stderr
+
+
+def test_what_rings_is_shown_within_the_strokes(patu):
+    model = quiet(crane.linearize, patu)
+    motion = model.motion()
+    assert motion.task == "modes in slow motion"
+    rings = [mode.frequency for mode in model.modes if mode.rings]
+    assert list(dict.fromkeys(motion.channels["mode_frequency"])) == rings
+    assert (motion.q >= patu.lower).all() and (motion.q <= patu.upper).all()
+    assert np.abs(np.diff(motion.q, axis=0)).max() < 0.02
+    assert crane.linearize(crane.load("tx40"), drive="forces").motion() is not None
