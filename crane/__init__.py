@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from crane.formats.adding import add_cylinder, add_loops
     from crane.formats.check import check
     from crane.hydraulics import PDGains
+    from crane.identification.calibration.calibrate import calibrate
+    from crane.identification.calibration.result import Calibration
     from crane.identification.excitation.excite import Excitation, excite
     from crane.identification.hydraulics.cylinder_friction import identify_cylinder_friction
     from crane.identification.hydraulics.orifices import identify_orifices
@@ -74,6 +76,8 @@ _HOMES = {
     "crane.formats.adding": "add_cylinder add_loops",
     "crane.formats.check": "check",
     "crane.hydraulics": "PDGains",
+    "crane.identification.calibration.calibrate": "calibrate",
+    "crane.identification.calibration.result": "Calibration",
     "crane.identification.excitation.excite": "Excitation excite",
     "crane.identification.hydraulics.cylinder_friction": "identify_cylinder_friction",
     "crane.identification.hydraulics.orifices": "identify_orifices",
@@ -95,12 +99,13 @@ _HOMES = {
 }
 
 __all__ = [
-    "PI", "Batch", "Closure", "Command", "Comparison", "ComputedTorque", "Controller",
-    "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation", "ForceElement", "Friction",
-    "GasSpring", "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel", "Machine",
-    "PDGains", "PIGains", "Payload", "Recording", "Rope", "Sampled", "Signals", "Study",
+    "PI", "Batch", "Calibration", "Closure", "Command", "Comparison", "ComputedTorque",
+    "Controller", "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation",
+    "ForceElement", "Friction", "GasSpring", "Identification", "InterruptedRun", "Kinematics",
+    "Law", "LinearModel", "Machine", "PDGains", "PIGains", "Payload", "Recording", "Rope",
+    "Sampled", "Signals", "Study",
     "TipVelocity", "Trajectory", "ValveDrive", "ValvePD", "Workspace", "add_cylinder", "add_loops",
-    "check", "excite",
+    "calibrate", "check", "excite",
     "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
     "identify_valve", "joystick", "linear_models", "linearize", "load",
     "point_to_point", "polynomial", "read_measured", "replay", "report",

@@ -11,6 +11,7 @@ import typer
 import crane
 from crane.cli import (  # noqa: F401  register their commands
     add,
+    calibrate,
     check,
     circuit,
     commands,

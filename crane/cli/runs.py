@@ -25,6 +25,7 @@ from crane.simulation.replays import Comparison
 from crane.studies.table import Study
 
 if TYPE_CHECKING:
+    from crane.identification.calibration.result import Calibration
     from crane.identification.mechanics.result import Identification
     from crane.motion.workspaces import Workspace
     from crane.simulation.linear import LinearModel
@@ -144,6 +145,21 @@ def write_workspace(folder: Path, space: "Workspace") -> str:
         (part / "workspace.md").write_text(text, encoding="utf-8")
         plot_workspace(space, part / "workspace.png")
     return text
+
+
+def write_calibration(folder: Path, found: "Calibration") -> None:
+    """Write report, picture and the fitted machine into a folder, created where there is none.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.formats import write_machine
+    from crane.view.plots.calibration import plot_calibration
+
+    with staging(folder) as part:
+        (part / "calibration.md").write_text(found.to_text() + "\n", encoding="utf-8")
+        plot_calibration(found, part / "calibration.png")
+        write_machine(found.machine, part / "machine")
 
 
 def write_modes(

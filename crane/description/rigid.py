@@ -49,7 +49,9 @@ def inertia(inertial: Inertial | None) -> pin.Inertia:
     xx, xy, xz, yy, yz, zz = inertial.tensor
     turn = rotation(inertial.rpy)
     tensor = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
-    return pin.Inertia(inertial.mass, np.array(inertial.com), tensor)
+    out = pin.Inertia(inertial.mass, np.array(inertial.com), np.zeros((3, 3)))
+    out.inertia = tensor  # the constructor refuses what assembling refuses with the link's name
+    return out
 
 
 def inertial(inertia: pin.Inertia) -> Inertial | None:

@@ -127,9 +127,11 @@ def replay(
     step = as_number(step, "the step", "s", above=0)
     table = timeseries.read(path)
     try:
-        time, drive, initial = _prepare(machine, table)
+        inputs = inputs_of(machine, table)
+        drive = inputs.drive(machine)
     except RecordingError as error:
         raise RecordingError(at(str(path), error)) from None
+    time, initial = inputs.time, inputs.initial
     steps = int(time[-1] / step + 1e-9)
     if steps < 1:
         raise RecordingError(f"{path}: is shorter than a step of {step:g} s, shorten the step")
@@ -176,10 +178,39 @@ def compare(table: Table, recording: Recording) -> Comparison:
     return Comparison(time[inside], tuple(found))
 
 
-def _prepare(
-    machine: Machine, table: Table
-) -> tuple[Array, ValveDrive, tuple[Array, Array] | None]:
-    """Time from zero, the valves' drive, and the state at the start."""
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """What a measured machine was driven by, and where it started.
+
+    Attributes:
+        time: (N,) [s] from zero.
+        signals: Of the valves that were moved, (N,) by joint [V].
+        supply: (N,) pressure of the supply [Pa], None where it was not measured.
+        tank: Likewise.
+        pressures: Of A and B at the start [Pa] by joint, where they were measured.
+        initial: q_A and v_A at the start, None where nothing tells.
+    """
+
+    time: Array
+    signals: dict[str, Array]
+    supply: Array | None
+    tank: Array | None
+    pressures: dict[str, tuple[float, float]]
+    initial: tuple[Array, Array] | None
+
+    def drive(self, machine: Machine) -> ValveDrive:
+        """The valves' drive of a machine."""
+        signals = Signals(machine, self.time, self.signals, self.supply, self.tank)
+        return ValveDrive(machine, signals, self.pressures)
+
+
+def inputs_of(machine: Machine, table: Table) -> Inputs:
+    """What drove a machine, of which a table was measured.
+
+    Raises:
+        RecordingError: The table has no signals, or is malformed.
+        InputError: The machine has no valves.
+    """
     joints = machine.hydraulics.joints if machine.hydraulics else ()
     if not joints:
         raise InputError(
@@ -195,11 +226,11 @@ def _prepare(
     supply, tank = (
         column(table, name, "Pa") if name in table.units else None for name in (_SUPPLY, _TANK)
     )
-    pressures = _pressures(joints, table)
-    drive = ValveDrive(machine, Signals(machine, time, signals, supply, tank), pressures)
-    if not any(joint in table.units for joint in machine.joints):
-        return time, drive, None
-    return time, drive, _initial(machine, table, time, list(signals.values()))
+    moved = list(signals.values())
+    pressures = _pressures(joints, table, time, moved)
+    there = any(joint in table.units for joint in machine.joints)
+    initial = _initial(machine, table, time, moved) if there else None
+    return Inputs(time, signals, supply, tank, pressures, initial)
 
 
 def _signals(machine: Machine, joints: Sequence[str], table: Table) -> dict[str, Array]:
@@ -218,8 +249,11 @@ def _signals(machine: Machine, joints: Sequence[str], table: Table) -> dict[str,
     return signals
 
 
-def _pressures(joints: Sequence[str], table: Table) -> dict[str, tuple[float, float]]:
-    """Of A and B at the first sample, by joint [Pa]."""
+def _pressures(
+    joints: Sequence[str], table: Table, time: Array, signals: list[Array]
+) -> dict[str, tuple[float, float]]:
+    """Of A and B at the start, by joint [Pa], from all samples near it."""
+    steady = time <= _steady(time, signals)
     pressures: dict[str, tuple[float, float]] = {}
     for joint in joints:
         pair = [f"pressure_{joint}_{side}" for side in "ab"]
@@ -228,8 +262,8 @@ def _pressures(joints: Sequence[str], table: Table) -> dict[str, tuple[float, fl
             missing = pair[pair[0] in there]
             raise RecordingError(f"'{missing}' is missing beside '{there[0]}', add or remove one")
         if there:
-            a, b = (float(column(table, name)[0]) for name in pair)
-            pressures[joint] = a, b
+            a, b = (_start(time, column(table, name), None, steady)[0] for name in pair)
+            pressures[joint] = max(a, 0.0), max(b, 0.0)
     return pressures
 
 

@@ -1,0 +1,1 @@
+"""A machine fitted to recordings through its simulation."""

@@ -1,0 +1,394 @@
+"""A machine's numbers from recordings, through the simulation of what drove it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from crane.common.errors import CraneError, InputError, RecordingError, at
+from crane.common.samples import Array
+from crane.description.changes import parameters
+from crane.formats import load
+from crane.formats.loading import Variants
+from crane.identification.calibration.problem import Case, Problem, case_of
+from crane.identification.calibration.readings import sensors_of
+from crane.identification.calibration.result import Calibration, Fitted, Sensor
+from crane.identification.calibration.unknowns import Unknown, unknowns_of
+from crane.machine import Machine
+from crane.recordings import timeseries
+from crane.recordings.logs import read_log
+from crane.recordings.timeseries import Table
+
+Progress = Callable[[float], None]
+
+_ROUNDS = 3  # of weights
+_STEPS = 25  # of Gauss-Newton between them
+_SETTLED = 1e-3  # change of the cost, as a share, that ends them
+_EXACT, _NOTHING = 1e-6, 1e-9  # of a channel's largest value, and of one that is zero [SI]
+_FLOOR = 0.02  # of a channel's variation that its weight begins with
+_GROWN, _SHRUNK, _STIFFEST = 10.0, 0.2, 1e8  # of Levenberg's damping
+_BLOCKS = 8, 40  # least and most blocks of a covariance
+_COUPLED = 0.95  # correlation of two numbers of which the data know a combination alone
+_VAGUE = 0.5  # standard deviation, of a number's size, that says nothing
+
+
+def calibrate(
+    machine: Machine | str | Path,
+    recordings: Sequence[str | Path] | str | Path,
+    fit: Mapping[str, object] | Sequence[str],
+    *,
+    train: tuple[float, float] = (0.0, np.inf),
+    validation: Sequence[str | Path] = (),
+    columns: str | Path | None = None,
+    sensors: Sequence[str] | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Fit numbers of a machine to recordings of it, driven by its measured valve signals.
+
+    The simulation of each recording's signals (see `crane.simulation.replay`) is compared with
+    what was measured. Least squares over the numbers and over each recording's start,
+
+        min sum_c sum_t ((y_c(t) - m_c(t)) / s_c)^2 + sum (start / its deviation)^2,
+
+    by Levenberg and Marquardt's method within bounds, first with friction that is smoothed over
+    millimetres per second, for what sticks when depends on everything before. A channel's s_c is
+    what is left of it, found in rounds: no channel outweighs others because its noise is small
+    where the model is not that good. Intervals take blocks of instants as what is independent,
+    since what is left is no white noise (Huber's sandwich over blocks).
+
+    Args:
+        machine: The machine, or what `crane.load` takes; joints that were held are locked in it.
+        recordings: Of measured valve signals, CSV or npz.
+        fit: Numbers by name: None, a start, or (start, low, high). Names are those of
+            `crane.description.parameters`; with `*` a common factor of all that match;
+            `sensor.COLUMN.zero`, `.scale` and `.delay` of what was measured.
+        train: From when to when [s] recordings are fitted; the rest is held out.
+        validation: Recordings that are held out whole.
+        columns: A file that says which columns of raw logs are which, see
+            `crane.recordings.logs`.
+        sensors: Columns to compare; all that can be if not given.
+        progress: Called with the finished share, 0 to 1.
+
+    Raises:
+        InputError: Names, bounds or windows that cannot be.
+        RecordingError: A recording is malformed, or has no signals.
+        SimulationError: The machine as it is cannot follow a recording.
+    """
+    if not isinstance(machine, Machine):
+        machine = load(machine)
+    paths = [recordings] if isinstance(recordings, str | Path) else list(recordings)
+    if not paths:
+        raise InputError("no recording is given, name at least one")
+    if not train[0] < train[1]:
+        raise InputError(f"the window from {train[0]:g} to {train[1]:g} s is empty")
+    tables = [_table(path, columns) for path in (*paths, *validation)]
+    cases = [
+        _case(machine, path, table, sensors, train if i < len(paths) else (np.inf, np.inf))
+        for i, (path, table) in enumerate(zip((*paths, *validation), tables, strict=True))
+    ]
+    if not any(case.train.any() for case in cases):
+        raise InputError(f"no instant lies within {train[0]:g} to {train[1]:g} s")
+    spec = Variants(machine).spec
+    units = {
+        name: table.units[name]
+        for case, table in zip(cases, tables, strict=True)
+        for name in case.sensors
+    }
+    # of a payload the description has the mass alone
+    numbers = parameters(spec) | dict(machine.changes)
+    unknowns = unknowns_of(fit, spec, numbers, units)
+    problem = Problem(machine, unknowns, cases)
+    search = _Search(problem, progress)
+    before = [problem.residuals(case, np.zeros(problem.size)) for case in problem.cases]
+    z = search.run(before)
+    return _result(problem, search, z, before, units)
+
+
+def _table(path: str | Path, columns: str | Path | None) -> Table:
+    return timeseries.read(path) if columns is None else read_log(path, columns)
+
+
+def _case(
+    machine: Machine,
+    path: str | Path,
+    table: Table,
+    sensors: Sequence[str] | None,
+    window: tuple[float, float],
+) -> Case:
+    try:
+        found = sensors_of(machine, table)
+        for name in sensors or ():
+            if name not in found:
+                raise InputError(f"'{name}' cannot be compared, choose among {', '.join(found)}")
+        found = found if sensors is None else list(sensors)
+        return case_of(machine, Path(path).name, table, found, window)
+    except RecordingError as error:
+        raise RecordingError(at(str(path), error)) from None
+
+
+class _Search:
+    """Levenberg and Marquardt's method within bounds, and the channels' weights.
+
+    Attributes:
+        sizes: (k,) by sensor, what is left of its channel.
+        jacobian: (M, p) weighted derivatives at the end, of what is fitted.
+        residual: (M,) weighted, likewise.
+        blocks: (M,) block of each row.
+    """
+
+    def __init__(self, problem: Problem, progress: Progress | None):
+        self._problem, self._progress = problem, progress
+        unknowns = problem.unknowns
+        rest = problem.size - len(unknowns)
+        self.low = np.array([(x.low - x.start) / x.scale for x in unknowns] + [-np.inf] * rest)
+        self.high = np.array([(x.high - x.start) / x.scale for x in unknowns] + [np.inf] * rest)
+        self.prior = np.array([0.0] * len(unknowns) + [1.0] * rest)
+        self.sizes: dict[str, float] = {}
+        self.jacobian = self.residual = self.blocks = np.zeros(0)
+        self._done = 0
+
+    def run(self, before: list[Array]) -> Array:
+        """The unknowns."""
+        problem = self._problem
+        noise = self._noise()
+        spread = self._spread()
+        self.sizes = {name: max(noise[name], _FLOOR * spread[name]) for name in noise}
+        z = np.zeros(problem.size)
+        sticks = any(law.sticks for law in problem.machine.friction.values())
+        problem.smooth = sticks
+        for i in range(_ROUNDS):
+            z = self._minimum(z)
+            left = self._left([problem.residuals(case, z) for case in self._trained])
+            fresh = {name: max(noise[name], left[name]) for name in left}
+            moved = max(abs(np.log(fresh[name] / self.sizes[name])) for name in fresh)
+            self.sizes = fresh
+            if moved < 0.05 and (i or not sticks):
+                break
+        if sticks:
+            problem.smooth = False
+            z = self._minimum(z)
+        # slopes over about the intervals, of what does not jump, tell how well all is known
+        problem.smooth = sticks
+        self._linearize(z)
+        problem.widen(np.sqrt(np.diag(self.covariance(z)[0])))
+        self._linearize(z)
+        problem.smooth = False
+        if self._progress is not None:
+            self._progress(1.0)
+        return z
+
+    @property
+    def _trained(self) -> list[Case]:
+        return [case for case in self._problem.cases if case.train.any()]
+
+    def _noise(self) -> dict[str, float]:
+        """Of each channel, by its third differences, and no less than its digits."""
+        found: dict[str, list[float]] = {}
+        largest: dict[str, float] = {}
+        for case in self._trained:
+            third = np.diff(case.measured, 3, axis=0)
+            for name, x, y in zip(case.sensors, third.T, case.measured.T, strict=True):
+                found.setdefault(name, []).append(float(np.mean(x**2)) / 20.0)
+                largest[name] = max(largest.get(name, 0.0), float(np.abs(y).max()))
+        return {
+            name: max(float(np.sqrt(np.mean(x))), _EXACT * largest[name], _NOTHING)
+            for name, x in found.items()
+        }
+
+    def _spread(self) -> dict[str, float]:
+        found: dict[str, list[Array]] = {}
+        for case in self._trained:
+            for name, x in zip(case.sensors, case.measured[case.train].T, strict=True):
+                found.setdefault(name, []).append(x - x.mean())
+        return {name: max(float(np.std(np.concatenate(x))), 1e-12) for name, x in found.items()}
+
+    def _left(self, residuals: list[Array]) -> dict[str, float]:
+        """Root mean square of each channel over what is fitted."""
+        found: dict[str, list[Array]] = {}
+        for case, residual in zip(self._trained, residuals, strict=True):
+            for name, x in zip(case.sensors, residual[case.train].T, strict=True):
+                found.setdefault(name, []).append(x)
+        return {
+            name: max(float(np.sqrt(np.mean(np.concatenate(x) ** 2))), _NOTHING)
+            for name, x in found.items()
+        }
+
+    def _weights(self, case: Case) -> Array:
+        """(N, k) one over the channels' sizes, 0 of what is held out."""
+        return case.train[:, None] / np.array([self.sizes[name] for name in case.sensors])
+
+    def _cost(self, z: Array) -> float:
+        """Half the sum of squares, infinite where the machine cannot be."""
+        total = float(np.sum((self.prior * z) ** 2))
+        for case in self._trained:
+            try:
+                left = self._problem.residuals(case, z) * self._weights(case)
+            except CraneError:
+                return np.inf
+            total += float(np.sum(left**2))
+        return 0.5 * total
+
+    def _linearize(self, z: Array) -> None:
+        rows, left, blocks = [], [], []
+        for number, case in enumerate(self._trained):
+            sizes = np.array([self.sizes[name] for name in case.sensors])
+            residual, slopes = self._problem.linearized(case, z, sizes)
+            weights = self._weights(case)
+            some = case.train
+            rows.append((slopes * weights[:, :, None])[some].reshape(-1, self._problem.size))
+            left.append((residual * weights)[some].ravel())
+            time = np.repeat(case.inputs.time[some], len(case.sensors))
+            blocks.append(time + 1e9 * number)
+        self.jacobian, self.residual = np.vstack(rows), np.concatenate(left)
+        self.blocks = np.concatenate(blocks)
+
+    def _minimum(self, z: Array) -> Array:
+        """The nearest minimum for the present weights."""
+        damping, cost = 1e-3, self._cost(z)
+        if not np.isfinite(cost):  # say why
+            for case in self._trained:
+                self._problem.residuals(case, z)
+        for _ in range(_STEPS):
+            self._linearize(z)
+            hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
+            gradient = self.jacobian.T @ self.residual + self.prior**2 * z
+            before = cost
+            while True:
+                there = self._step(z, hessian, gradient, damping)
+                new = self._cost(there)
+                self._report()
+                if new < cost:
+                    z, cost, damping = there, new, max(damping * _SHRUNK, 1e-9)
+                    break
+                damping *= _GROWN
+                if damping > _STIFFEST:
+                    return z
+            if before - cost < _SETTLED * before:
+                break
+        return z
+
+    def _step(self, z: Array, hessian: Array, gradient: Array, damping: float) -> Array:
+        """A damped step, of which what would leave its bounds stays on them."""
+        size = np.diag(hessian)
+        scaled = hessian + damping * np.diag(np.maximum(size, 1e-12 * size.max()))
+        free = np.ones(len(z), dtype=bool)
+        step = np.zeros(len(z))
+        for _ in range(len(z)):
+            at = np.flatnonzero(free)
+            right = -gradient[at] - scaled[np.ix_(at, ~free)] @ step[~free]
+            step[at] = np.linalg.lstsq(scaled[np.ix_(at, at)], right, rcond=1e-12)[0]
+            there = z + step
+            out = free & ((there < self.low) | (there > self.high))
+            if not out.any():
+                break
+            step[out] = np.clip(there, self.low, self.high)[out] - z[out]
+            free &= ~out
+        return np.clip(z + step, self.low, self.high)
+
+    def _report(self) -> None:
+        self._done += 1
+        if self._progress is not None:
+            self._progress(1.0 - 0.97**self._done)
+
+    def covariance(self, z: Array) -> tuple[Array, int]:
+        """(p, p) of the unknowns in their scales, and the number of blocks.
+
+        H^-1 (sum_b g_b g_b^T) H^-1 with g_b the gradient of a block, and at least that of white
+        noise; as if there were no bounds.
+        """
+        hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
+        inverse = np.linalg.pinv(hessian, rcond=1e-13, hermitian=True)
+        length, count = self._length()
+        numbers = np.unique(np.floor(self.blocks / length), return_inverse=True)[1]
+        weighed = self.jacobian * self.residual[:, None]
+        sums = np.zeros((numbers.max() + 1, len(z)))
+        np.add.at(sums, numbers, weighed)
+        count = len(sums)
+        meat = sums.T @ sums * (count / max(count - 1, 1)) + np.diag(self.prior**2)
+        robust = inverse @ meat @ inverse
+        freedom = max(len(self.residual) - len(z), 1)
+        white = inverse * float(self.residual @ self.residual) / freedom
+        more = np.sqrt(np.maximum(np.diag(white) / np.maximum(np.diag(robust), 1e-300), 1.0))
+        return robust * np.outer(more, more), count
+
+    def _length(self) -> tuple[float, int]:
+        """Of a block [s]: four times over which what is left remembers itself."""
+        longest, whole = 0.0, 0.0
+        for case in self._trained:
+            time = case.inputs.time[case.train]
+            whole += float(time[-1] - time[0])
+        start = 0
+        for case in self._trained:
+            k, count = len(case.sensors), int(case.train.sum())
+            rows = self.residual[start : start + k * count].reshape(count, k)
+            start += k * count
+            step = float(np.median(np.diff(case.inputs.time)))
+            for x in rows.T:
+                longest = max(longest, step * _memory(x))
+        length = min(max(4.0 * longest, whole / _BLOCKS[1]), whole / _BLOCKS[0])
+        return max(length, 1e-9), int(whole / length) if length else 1
+
+
+def _memory(x: Array) -> float:
+    """Samples over which a sequence remembers itself: its integral correlation time."""
+    x = x - x.mean()
+    power = float(x @ x)
+    if not power:
+        return 0.0
+    size = 1 << (2 * len(x) - 1).bit_length()
+    spectrum = np.fft.rfft(x, size)
+    correlation = np.fft.irfft(spectrum * spectrum.conj(), size)[: len(x)] / power
+    negative = np.flatnonzero(correlation < 0.05)
+    return float(correlation[: negative[0] if len(negative) else len(x)].sum())
+
+
+def _result(
+    problem: Problem,
+    search: _Search,
+    z: Array,
+    before: list[Array],
+    units: Mapping[str, str],
+) -> Calibration:
+    from scipy.stats import t as student
+
+    unknowns = problem.unknowns
+    covariance, count = search.covariance(z)
+    deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    factor = float(student.ppf(0.975, max(count - 1, 1)))
+    values = problem.values(z)
+    fitted = []
+    for i, unknown in enumerate(unknowns):
+        width = factor * float(deviations[i]) * unknown.scale
+        value = values[unknown.name]
+        bound = z[i] <= search.low[i] + 1e-9 or z[i] >= search.high[i] - 1e-9
+        size = max(abs(value), abs(unknown.start)) if not unknown.sensor else np.inf
+        fitted.append(Fitted(
+            unknown.name, unknown.start, value, width, bool(bound),
+            bool(not bound and width / factor > _VAGUE * size),
+        ))  # fmt: skip
+    after = [problem.residuals(case, z) for case in problem.cases]
+    seen = [
+        Sensor(case.name, name, units[name], case.inputs.time, case.train, case.measured[:, k],
+               old[:, k] + case.measured[:, k], new[:, k] + case.measured[:, k])
+        for case, old, new in zip(problem.cases, before, after, strict=True)
+        for k, name in enumerate(case.sensors)
+    ]  # fmt: skip
+    machine = problem.variant(z)
+    return Calibration(
+        machine, tuple(fitted), tuple(seen), problem.changes(z),
+        tuple(_coupled(unknowns, covariance)), problem.runs,
+    )  # fmt: skip
+
+
+def _coupled(unknowns: Sequence[Unknown], covariance: Array) -> list[tuple[str, str, float]]:
+    """Pairs of numbers that the data tell apart badly, with their correlation."""
+    count = len(unknowns)
+    deviations = np.sqrt(np.diag(covariance))[:count]
+    found = []
+    for i in range(count):
+        for j in range(i):
+            if deviations[i] and deviations[j]:
+                share = float(covariance[i, j] / (deviations[i] * deviations[j]))
+                if abs(share) > _COUPLED:
+                    found.append((unknowns[j].name, unknowns[i].name, share))
+    return sorted(found, key=lambda pair: -abs(pair[2]))

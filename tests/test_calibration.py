@@ -1,0 +1,187 @@
+"""A machine fitted through its simulation: virtual recordings of known truth, and what is said."""
+
+import warnings
+
+import numpy as np
+import pytest
+from hydraulic_rig import COMPENSATED, rig
+from typed import typed
+
+import crane
+from crane.common.errors import CraneError, CraneWarning
+from crane.recordings import timeseries
+
+TRUTH = {
+    "valve.x.neutral": 5.87, "friction.x.viscous": 900.0, "oil.bulk_modulus": 0.9e9,
+    "load_x.mass": 2300.0, "friction.x.coulomb": 350.0,
+}  # fmt: skip
+VALVE = COMPENSATED | {"bandwidth": 60.0, "damping": 0.9}
+
+
+def simple(folder):
+    return rig(
+        folder, VALVE, {"refill": 6e-6}, supply={"pressure": 140e5, "tank": 8e5},
+        friction={"viscous": 600.0, "coulomb": 200.0},
+    )  # fmt: skip
+
+
+def recorded(machine, path, seed, truth=None, offset=0.0, extra=()):
+    """What sensors say of the true machine, 100 Hz with noise: up and down in steps."""
+    time = np.arange(0.0, 6.0, 0.01)
+    levels = [5.8, 4.4, 5.8, 5.0, 5.8, 7.0, 5.8, 6.6, 4.8, 5.8]
+    voltage = np.array(levels)[np.minimum((time / 0.6).astype(int), 9)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        true = crane.load(machine.path, changes=TRUTH if truth is None else truth)
+        run = crane.simulate(
+            true, crane.Signals(true, time, {"x": voltage}), [0.2], 5.99, 0.01, tolerance=1e-10
+        )
+    random = np.random.default_rng(seed)
+    names = ["x", "pressure_x_a", "pressure_x_b", *extra]
+    sizes = {"x": 2e-4, "pressure_x_a": 2e4, "pressure_x_b": 2e4}
+    columns = run.columns()
+    values = [columns[name] + sizes.get(name, 1e-3) * random.normal(size=600) for name in names]
+    values[0] = values[0] + offset
+    units = {"time": "s", "voltage_x": "V"} | {
+        name: "m" if name == "x" else "Pa" if name.startswith("pressure") else "m/s"
+        for name in names
+    }
+    table = timeseries.Table(units, np.column_stack([run.time, voltage, *values]), {})
+    timeseries.write(path, table)
+    return path
+
+
+def quiet(call, *args, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        return call(*args, **options)
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rig")
+    machine = simple(folder)
+    path = recorded(machine, folder / "run.csv", 0, offset=4e-3)
+    fit = [*TRUTH, "sensor.x.zero"]
+    return machine, path, quiet(crane.calibrate, machine, path, fit, train=(0.0, 4.0))
+
+
+def test_numbers_of_a_virtual_rig_come_back(fitted):
+    """Within their intervals, from a file that is wrong by up to 75 %."""
+    _, _, found = fitted
+    truth = TRUTH | {"sensor.x.zero": 4e-3}
+    for one in found.fitted:
+        assert not one.bound, one.name
+        assert abs(one.value - truth[one.name]) < 2.0 * one.interval + 1e-9, one
+    told = {one.name: one.interval for one in found.fitted}
+    assert told["load_x.mass"] < 100 and told["valve.x.neutral"] < 0.02
+    assert told["oil.bulk_modulus"] < 0.1e9
+
+
+def test_the_rest_of_the_recording_is_predicted_to_its_noise(fitted):
+    _, _, found = fitted
+    for sensor, noise in zip(found.sensors, (2e-4, 2e4, 2e4), strict=True):
+        assert sensor.rms(sensor.after, True) < 1.1 * noise
+        assert sensor.rms(sensor.after, False) < 1.2 * noise, sensor.name
+        assert sensor.rms(sensor.before, False) > 3 * noise
+
+
+def test_what_is_fitted_can_be_loaded(fitted):
+    machine, path, found = fitted
+    assert set(found.changes) == set(TRUTH)
+    again = crane.load(machine.path, changes=found.changes)
+    _, comparison = quiet(crane.replay, again, path, 0.01)
+    by_name = {channel.name: channel for channel in comparison.channels}
+    assert by_name["pressure_x_a"].rms < 4e4
+    assert found.machine.changes == again.changes
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_truth(tmp_path):
+    """Of twenty rigs with other noise, about 95 of 100 numbers lie within their intervals."""
+    machine, shares = simple(tmp_path), []
+    for seed in range(20):
+        path = recorded(machine, tmp_path / f"run{seed}.csv", 500 + seed)
+        found = quiet(crane.calibrate, machine, path, list(TRUTH))
+        shares.append([abs(x.value - TRUTH[x.name]) / x.interval for x in found.fitted])
+    shares = np.array(shares)
+    assert 0.90 <= (shares < 1.0).mean() <= 0.99
+    assert (shares < 2.5).all()
+
+
+def test_a_common_factor_and_delays(tmp_path):
+    machine = simple(tmp_path)
+    path = recorded(machine, tmp_path / "run.csv", 3, truth={
+        "cylinder.x.hose_a": 1.5 * 1.9e-4, "cylinder.x.hose_b": 1.5 * 1.9e-4
+    })  # fmt: skip
+    table = timeseries.read(path)
+    late = table.values.copy()
+    late[:, 2] = np.interp(late[:, 0] - 0.03, late[:, 0], late[:, 2])
+    timeseries.write(path, timeseries.Table(table.units, late, {}))
+    found = quiet(crane.calibrate, machine, path, ["cylinder.x.hose_*", "sensor.x.delay"])
+    values = found.values
+    assert values["cylinder.x.hose_*"] == pytest.approx(1.5, abs=0.1)
+    assert values["sensor.x.delay"] == pytest.approx(0.03, abs=2e-3)
+    assert found.changes["cylinder.x.hose_a"] == pytest.approx(
+        values["cylinder.x.hose_*"] * 1.9e-4, rel=1e-12
+    )
+
+
+def test_what_the_recording_cannot_say_is_said(tmp_path):
+    """Area and load of a cylinder that only stands: a combination, and what nothing tells."""
+    machine = simple(tmp_path)
+    path = recorded(machine, tmp_path / "run.csv", 4)
+    found = quiet(
+        crane.calibrate, machine, path,
+        {"load_x.mass": None, "cylinder.x.area_a": None, "cylinder.x.leakage": (1e-16, 0.0, 1e-9)},
+        train=(0.0, 0.55),
+    )  # fmt: skip
+    pair = {name for name, *_ in found.coupled} | {name for _, name, _ in found.coupled}
+    assert {"load_x.mass", "cylinder.x.area_a"} <= pair
+    text = found.to_text()
+    assert "Told apart badly" in text
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        ({"fit": []}, "nothing is to be fitted"),
+        ({"fit": ["load.mass"]}, "parameter 'load.mass' is unknown"),
+        ({"fit": ["load_*.mss"]}, "matches no number"),
+        ({"fit": ["sensor.y.zero"]}, "'sensor.y.zero' is of no sensor"),
+        ({"fit": ["sensor.x.gain"]}, "a sensor has no 'gain'"),
+        ({"fit": ["cylinder.x.leakage"]}, "is 0 at first, say how large it may be"),
+        ({"fit": {"load_x.mass": (1.0, 2.0, 3.0)}}, "1 does not lie within 2 to 3"),
+        ({"fit": {"load_x.mass": "much"}}, "give a start, or (start, low, high)"),
+        ({"fit": ["load_x.mass"], "train": (3.0, 1.0)}, "is empty"),
+        ({"fit": ["load_x.mass"], "train": (30.0, 40.0)}, "no instant lies within"),
+        ({"fit": ["load_x.mass"], "sensors": ["pressure_y_a"]}, "cannot be compared"),
+    ],
+)
+def test_what_cannot_be_is_one_line(fitted, options, said):
+    machine, path, _ = fitted
+    with pytest.raises(CraneError) as error:
+        quiet(crane.calibrate, machine, path, **options)
+    assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_the_command_writes_machine_report_and_picture(fitted, tmp_path):
+    machine, path, _ = fitted
+    done = typed(
+        "calibrate", machine.path, path, "--fit", "load_x.mass", "--fit",
+        "valve.x.neutral=5.8,5.5~6.2", "--fit", "sensor.x.zero", "--train", "0:2", "--out",
+        tmp_path / "out",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "| load_x.mass |" in done.stdout and "--set load_x.mass=" in done.stdout
+    written = {item.name for item in (tmp_path / "out").iterdir()}
+    assert written == {"calibration.md", "calibration.png", "machine"}
+    again = crane.load(tmp_path / "out" / "machine" / "rig.yaml")
+    assert again.tree.links["load_x"].inertial.mass > 2100
+    for words, said in (
+        (["--fit", "load_x.mass=1~2"], "--fit is 'load_x.mass=1~2', write NAME"),
+        (["--fit", "load_x.mass", "--fit", "load_x.mass=3"], "names 'load_x.mass' twice"),
+        (["--fit", "load_x.mass", "--train", "4"], "--train is '4', write FROM:TO"),
+    ):
+        done = typed("calibrate", machine.path, path, *words)
+        assert done.returncode == 2 and said in done.stderr
