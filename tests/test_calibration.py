@@ -1,6 +1,7 @@
 """A machine fitted through its simulation: virtual recordings of known truth, and what is said."""
 
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import crane
 from crane.common.errors import CraneError, CraneWarning
 from crane.recordings import timeseries
 
+LIFTING = Path(__file__).parents[2] / "shared" / "data" / "patu655" / "lifting_first_half.csv"
 TRUTH = {
     "valve.x.neutral": 5.87, "friction.x.viscous": 900.0, "oil.bulk_modulus": 0.9e9,
     "load_x.mass": 2300.0, "friction.x.coulomb": 350.0,
@@ -185,3 +187,62 @@ def test_the_command_writes_machine_report_and_picture(fitted, tmp_path):
     ):
         done = typed("calibrate", machine.path, path, *words)
         assert done.returncode == 2 and said in done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not LIFTING.exists(), reason="the recordings, ../shared/data, are not there")
+def test_a_measured_crane_lifts_as_it_did(tmp_path):
+    """One command from a raw log; what was held out is predicted, ringing included."""
+    columns = tmp_path / "columns.txt"
+    columns.write_text("""# machine: patu655
+time [s] = t_s
+voltage_X_lift [V] = U1_V
+voltage_X_tilt [V] = U2_V
+X_lift [mm] = s1_mm - 820
+X_tilt [mm] = s2_mm - 1050
+pressure_X_lift_a [Pa] = p1_Pa
+pressure_X_lift_b [Pa] = p2_Pa
+pressure_X_tilt_a [Pa] = p3_Pa
+pressure_X_tilt_b [Pa] = p4_Pa
+pressure_supply [Pa] = pP_Pa
+pressure_tank [Pa] = pT_Pa
+inclination_lift_boom [deg] = z1_deg
+inclination_tilt_boom [deg] = z2_deg
+""")
+    machine = quiet(
+        crane.load, "patu655", lock={"slew": 0.0, "X_ext": 0.0}, changes={"payload.mass": 211.4}
+    )
+    fit = {
+        "payload.mass": None, "valve.X_lift.dead_band": (0.1143, 0.02, 0.3),
+        "valve.X_lift.c1": None, "valve.X_lift.c2": None,
+        "valve.X_lift.bandwidth": (31.4, 5.0, 200.0),
+        "sensor.voltage_X_lift.delay": (0.02, 0.0, 0.6),
+        "cylinder.X_lift.stiffness": (2e7, 2e6, 1e9), "cylinder.X_lift.damping": (2e4, 1e3, 1e6),
+        "cylinder.X_*.leakage_*": (1.0, 0.0, 3.0), "friction.X_lift.coulomb": (210.0, 0.0, 3000.0),
+        "cylinder.X_lift.gas_b": (1e-4, 0.0, 3e-3), "sensor.inclination_lift_boom.zero": None,
+        "sensor.inclination_tilt_boom.zero": None, "sensor.pressure_X_lift_b.zero": None,
+    }  # fmt: skip
+    found = quiet(crane.calibrate, machine, LIFTING, fit, columns=columns, train=(0.0, 10.0))
+    left = {sensor.name: sensor for sensor in found.sensors}
+    for name, fitted, held_out in (
+        ("X_lift", 2.5e-3, 6e-3), ("pressure_X_lift_a", 1.0e5, 0.8e5),
+        ("pressure_X_lift_b", 0.3e5, 1.0e5), ("pressure_X_tilt_a", 0.3e5, 0.6e5),
+        ("pressure_X_tilt_b", 0.3e5, 0.6e5), ("inclination_tilt_boom", 6e-3, 8e-3),
+    ):  # fmt: skip
+        sensor = left[name]
+        assert sensor.rms(sensor.after, True) < fitted, name
+        assert sensor.rms(sensor.after, False) < held_out, name
+        assert sensor.rms(sensor.after, False) < sensor.rms(sensor.before, False), name
+    ringing = left["pressure_X_lift_a"]
+    some = (ringing.time > 3.0) & (ringing.time < 9.0)
+
+    def swings(x):
+        return np.fft.rfft((x - np.polyval(np.polyfit(ringing.time[some], x[some], 2),
+                                           ringing.time))[some])  # fmt: skip
+
+    measured, simulated = swings(ringing.measured), swings(ringing.after)
+    peak = int(np.abs(measured).argmax())
+    assert abs(int(np.abs(simulated).argmax()) - peak) <= 1
+    near = slice(peak - 3, peak + 4)
+    share = np.linalg.norm(simulated[near]) / np.linalg.norm(measured[near])
+    assert 0.5 < share < 1.3

@@ -227,7 +227,7 @@ def inputs_of(machine: Machine, table: Table) -> Inputs:
         column(table, name, "Pa") if name in table.units else None for name in (_SUPPLY, _TANK)
     )
     moved = list(signals.values())
-    pressures = _pressures(joints, table, time, moved)
+    pressures = _pressures(joints, table, time)
     there = any(joint in table.units for joint in machine.joints)
     initial = _initial(machine, table, time, moved) if there else None
     return Inputs(time, signals, supply, tank, pressures, initial)
@@ -249,11 +249,8 @@ def _signals(machine: Machine, joints: Sequence[str], table: Table) -> dict[str,
     return signals
 
 
-def _pressures(
-    joints: Sequence[str], table: Table, time: Array, signals: list[Array]
-) -> dict[str, tuple[float, float]]:
+def _pressures(joints: Sequence[str], table: Table, time: Array) -> dict[str, tuple[float, float]]:
     """Of A and B at the start, by joint [Pa], from all samples near it."""
-    steady = time <= _steady(time, signals)
     pressures: dict[str, tuple[float, float]] = {}
     for joint in joints:
         pair = [f"pressure_{joint}_{side}" for side in "ab"]
@@ -262,7 +259,7 @@ def _pressures(
             missing = pair[pair[0] in there]
             raise RecordingError(f"'{missing}' is missing beside '{there[0]}', add or remove one")
         if there:
-            a, b = (_start(time, column(table, name), None, steady)[0] for name in pair)
+            a, b = (_first(time, column(table, name), 0) for name in pair)
             pressures[joint] = max(a, 0.0), max(b, 0.0)
     return pressures
 

@@ -10,10 +10,10 @@ from crane.common.samples import Array
 from crane.description.changes import parameters
 from crane.formats import load
 from crane.formats.loading import Variants
-from crane.identification.calibration.problem import Case, Problem, case_of
+from crane.identification.calibration.problem import Case, Problem, case_of, noise_of
 from crane.identification.calibration.readings import sensors_of
 from crane.identification.calibration.result import Calibration, Fitted, Sensor
-from crane.identification.calibration.unknowns import Unknown, unknowns_of
+from crane.identification.calibration.unknowns import SIGNAL, Unknown, unknowns_of
 from crane.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.logs import read_log
@@ -22,10 +22,10 @@ from crane.recordings.timeseries import Table
 Progress = Callable[[float], None]
 
 _ROUNDS = 3  # of weights
-_STEPS = 25  # of Gauss-Newton between them
-_SETTLED = 1e-3  # change of the cost, as a share, that ends them
+_STEPS = 40  # of Gauss-Newton between them
+_SETTLED = 1e-4  # change of the cost, as a share, that ends them
 _EXACT, _NOTHING = 1e-6, 1e-9  # of a channel's largest value, and of one that is zero [SI]
-_FLOOR = 0.02  # of a channel's variation that its weight begins with
+_FLOOR = 0.2  # of a channel's variation, that no channel may be off by for nothing
 _GROWN, _SHRUNK, _STIFFEST = 10.0, 0.2, 1e8  # of Levenberg's damping
 _BLOCKS = 8, 40  # least and most blocks of a covariance
 _COUPLED = 0.95  # correlation of two numbers of which the data know a combination alone
@@ -50,11 +50,12 @@ def calibrate(
 
         min sum_c sum_t ((y_c(t) - m_c(t)) / s_c)^2 + sum (start / its deviation)^2,
 
-    by Levenberg and Marquardt's method within bounds, first with friction that is smoothed over
+    by Levenberg and Marquardt's method within bounds, at first with friction that is smoothed over
     millimetres per second, for what sticks when depends on everything before. A channel's s_c is
-    what is left of it, found in rounds: no channel outweighs others because its noise is small
-    where the model is not that good. Intervals take blocks of instants as what is independent,
-    since what is left is no white noise (Huber's sandwich over blocks).
+    what is left of it, found in rounds, but no more than a fifth of its variation or its noise: no
+    channel outweighs others because its noise is small where the model is not that good, and none
+    is given up. Intervals take blocks of instants as what is independent, since what is left is no
+    white noise (Huber's sandwich over blocks).
 
     Args:
         machine: The machine, or what `crane.load` takes; joints that were held are locked in it.
@@ -92,7 +93,7 @@ def calibrate(
     units = {
         name: table.units[name]
         for case, table in zip(cases, tables, strict=True)
-        for name in case.sensors
+        for name in (*case.sensors, *(SIGNAL + joint for joint in case.inputs.signals))
     }
     # of a payload the description has the mass alone
     numbers = parameters(spec) | dict(machine.changes)
@@ -152,14 +153,15 @@ class _Search:
         problem = self._problem
         noise = self._noise()
         spread = self._spread()
-        self.sizes = {name: max(noise[name], _FLOOR * spread[name]) for name in noise}
+        most = {name: max(noise[name], _FLOOR * spread[name]) for name in noise}
+        self.sizes = dict(most)
         z = np.zeros(problem.size)
         sticks = any(law.sticks for law in problem.machine.friction.values())
         problem.smooth = sticks
         for i in range(_ROUNDS):
             z = self._minimum(z)
             left = self._left([problem.residuals(case, z) for case in self._trained])
-            fresh = {name: max(noise[name], left[name]) for name in left}
+            fresh = {name: min(max(noise[name], left[name]), most[name]) for name in left}
             moved = max(abs(np.log(fresh[name] / self.sizes[name])) for name in fresh)
             self.sizes = fresh
             if moved < 0.05 and (i or not sticks):
@@ -186,10 +188,9 @@ class _Search:
         found: dict[str, list[float]] = {}
         largest: dict[str, float] = {}
         for case in self._trained:
-            third = np.diff(case.measured, 3, axis=0)
-            for name, x, y in zip(case.sensors, third.T, case.measured.T, strict=True):
-                found.setdefault(name, []).append(float(np.mean(x**2)) / 20.0)
-                largest[name] = max(largest.get(name, 0.0), float(np.abs(y).max()))
+            for name, x in zip(case.sensors, case.measured.T, strict=True):
+                found.setdefault(name, []).append(noise_of(x) ** 2)
+                largest[name] = max(largest.get(name, 0.0), float(np.abs(x).max()))
         return {
             name: max(float(np.sqrt(np.mean(x))), _EXACT * largest[name], _NOTHING)
             for name, x in found.items()

@@ -12,7 +12,7 @@ from crane.common.errors import CraneError, InputError, SimulationError
 from crane.common.samples import Array
 from crane.formats.loading import Variants
 from crane.identification.calibration.readings import read
-from crane.identification.calibration.unknowns import Unknown
+from crane.identification.calibration.unknowns import SIGNAL, Unknown
 from crane.machine import Machine
 from crane.recordings.measured import column
 from crane.recordings.timeseries import Table
@@ -26,8 +26,10 @@ _SEEN, _CLEAR = 0.02, 0.2
 _FEWEST = 20  # instants of a recording
 _SMOOTH = {"rad": 5e-3, "m": 2e-3}  # [rad/s], [m/s] over which friction changes its sign
 _SHARPEST = 1e-2  # [s] of a step of the simulation at most
-# What starts may be off by, one standard deviation: rad, m, their rates, pressures.
-_PLACE, _PACE, _PRESSURE = {"rad": 5e-3, "m": 5e-3}, {"rad": 0.01, "m": 5e-3}, 1e5
+# What starts may be off by, one standard deviation, where nothing measures them: rad, m, rates.
+_PLACE, _PACE = {"rad": 5e-3, "m": 5e-3}, {"rad": 0.01, "m": 5e-3}
+_SURE = 2.0  # noises of a sensor that the start is off by, which is the mean of several samples
+_LEAST = {"rad": 1e-4, "m": 1e-5, "Pa": 1e3}
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,13 +73,28 @@ def case_of(
         raise InputError(f"{name}: {len(train)} instants, give at least {_FEWEST}")
     measured = np.column_stack([column(table, x) for x in sensors])
     kinds = [machine.unit(joint) for joint in machine.active]
-    starts = [_PLACE[kind] for kind in kinds] if inputs.initial else []
+    starts: list[float] = []
+
+    def near(name: str, unit: str, otherwise: float) -> float:
+        if name not in table.units:
+            return otherwise
+        return max(_SURE * noise_of(column(table, name)), _LEAST[unit])
+
+    if inputs.initial:
+        pairs = zip(machine.active, kinds, strict=True)
+        starts += [near(joint, kind, _PLACE[kind]) for joint, kind in pairs]
     if inputs.initial:  # what rests at first rests
         starts += [
             _PACE[kind] if v else 0.0 for kind, v in zip(kinds, inputs.initial[1], strict=True)
         ]
-    starts += [_PRESSURE] * (2 * len(inputs.pressures))
+    for joint in inputs.pressures:
+        starts += [near(f"pressure_{joint}_{side}", "Pa", 0.0) for side in "ab"]
     return Case(name, inputs, sensors, measured, train, starts=np.array(starts))
+
+
+def noise_of(x: Array) -> float:
+    """Standard deviation of a channel's noise, by its third differences."""
+    return float(np.sqrt(np.mean(np.diff(x, 3) ** 2) / 20.0))
 
 
 class Problem:
@@ -157,17 +174,43 @@ class Problem:
         """Inputs with another start."""
         moved = case.starts * z[case.first : case.first + len(case.starts)]
         inputs, n = case.inputs, len(self.machine.active)
+        values, signals = self.values(z), dict(inputs.signals)
         initial = inputs.initial
         if initial is not None:
             low, high = self.machine.lower, self.machine.upper
-            initial = np.clip(initial[0] + moved[:n], low, high), initial[1] + moved[n : 2 * n]
+            places = [
+                self._true(joint, float(x), values)
+                for joint, x in zip(self.machine.active, initial[0], strict=True)
+            ]
+            place = np.clip(np.array(places) + moved[:n], low, high)
+            initial = place, initial[1] + moved[n : 2 * n]
             moved = moved[2 * n :]
+        for joint, x in inputs.signals.items():
+            late = values.get(f"sensor.{SIGNAL}{joint}.delay", 0.0)
+            if late:
+                signals[joint] = np.interp(inputs.time - late, inputs.time, x)
+            scale = values.get(f"sensor.{SIGNAL}{joint}.scale", 1.0)
+            signals[joint] = scale * signals[joint] + values.get(
+                f"sensor.{SIGNAL}{joint}.zero", 0.0
+            )
         pairs = moved.reshape(-1, 2)
         pressures = {
-            joint: (max(a + float(da), 0.0), max(b + float(db), 0.0))
+            joint: (
+                max(self._true(f"pressure_{joint}_a", a, values) + float(da), 0.0),
+                max(self._true(f"pressure_{joint}_b", b, values) + float(db), 0.0),
+            )
             for (joint, (a, b)), (da, db) in zip(inputs.pressures.items(), pairs, strict=True)
         }
-        return replace(inputs, initial=initial, pressures=pressures)
+        return replace(inputs, initial=initial, pressures=pressures, signals=signals)
+
+    def _true(self, name: str, reading: float, values: dict[str, float]) -> float:
+        """What a sensor stands for that reads so."""
+        zero = values.get(f"sensor.{name}.zero", 0.0)
+        return (reading - zero) / values.get(f"sensor.{name}.scale", 1.0)
+
+    def _starts(self, name: str) -> bool:
+        """Whether the start depends on a sensor."""
+        return name in self.machine.active or name.startswith("pressure_")
 
     def _sensed(self, case: Case, curve: CubicSpline, z: Array) -> tuple[Array, dict[int, Array]]:
         """Readings (N, k) as sensors give them, and their slopes (N, k) by sensors' unknowns."""
@@ -219,7 +262,8 @@ class Problem:
         out = np.zeros((*here.shape, self.size))
         own = case.first + np.flatnonzero(case.starts)
         for i in (*range(len(self.unknowns)), *own.tolist()):
-            if i < len(self.unknowns) and self.unknowns[i].sensor:
+            sensor = self.unknowns[i].sensor if i < len(self.unknowns) else ""
+            if sensor in case.sensors and not self._starts(sensor):
                 out[:, :, i] = slopes.get(i, 0.0)
                 continue
             change = self._difference(case, z, i, here, machine)

@@ -8,7 +8,7 @@ from crane.common.errors import InputError, known
 from crane.description.changes import unknown_parameter
 from crane.description.spec import MachineSpec
 
-SENSOR = "sensor."
+SENSOR, SIGNAL = "sensor.", "voltage_"
 _SENSORS = {"zero": 0.0, "scale": 1.0, "delay": 0.0}
 _SIZES = {
     "rad": 0.02,
