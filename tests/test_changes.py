@@ -1,5 +1,6 @@
 """Machines loaded with some of their numbers changed."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from broken import DATA
 import crane
 import crane.cli.entry
 from crane.common.errors import InputError
-from crane.description import bundled, parameters
+from crane.description import bundled, changed, parameters
 from crane.formats import read
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
@@ -119,7 +120,7 @@ def test_urdfs_can_be_changed_too():
         (
             {"link3G.x": 1.0},
             "parameter 'link3G.x' is unknown, did you mean 'link3_G.x'? like it are "
-            "'link3.x' and 'link3_H.x'; crane info mini_forwarder --parameters lists all names",
+            "'link3.x' and 'link3_H.x'; crane info mini_forwarder --names lists all names",
         ),
         ({"link7.mass": -1.0}, "parameter 'link7.mass' is -1 kg, it must not be negative"),
         ({"link7.mass": "heavy"}, "parameter 'link7.mass' is not made of real numbers"),
@@ -213,3 +214,26 @@ def test_names_can_be_listed_and_changed(capsys):
     assert {name: float(f"{x:.6g}") for name, x in parameters(read("mini_forwarder")).items()} == {
         name: float(value) for name, value in listed
     }
+
+
+def test_numbers_of_springs_stops_and_ropes(tmp_path):
+    """By name, the second of a name too, and between frames; what cannot be is said."""
+    machine = crane.load("kr300", changes={"gas_spring.stroke.pressure": 1.2e7,
+                                           "gas_spring.stroke.exponent": 1.3})  # fmt: skip
+    (gas,) = machine.gas_springs
+    assert (gas.pressure, gas.exponent, gas.area) == (
+        1.2e7, 1.3, crane.load("kr300").gas_springs[0].area
+    )  # fmt: skip
+    assert (
+        crane.load("patu655", changes={"end_stop.slew.damping": 7.0}).end_stops[0].damping == 7.0
+    )
+    spec = read("mini_forwarder")
+    ropes = (crane.Rope(("link1", "link7"), 0.5, 1e4), crane.Rope(("link1", "link7"), 0.6, 2e4))
+    springs = (crane.ForceElement("q1", stiffness=3.0),)
+    spec = dataclasses.replace(spec, ropes=ropes, forces=springs)
+    names = parameters(spec)
+    assert names["rope.link1-link7.length"] == 0.5 and names["rope.link1-link7#2.length"] == 0.6
+    new = changed(spec, {"rope.link1-link7#2.length": 0.7, "spring.q1.rest": 0.1})
+    assert [rope.length for rope in new.ropes] == [0.5, 0.7] and new.forces[0].rest == 0.1
+    with pytest.raises(InputError, match="stiffness of .* is -1"):
+        changed(spec, {"spring.q1.stiffness": -1.0})

@@ -53,7 +53,11 @@ def info(
     machine: MachineName,
     parameters: Annotated[
         bool,
-        typer.Option("--parameters", help="List the names that --set changes, and their values."),
+        typer.Option(
+            "--parameters",
+            "--names",
+            help="List the names that --set, --vary and --fit take, and their values.",
+        ),
     ] = False,
     active: Active = None,
     free: Free = None,

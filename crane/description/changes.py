@@ -20,6 +20,7 @@ from crane.description.spec import (
     Coupling,
     Drive,
     Element,
+    EndStop,
     Friction,
     MachineSpec,
 )
@@ -27,6 +28,7 @@ from crane.description.tree import Joint, Limits, Link, Tree, limit
 from crane.hydraulics.components import Hydraulics, number_names
 
 PAYLOAD = "payload.mass"
+_LISTS = ("forces", "gas_springs", "ropes", "end_stops")
 _TURNS = ("roll", "pitch", "yaw")
 
 
@@ -81,9 +83,10 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
     `LINK.mass`, `LINK.com.x`, `LINK.inertia.xx` (about the centre of mass), `LINK.x`, `LINK.roll`
     (where its joint places it on its parent; frames such as pins are links, too), `JOINT.lower`,
     `JOINT.rotor_inertia`, `friction.JOINT.coulomb`, `control.JOINT.kp`, of a circuit
-    `supply.pressure`, `oil.bulk_modulus`, `cylinder.JOINT.area_a`, `valve.JOINT.c1`, and
-    `payload.mass`, a point mass at the tip, or the load that the machine file names, scaled to
-    that mass.
+    `supply.pressure`, `oil.bulk_modulus`, `cylinder.JOINT.area_a`, `valve.JOINT.c1`; of what acts
+    along joints or between frames `spring.JOINT.stiffness`, `gas_spring.JOINT.pressure`,
+    `rope.LINK-LINK.length`, `end_stop.JOINT.stiffness`; and `payload.mass`, a point mass at the
+    tip, or the load that the machine file names, scaled to that mass.
     """
     found = {name: _number(part, way) for name, part, way in _numbers(spec)}
     for joint in (joint.name for joint in spec.tree.moving):
@@ -93,11 +96,33 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
     for joint, gains in spec.control.items():
         for field in dataclasses.fields(gains):
             found[f"control.{joint}.{field.name}"] = getattr(gains, field.name)
+    for head, (_, _, item) in _elements(spec).items():
+        for field in dataclasses.fields(item):
+            if field.name not in ("joint", "between"):
+                found[f"{head}.{field.name}"] = getattr(item, field.name)
     if spec.hydraulics is not None:
         for head, part in _parts(spec.hydraulics).items():
             found |= {f"{head}.{name}": getattr(part, name) for name in number_names(type(part))}
     if spec.tip is not None:
         found[PAYLOAD] = 0.0
+    return found
+
+
+def _elements(spec: MachineSpec) -> dict[str, tuple[str, int, Element | EndStop]]:
+    """Springs, gas springs, ropes and end stops by the names that their numbers begin with.
+
+    With the field of the description and the place in it that they have.
+    """
+    found: dict[str, tuple[str, int, Element | EndStop]] = {}
+    for head, field in (
+        ("spring", "forces"), ("gas_spring", "gas_springs"), ("rope", "ropes"),
+        ("end_stop", "end_stops"),
+    ):  # fmt: skip
+        for i, item in enumerate(getattr(spec, field)):
+            between = getattr(item, "between", None)
+            name = f"{head}.{'-'.join(between) if between else item.joint}"
+            count = sum(other == name or other.startswith(f"{name}#") for other in found)
+            found[f"{name}#{count + 1}" if count else name] = field, i, item
     return found
 
 
@@ -116,7 +141,9 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
     tree, chains = spec.tree, spec.chains
     friction, control = dict(spec.friction), dict(spec.control)
     circuit = _parts(spec.hydraulics) if spec.hydraulics else {}
+    elements = _elements(spec)
     replaced: dict[str, dict[str, float]] = {}
+    renewed: dict[str, dict[str, float]] = {}
     for name in sorted(changes, key=lambda name: name == PAYLOAD):  # last: it adds to a link
         if name not in names:
             raise InputError(unknown_parameter(spec, names, name))
@@ -130,7 +157,9 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
             tree, chains = _load(spec, tree, value)
         elif head == "friction":
             _set(friction, rest, value, Friction)
-        elif (part := name.rpartition(".")[0]) in circuit:
+        elif (part := name.rpartition(".")[0]) in elements:
+            renewed.setdefault(part, {})[name.rpartition(".")[2]] = value
+        elif part in circuit:
             replaced.setdefault(part, {})[name.rpartition(".")[2]] = value
         elif head == "control":
             _set(control, rest, value, None)
@@ -140,6 +169,10 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
             tree = tree.replacing(_changed(now, way, value, name))
     for part, values in replaced.items():
         circuit[part] = dataclasses.replace(circuit[part], **values)
+    lists: dict[str, list[Any]] = {field: list(getattr(spec, field)) for field in _LISTS}
+    for part, values in renewed.items():
+        field, i, _ = elements[part]
+        lists[field][i] = dataclasses.replace(lists[field][i], **values)
     hydraulics = _circuit(circuit) if circuit else None
     for part, values in replaced.items():
         _warn_of_units(spec, part, values)
@@ -150,6 +183,10 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
         friction=MappingProxyType(friction),
         control=MappingProxyType(control),
         hydraulics=hydraulics,
+        forces=tuple(lists["forces"]),
+        gas_springs=tuple(lists["gas_springs"]),
+        ropes=tuple(lists["ropes"]),
+        end_stops=tuple(lists["end_stops"]),
     )
 
 
@@ -171,7 +208,7 @@ def unknown_parameter(spec: MachineSpec, names: Iterable[str], wanted: str) -> s
         meant += f"like it are {' and '.join(map(repr, near[1:]))}; "
     at = spec.path.stem if bundled().get(spec.path.stem) == spec.path else spec.path
     what = f"parameter '{wanted}' is unknown"
-    return f"{what}, {meant}crane info {at} --parameters lists all names"
+    return f"{what}, {meant}crane info {at} --names lists all names"
 
 
 def _warn_of_units(spec: MachineSpec, part: str, values: Mapping[str, float]) -> None:

@@ -243,6 +243,8 @@ def _unit(machine: Machine, head: str, rest: list[str]) -> str:
         if last in ("smoothing", "stribeck"):
             return f"{length}/s"
         return f"{force} s/{length}" if last.startswith("viscous") else force
+    if head in ("spring", "gas_spring", "rope", "end_stop"):
+        return ""
     if last in ("lower", "upper"):
         return machine.unit(".".join([head, *rest[:-1]]))
     if last == "rotor_inertia":
