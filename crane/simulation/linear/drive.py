@@ -1,0 +1,176 @@
+"""What acts on a machine that is linearized: forces, or a circuit with its valves."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from crane.codegen import Expression, Number, Program, Tape
+from crane.codegen.derivative import derivatives
+from crane.common.samples import Array
+from crane.control import At, Signals, ValveDrive
+from crane.dynamics import Dynamics
+from crane.hydraulics.circuit import BALANCES
+from crane.machine import Machine
+from crane.recordings.recording import FORCE_UNITS
+from crane.simulation.integration.traced import settings_of
+
+_AJAR = 1e-6  # of a spool's stroke, beyond the dead band
+
+
+class Drive:
+    """What acts on the machine, its states and inputs: forces, or a circuit with its valves.
+
+    Attributes:
+        states: Names and units of the drive's own states.
+        inputs: Names and units.
+        seen: Names and units of what else can be an output.
+        own: (k,) states where the machine stands still.
+        u: (m,) inputs there.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        dynamics: Dynamics,
+        q: Array,
+        valves: bool,
+        pressures: Mapping[str, tuple[float, float]] | None,
+    ):
+        n = self._n = len(machine.active)
+        self.states: dict[str, str] = {}
+        self.inputs = {
+            f"{joint}_force": FORCE_UNITS[machine.unit(joint)]
+            for joint, driven in zip(machine.active, machine.driven, strict=True)
+            if driven
+        }
+        self.seen: dict[str, str] = {}
+        self.own, self.u = np.zeros(0), np.zeros(len(self.inputs))
+        self.scales, self._vapour = np.zeros(0), 0.0
+        self._control: ValveDrive | None = None
+        self._spread = np.eye(n)[:, machine.driven]
+        if valves:
+            control = ValveDrive(machine, Signals(machine, [0.0], {}), pressures)
+            self._control = control
+            circuit = control.circuit
+            self.states = dict(circuit.states)
+            self._stiff, self.scales = circuit.stiff, circuit.scales[: circuit.stiff]
+            self._vapour = circuit.hydraulics.oil.vapour_pressure
+            ends = [*circuit.starts, circuit.stiff]
+            self._owner = {
+                name: joint
+                for joint, first, last in zip(circuit.joints, ends, ends[1:], strict=False)
+                for name in list(self.states)[first:last]
+                if name != "pressure_supply"
+            }
+            self.inputs = {f"voltage_{joint}": "V" for joint in circuit.joints}
+            self.seen = dict(control.channels) | {
+                f"{joint}_force": FORCE_UNITS[machine.unit(joint)] for joint in circuit.joints
+            }
+            self._forces = [machine.active.index(joint) for joint in circuit.joints]
+            self.own = control.start_at(dynamics, q)[: self._stiff]
+            self.u = control.references(np.zeros(1))[0]
+            self._program = self._built(machine)
+
+    def moving(self, v_a: Array) -> Array:
+        """(k + m,) which states and signals belong to joints that move, or to the supply."""
+        assert self._control is not None
+        joints = self._control.circuit.joints
+        moving = {x for x, i in zip(joints, self._forces, strict=True) if v_a[i]}
+        own = [
+            self._owner.get(name) in moving or name == "pressure_supply" for name in self.states
+        ]
+        mask: Any = np.array([*own, *(joint in moving for joint in joints)]) & bool(moving)
+        return mask
+
+    def loaded(self, forces: Array) -> Any:
+        """(k,) which states are pressures of the chambers that bear forces (n,)."""
+        assert self._control is not None
+        found = np.zeros(len(self.states), dtype=bool)
+        for i, first in zip(self._forces, self._control.circuit.starts, strict=True):
+            found[first + int(forces[i] < 0)] = True
+        return found
+
+    def opened(self, v_a: Array, share: float) -> tuple[Array, Array, Array, Array]:
+        """States and signals z with valves open by a share of their stroke, and where they may go.
+
+        Returns:
+            z (k + m,); how it depends on pressures and openings (k + m, r); least and most of
+            these (r,), which keep valves open and pumps within their droop.
+        """
+        assert self._control is not None
+        hydraulics, names = self._control.circuit.hydraulics, list(self.states)
+        supply, k = hydraulics.supply, len(names)
+        z = np.concatenate([self.own, self.u])
+        ways: list[Array] = []
+        ends: list[tuple[float, float]] = []
+        if "pressure_supply" in names:
+            at = names.index("pressure_supply")
+            z[at] = supply.pressure - 0.5 * supply.droop - self._vapour
+            ways.append(np.eye(len(z))[at])
+            ends.append((-0.5 * supply.droop, 0.5 * supply.droop))
+        for i, (joint, valve) in enumerate(hydraulics.valves.items()):
+            if not (side := float(np.sign(v_a[self._forces[i]]))):
+                continue
+            for at, name in enumerate(names):
+                if name in (f"pressure_{joint}_a", f"pressure_{joint}_b"):
+                    z[at] = max(z[at], 0.3 * supply.pressure)
+                    ways.append(np.eye(len(z))[at])
+                    ends.append((-z[at], np.inf))
+            dead, open_to = valve.dead_band, valve.dead_band + share * (1.0 - valve.dead_band)
+            way = np.zeros(len(z))
+            way[k + i] = side * (valve.full - valve.neutral)
+            z[k + i] = valve.neutral + open_to * way[k + i]
+            if f"spool_{joint}" in names:
+                at = names.index(f"spool_{joint}")
+                way[at], z[at] = side, side * open_to
+            ways.append(way)
+            ends.append((dead + _AJAR - open_to, 1.0 - open_to))
+        lower, upper = np.array(ends).T
+        return z, np.array(ways).T, lower, upper
+
+    @property
+    def shown(self) -> Array:
+        """(k,) what states are to be added for pressures to count from a vacuum."""
+        return np.array([self._vapour * name.startswith("pressure_") for name in self.states])
+
+    def _built(self, machine: Machine) -> Program:
+        control, n, k, m = self._control, self._n, self._stiff, len(self.inputs)
+        assert control is not None
+        tape = Tape()
+        q_a, v_a, own = tape.loads(0, 0, n), tape.loads(0, n, n), tape.loads(0, 2 * n, k)
+        settings, u = settings_of(control, tape, 1, fold=True), tape.loads(0, 2 * n + k, m)
+        integrals: list[Number] = [0.0] * len(BALANCES)
+        at = At(q_a, v_a, [*own, *integrals], settings, u, _no_inverse)
+        tau, rates = control.trace(at)
+        seen = [*control.look(at), *(tau[i] for i in self._forces)]
+        values = [*tau, *rates[:k], *seen]
+        by = [x for x in (*q_a, *v_a, *own, *u) if isinstance(x, Expression)]
+        slopes = [entry for row in derivatives(values, by) for entry in row]
+        words = [x.index if isinstance(x, Expression) else float(x) for x in (*values, *slopes)]
+        fast, key = machine.closure.fast, ("linear drive", repr((tape.operations, words)))
+
+        def build(program: Program) -> None:
+            program.add("formula", 2, {"values": values, "slopes": slopes})
+
+        if key not in fast.programs:
+            fast.programs[key] = fast.kept(key, build)
+        return fast.programs[key]
+
+    def at(self, q_a: Array, v_a: Array, own: Array, u: Array) -> tuple[Array, Array]:
+        """Forces (n,), rates (k,) and what is seen, and their derivatives by all arguments."""
+        n = self._n
+        if self._control is None:
+            slopes = np.zeros((n, 2 * n + len(u)))
+            slopes[:, 2 * n :] = self._spread
+            return self._spread @ u, slopes
+        layout = self._program.outputs("formula")
+        out = np.empty(layout.size)
+        settings = np.ascontiguousarray(self._control.settings)
+        self._program.call("formula", np.concatenate([q_a, v_a, own, u]), settings, out)
+        values, slopes = out[layout["values"]], out[layout["slopes"]]
+        return values, slopes.reshape(len(values), -1)
+
+
+def _no_inverse(a_a: Sequence[Number], friction: bool) -> list[Number]:
+    raise AssertionError("signals that are given do not ask for forces")

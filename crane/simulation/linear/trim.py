@@ -1,0 +1,149 @@
+"""Forces, or pressures and signals, at which a machine goes on as it does."""
+
+import itertools
+import warnings
+
+import numpy as np
+
+from crane.common.errors import CraneWarning, SimulationError
+from crane.common.samples import Array
+from crane.dynamics import Dynamics
+from crane.recordings.recording import FORCE_UNITS
+from crane.simulation.linear.drive import Drive
+
+_STILL = 1e-9  # what is left of a trimmed machine, in its size per its pace squared
+_ROUNDS = 50  # of Newton's method
+_BAR, _SOON = 1e5, 0.1  # [Pa], [s]
+
+
+def trimmed(dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array) -> tuple[Array, Array]:
+    """The drive's states and inputs at which velocities and states stay.
+
+    Raises:
+        SimulationError: There are none.
+    """
+    if drive.states:
+        return _on_valves(_Trim(dynamics, drive, q_a, v_a))
+    machine = dynamics.machine
+    forces = dynamics.inverse(q_a, v_a, np.zeros(len(q_a))) + dynamics.friction(q_a, v_a)
+    driven = machine.driven.astype(bool)
+    held = np.where(driven, forces, 0.0)
+    if np.abs(dynamics.forward(q_a, v_a, held, friction=True)).max() > _STILL:
+        worst = int(np.argmax(np.abs(forces - held)))
+        joint = machine.active[worst]
+        unit = FORCE_UNITS[machine.unit(joint)]
+        raise SimulationError(
+            f"free joint '{joint}' does not stay there, {forces[worst]:.3g} {unit} would have to "
+            "hold it: linearize where it hangs still"
+        )
+    return drive.own, forces[driven]
+
+
+class _Trim:
+    """What is left of an equilibrium on valves, over their states and signals z.
+
+    Joints at rest have their valves closed: the pressure of the chamber that bears the load holds
+    the machine for now, whatever leaks. All else has to stay what it is.
+
+    Args:
+        dynamics: Of the machine.
+        drive: The circuit.
+        q_a: (n,).
+        v_a: (n,).
+
+    Attributes:
+        start: (k + m,) closed valves.
+    """
+
+    def __init__(self, dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array):
+        self._dynamics, self.drive, self._q_a, self.v_a = dynamics, drive, q_a, v_a
+        closure = dynamics.machine.closure
+        n, k = len(q_a), len(drive.states)
+        pressure = np.array([unit == "Pa" for unit in drive.states.values()])
+        scales = np.where(pressure, _BAR, 1.0)
+        moving = drive.moving(v_a)
+        loaded = drive.loaded(dynamics.inverse(q_a, v_a, np.zeros(n)))
+        self._free = np.flatnonzero(np.concatenate([loaded | moving[:k], moving[k:]]))
+        self._rows = np.concatenate([np.arange(n), n + np.flatnonzero(moving[:k])])
+        self._scales = np.concatenate([scales, np.ones(len(drive.u))])
+        # pressures of bars within tenths of a second are as much as such accelerations
+        accelerations = closure.units[closure.active] / closure.pace**2
+        self._units = np.concatenate([accelerations, scales / _SOON])[self._rows]
+        self.start = np.concatenate([drive.own, drive.u])
+
+    def rates(self, z: Array) -> Array:
+        """(k,) of the states."""
+        n, k = len(self._q_a), len(self.drive.states)
+        return self.drive.at(self._q_a, self.v_a, z[:k], z[k:])[0][n : n + k]
+
+    def left(self, z: Array) -> tuple[Array, Array]:
+        """Accelerations and rates in their units, and their derivatives by z."""
+        drive, n, k = self.drive, len(self._q_a), len(self.drive.states)
+        values, slopes = drive.at(self._q_a, self.v_a, z[:k], z[k:])
+        state = self._q_a, self.v_a, values[:n]
+        a_a = self._dynamics.forward(*state, friction=True)
+        found = self._dynamics.derivatives("forward", *state, friction=True, by=["tau_a"])
+        by = slopes[:, 2 * n :]
+        rows = np.vstack([found["tau_a"] @ by[:n], by[n : n + k]])
+        left = np.concatenate([a_a, values[n : n + k]])
+        return left[self._rows] / self._units, rows[self._rows] / self._units[:, None]
+
+    def polished(self, z: Array) -> Array | None:
+        """The nearest z at which nothing is left, by Newton's method; None if there is none."""
+        z, free = z.copy(), self._free
+        for _ in range(_ROUNDS):
+            left, slopes = self.left(z)
+            if np.abs(left).max() < _STILL:
+                return z
+            rows = (slopes * self._scales)[:, free]
+            step = np.linalg.lstsq(rows, left, rcond=1e-10)[0]
+            if not np.isfinite(step).all():
+                return None
+            z[free] -= step * self._scales[free]
+        return None
+
+    def searched(self, share: float) -> Array:
+        """The best z from valves that are open by a share of their stroke, and stay open."""
+        from scipy.optimize import least_squares
+
+        z, ways, lower, upper = self.drive.opened(self.v_a, share)
+
+        def left(x: Array) -> Array:
+            return self.left(z + ways @ x)[0]
+
+        def slopes(x: Array) -> Array:
+            found: Array = self.left(z + ways @ x)[1] @ ways
+            return found
+
+        scales = 1.0 / (np.abs(ways) / self._scales[:, None]).max(axis=0)
+        start = np.zeros(len(lower))
+        found = least_squares(left, start, slopes, (lower, upper), x_scale=scales)
+        return z + ways @ found.x
+
+
+def _on_valves(trim: _Trim) -> tuple[Array, Array]:
+    drive, k = trim.drive, len(trim.drive.states)
+    starts = (trim.searched(share) for share in (0.2, 0.5, 0.8)) if trim.v_a.any() else ()
+    done = next(
+        (
+            z
+            for start in itertools.chain(starts, [trim.start])
+            if (z := trim.polished(start)) is not None
+        ),
+        None,
+    )
+    if done is None:
+        raise SimulationError(
+            "the machine cannot be trimmed there: no pressures and signals keep these velocities"
+        )
+    rates = np.abs(trim.rates(done))
+    worst = int(np.argmax(np.where(rates > 1e-3 * drive.scales, rates / drive.scales, 0.0)))
+    if rates[worst] > _BAR * _STILL:
+        name, unit = list(drive.states.items())[worst]
+        warnings.warn(
+            f"linearized where it does not stay: {name} changes by {rates[worst]:.3g} {unit}/s "
+            "with closed valves, through leakage or relief valves",
+            CraneWarning,
+            stacklevel=4,
+        )
+    return done[:k], done[k:]
