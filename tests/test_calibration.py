@@ -10,6 +10,9 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
+from crane.description.changes import parameters
+from crane.formats.loading import Variants
+from crane.identification.calibration.unknowns import unknowns_of
 from crane.recordings import timeseries
 
 LIFTING = Path(__file__).parents[2] / "shared" / "data" / "patu655" / "lifting_first_half.csv"
@@ -246,3 +249,14 @@ inclination_tilt_boom [deg] = z2_deg
     near = slice(peak - 3, peak + 4)
     share = np.linalg.norm(simulated[near]) / np.linalg.norm(measured[near])
     assert 0.5 < share < 1.3
+
+
+def test_numbers_keep_their_sign():
+    """A piston that drives its joint backwards has a negative area."""
+    spec = Variants(crane.load("kr300")).spec
+    numbers = parameters(spec)
+    names = ["gas_spring.stroke.area", "gas_spring.stroke.pressure", "link2_anchor.x"]
+    area, pressure, pin = unknowns_of(names, spec, numbers, {})
+    assert area.start < area.high < 0 and area.low == -np.inf
+    assert 0 < pressure.low < pressure.start and pressure.high == np.inf
+    assert (pin.low, pin.high) == (-np.inf, np.inf)

@@ -115,8 +115,11 @@ def _unknown(
     if name not in numbers:
         raise InputError(unknown_parameter(spec, numbers, name))
     begin = numbers[name] if start is None else start
-    if low is None and not name.endswith(tuple("." + word for word in _SIGNED)):
-        low = _LEAST * abs(begin)
+    signed = name.endswith(tuple("." + word for word in _SIGNED))
+    if not signed and begin >= 0:
+        low = _LEAST * begin if low is None else low
+    elif not signed:
+        high = _LEAST * begin if high is None else high
     if begin:
         size = abs(begin)
     elif low is not None and high is not None:
