@@ -260,3 +260,18 @@ def test_numbers_keep_their_sign():
     assert area.start < area.high < 0 and area.low == -np.inf
     assert 0 < pressure.low < pressure.start and pressure.high == np.inf
     assert (pin.low, pin.high) == (-np.inf, np.inf)
+
+
+def test_recordings_that_are_held_out_whole_and_several_that_are_fitted(tmp_path):
+    machine = simple(tmp_path)
+    paths = [recorded(machine, tmp_path / f"run{seed}.csv", 40 + seed) for seed in range(3)]
+    found = quiet(
+        crane.calibrate, machine, paths[:2], list(TRUTH), validation=paths[2:], train=(0.0, 3.0)
+    )
+    for one in found.fitted:
+        assert abs(one.value - TRUTH[one.name]) < 2.0 * one.interval, one
+    kept = [sensor for sensor in found.sensors if sensor.recording == "run2.csv"]
+    assert len(kept) == 3 and not any(sensor.train.any() for sensor in kept)
+    for sensor, noise in zip(kept, (2e-4, 2e4, 2e4), strict=True):
+        assert sensor.rms(sensor.after, False) < 1.2 * noise < sensor.rms(sensor.before, False)
+    assert "run2.csv: pressure_x_a" in found.to_text()

@@ -38,7 +38,7 @@ def calibrate(
     ] = None,
     columns: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Which columns of raw logs are which, as for convert."),
+        typer.Option(metavar="FILE", help="Which columns of raw logs are which, as for import."),
     ] = None,
     sensors: Annotated[
         str | None,

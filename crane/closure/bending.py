@@ -127,7 +127,7 @@ class Bending:
     def turning(
         self, cluster: Cluster, velocity: Mapping[int, Pair], acceleration: Mapping[int, Pair]
     ) -> dict[int, tuple[Pair, Pair]]:
-        """S' and s'' of a cluster's joints, whose bodies move so."""
+        """Of a cluster's joints, whose bodies move so, s' and s'' of their columns s."""
         out = {}
         for i in cluster.joints:
             once = crossed(velocity[i], self._columns[i])
@@ -179,7 +179,7 @@ class Bending:
         ]
 
     def _along(self, cluster: Cluster, tied: Sequence[int], k: int, j: int) -> Rates:
-        """D gamma_j / d q_k."""
+        """Derivative of gamma_j by q_k, by joint."""
         mover = self.twists[k]
         parts = {
             i: by(self._loops.gamma[i][j], crossed(mover[i], self._columns[i]))
@@ -199,7 +199,7 @@ class Bending:
 
 
 def _twice(row: Row, velocity: Motions, acceleration: Motions) -> tuple[Pair, Pair]:
-    """W' and w'' of a row."""
+    """First and second time derivative of a row's wrench, w' and w''."""
     one, two = row.bodies
     first, second = _of(velocity, one), _of(velocity, two)
     (_, e1), (a2, e2) = _of(acceleration, one), _of(acceleration, two)

@@ -48,13 +48,9 @@ QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
     "regressor": lambda sweep, x: [entry for row in sweep.regressor(x) for entry in row],
 }
 _Analytic = Callable[[Sensitivity, list[Number]], tuple[Matrix, Matrix, Matrix]]
-_INVERSE: _Analytic = lambda found, x: (*found.inverse(x), found.mass)  # noqa: E731
-_FORWARD: _Analytic = lambda found, x: found.forward(x)  # noqa: E731
 _ANALYTIC: dict[str, _Analytic] = {
-    "inverse": _INVERSE,
-    "inverse" + FRICTION: _INVERSE,
-    "forward": _FORWARD,
-    "forward" + FRICTION: _FORWARD,
+    "inverse": lambda found, x: (*found.inverse(x), found.mass),
+    "forward": lambda found, x: found.forward(x),
 }
 SLOPES = "slopes of "  # before a quantity: its derivatives by q_A, v_A and the second argument
 _FLOAT = np.dtype(np.float64)
@@ -166,10 +162,11 @@ def _build(
     modes, of = quantity in MOVES, quantity.removeprefix(SLOPES)
     geometry = fast.geometry
     holonomic = not geometry.flyers and form.carriers == geometry.parents
-    if of != quantity and of in _ANALYTIC and holonomic:
+    plain = of.removesuffix(FRICTION)
+    if of != quantity and plain in _ANALYTIC and holonomic:
         bending = Bending(posture, loops, fast.clusters, v_a)
         sweep = Sweep(posture, loops, constants, q, v_a, form, drift=bending.drift)
-        matrices = _ANALYTIC[of](Sensitivity(sweep, bending, of.endswith(FRICTION)), x)
+        matrices = _ANALYTIC[plain](Sensitivity(sweep, bending, of != plain), x)
         outputs = [entry for matrix in matrices for row in matrix for entry in row]
     else:
         sweep = Sweep(posture, loops, constants, q, v_a, form, modes)

@@ -6,7 +6,7 @@ import numpy as np
 
 from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
-from crane.description.changes import parameters, unknown_parameter
+from crane.description.changes import unknown_parameter
 from crane.formats.loading import Variants
 from crane.machine import Machine
 
@@ -31,7 +31,7 @@ class Named:
 
     def __init__(self, machine: Machine):
         self._variants = Variants(machine)
-        self._values = parameters(self._variants.spec)
+        self._values = self._variants.values
 
     def slopes(self, names: Sequence[str], constants: Callable[[Machine], Array]) -> Array:
         """Derivatives (k, m) of constants (m,) of a machine by k of its numbers.

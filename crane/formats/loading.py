@@ -10,7 +10,7 @@ from types import MappingProxyType
 from crane.common.counted import few_warnings
 from crane.common.errors import DescriptionError, InputError
 from crane.common.packages import giving, package_folders, values_by_name
-from crane.description import MachineSpec, changed, driven, locked
+from crane.description import MachineSpec, changed, driven, locked, parameters
 from crane.description.floating import floated
 from crane.description.sources import WITH, find
 from crane.formats.ambiguity import warn_of_assemblies
@@ -76,6 +76,7 @@ class Variants:
 
     Attributes:
         spec: Its description, with its own changes.
+        values: Its numbers by name, see `crane.description.parameters`.
     """
 
     def __init__(self, machine: Machine):
@@ -88,6 +89,8 @@ class Variants:
                 machine.floats,
             )
             self.spec = changed(unchanged, machine.changes)
+        # of a payload the description does not say that it is one
+        self.values = parameters(self.spec) | dict(machine.changes)
         self._unchanged = unchanged
 
     def machine(self, changes: Mapping[str, float]) -> Machine:

@@ -7,7 +7,6 @@ import numpy as np
 
 from crane.common.errors import CraneError, InputError, RecordingError, at
 from crane.common.samples import Array
-from crane.description.changes import parameters
 from crane.formats import load
 from crane.formats.loading import Variants
 from crane.identification.calibration.problem import Case, Problem, case_of, noise_of
@@ -89,15 +88,13 @@ def calibrate(
     ]
     if not any(case.train.any() for case in cases):
         raise InputError(f"no instant lies within {train[0]:g} to {train[1]:g} s")
-    spec = Variants(machine).spec
+    variants = Variants(machine)
     units = {
         name: table.units[name]
         for case, table in zip(cases, tables, strict=True)
         for name in (*case.sensors, *(SIGNAL + joint for joint in case.inputs.signals))
     }
-    # of a payload the description has the mass alone
-    numbers = parameters(spec) | dict(machine.changes)
-    unknowns = unknowns_of(fit, spec, numbers, units)
+    unknowns = unknowns_of(fit, variants.spec, variants.values, units)
     problem = Problem(machine, unknowns, cases)
     search = _Search(problem, progress)
     before = [problem.residuals(case, np.zeros(problem.size)) for case in problem.cases]

@@ -16,6 +16,7 @@ _SIZES = {
     "rad/s": 0.02,
     "m/s": 0.01,
     "Pa": 1e5,
+    "V": 0.05,
 }  # of zeros that sensors have
 _DELAY = 0.02  # [s]
 _LEAST = 1e-3  # share of a number's start below which it does not go, where it must be positive
@@ -126,8 +127,8 @@ def _unknown(
         size = high - low
     else:
         raise InputError(f"'{name}' is 0 at first, say how large it may be: '{name}=0,LOW~HIGH'")
-    if name.endswith(tuple("." + word for word in _SIGNED)):
-        size = min(size, 0.1) if name.endswith((".x", ".y", ".z")) else size
+    if name.endswith((".x", ".y", ".z")):
+        size = min(size, 0.1)
     return _made(name, begin, low, high, size, ((name, numbers[name]),))
 
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, known
 from crane.common.samples import Array, as_samples
-from crane.description.changes import parameters, unknown_parameter
+from crane.description.changes import unknown_parameter
 from crane.dynamics import Dynamics
 from crane.formats import load
 from crane.formats.loading import Variants
@@ -135,7 +135,7 @@ def linear_models(
         machine = load(machine)
     values = {name: np.atleast_1d(np.asarray(x, dtype=np.float64)) for name, x in vary.items()}
     variants, found = Variants(machine), []
-    numbers = parameters(variants.spec)
+    numbers = variants.values
     for name in values:
         if name not in machine.active and name not in numbers:
             raise InputError(unknown_parameter(variants.spec, [*numbers, *machine.active], name))

@@ -12,6 +12,7 @@ from crane.recordings.recording import FORCE_UNITS
 from crane.simulation.linear.drive import Drive
 
 _STILL = 1e-9  # what is left of a trimmed machine, in its size per its pace squared
+_HANGS = 1e-6  # the same, of free joints that hang still
 _ROUNDS = 50  # of Newton's method
 _BAR, _SOON = 1e5, 0.1  # [Pa], [s]
 
@@ -28,7 +29,9 @@ def trimmed(dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array) -> tuple[A
     forces = dynamics.inverse(q_a, v_a, np.zeros(len(q_a))) + dynamics.friction(q_a, v_a)
     driven = machine.driven.astype(bool)
     held = np.where(driven, forces, 0.0)
-    if np.abs(dynamics.forward(q_a, v_a, held, friction=True)).max() > _STILL:
+    units = machine.closure.units[machine.closure.active] / machine.closure.pace**2
+    moved = np.abs(dynamics.forward(q_a, v_a, held, friction=True)) / units
+    if not driven.all() and moved.max() > _HANGS:
         worst = int(np.argmax(np.abs(forces - held)))
         joint = machine.active[worst]
         unit = FORCE_UNITS[machine.unit(joint)]
