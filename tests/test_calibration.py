@@ -275,3 +275,14 @@ def test_recordings_that_are_held_out_whole_and_several_that_are_fitted(tmp_path
     for sensor, noise in zip(kept, (2e-4, 2e4, 2e4), strict=True):
         assert sensor.rms(sensor.after, False) < 1.2 * noise < sensor.rms(sensor.before, False)
     assert "run2.csv: pressure_x_a" in found.to_text()
+
+
+def test_what_no_machine_file_says_is_left_out_with_a_warning(fitted, tmp_path):
+    machine, path, _ = fitted
+    done = typed(
+        "calibrate", machine.path, path, "--fit", "valve.x.c1", "--train", "0:1", "--out",
+        tmp_path / "out",
+    )  # fmt: skip
+    assert done.returncode == 0 and "the machine is not written, take the --set" in done.stderr
+    assert {x.name for x in (tmp_path / "out").iterdir()} == {"calibration.md", "calibration.png"}
+    assert "--set valve.x.c1=" in done.stdout

@@ -150,6 +150,8 @@ def write_workspace(folder: Path, space: "Workspace") -> str:
 def write_calibration(folder: Path, found: "Calibration") -> None:
     """Write report, picture and the fitted machine into a folder, created where there is none.
 
+    A machine that no machine file can say is left out with a warning: the report has its `--set`.
+
     Raises:
         OutputError: The folder or a file cannot be written.
     """
@@ -159,7 +161,11 @@ def write_calibration(folder: Path, found: "Calibration") -> None:
     with staging(folder) as part:
         (part / "calibration.md").write_text(found.to_text() + "\n", encoding="utf-8")
         plot_calibration(found, part / "calibration.png")
-        write_machine(found.machine, part / "machine")
+        try:
+            write_machine(found.machine, part / "machine")
+        except InputError as error:
+            text = f"the machine is not written, take the --set options of the report: {error}"
+            warnings.warn(text, CraneWarning, stacklevel=2)
 
 
 def write_modes(
