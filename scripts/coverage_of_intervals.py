@@ -19,7 +19,8 @@ from identify_mini_forwarder import BANDWIDTH, SLOW, rig, terms
 import crane
 from crane.identification.excitation.excite import excite
 from crane.identification.mechanics.identify import METHODS, identify
-from crane.identification.mechanics.model import Model, default_terms
+from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.terms import default_terms
 
 
 def main() -> None:

@@ -17,15 +17,16 @@ import numpy as np
 from rig import Converter, Rig, Tolerances, default_sensors
 
 import crane
-from crane.identification.estimation.estimators import Prior
 from crane.identification.excitation.excite import excite
+from crane.identification.mechanics.friction import friction
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.model import Inertial, Model, Term, friction
-from crane.identification.mechanics.possible import prior_of_bodies
+from crane.identification.mechanics.inertias import Inertial
+from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.term import Term
 
 SLOW = (0.05, 0.004, 0.004)  # beyond Stribeck velocities [rad/s], [m/s]: below, friction sticks
 BANDWIDTH = 5.0  # [Hz], five times the highest harmonic
-BODIES, FRICTION = 0.1, 0.3  # standard deviations of the prior of the model that predicts
+PRIOR = {"*": "30 %", "bodies": "10 %"}  # of the model that predicts: the description's tolerances
 
 
 def terms(machine: crane.Machine) -> list[Term]:
@@ -36,15 +37,6 @@ def terms(machine: crane.Machine) -> list[Term]:
         *(friction(machine, joint, smoothing=0.0) for joint in machine.active),
         *(friction(machine, joint, ("viscous",)) for joint in passive),
     ]
-
-
-def prior(model: Model) -> Prior:
-    """The description's values, with what their tolerances are."""
-    mean, std = prior_of_bodies(model, BODIES)
-    count = 10 * len(model.bodies)
-    others = np.abs(model.nominal[count:])
-    std[count:] = FRICTION * np.where(others > 0, others, others.max())
-    return model.nominal, std
 
 
 def rig(machine: crane.Machine, seed: int, noise: float = 1.0) -> Rig:
@@ -88,9 +80,7 @@ def main() -> None:
         truth = result.base.values(Model(virtual.plant, terms(virtual.plant)).nominal)
         low, high = result.interval().T
         covered.append(float(np.mean((low <= truth) & (truth <= high))))
-        model = identify(
-            machine, one, other, prior=prior(Model(machine, terms(machine))), **settings
-        )
+        model = identify(machine, one, other, prior=PRIOR, **settings)
         # the floor: what the true parameters leave of the same recording
         exact = identify(virtual.plant, other, terms=terms(virtual.plant), prior=1e-6, slow=SLOW,
                          bandwidth=BANDWIDTH)  # fmt: skip

@@ -15,8 +15,10 @@ from crane.identification.estimation import estimators, regressor
 from crane.identification.estimation.estimators import huber, instrumental, least_squares, weighted
 from crane.identification.mechanics import equations
 from crane.identification.mechanics.equations import Equations
+from crane.identification.mechanics.friction import Presliding
 from crane.identification.mechanics.identify import equations_of, identify
-from crane.identification.mechanics.model import Model, Presliding, default_terms
+from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.terms import default_terms
 from crane.identification.signals import smoother
 from crane.identification.signals.motion import Motion, filter_rows
 
@@ -104,7 +106,7 @@ def test_the_equations_are_those_of_one_filter(mini, monkeypatch):
     """Against the whole regressor through the filter at once."""
     monkeypatch.setattr(equations, "_BLOCK", 1 << 19)
     given, model = motion(mini, duration=8.0), Model(mini)
-    found, _ = equations_of(model, given, bandwidth=10.0)
+    found, _ = equations_of(model, [given], bandwidth=10.0)
     assert len(list(found.blocks())) > 2
     at = model.samples(given.q, given.v, given.a)
     W = model.regressor(at)[:, :, found.base.independent]
@@ -129,7 +131,7 @@ def test_what_is_held_does_not_grow_with_the_recording(mini, monkeypatch):
     for copies in (2, 5):
         parts = (np.tile(x, (copies, 1)) for x in (given.q, given.v, given.a, given.tau))
         time = 2e-3 * np.arange(copies * len(given.time))
-        rows, base = equations_of(Model(mini), Motion(time, *parts), bandwidth=100.0)
+        rows, base = equations_of(Model(mini), [Motion(time, *parts)], bandwidth=100.0)
         columns = rows.columns(rows.selection(base))
         assert len(list(columns.blocks())) >= copies
         assert max(sizes) < 1.5 * (1 << 21)  # with what the filter needs around

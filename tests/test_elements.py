@@ -20,16 +20,13 @@ from crane.common.errors import CraneWarning, InputError
 from crane.dynamics.compiled import MOVES, QUANTITIES
 from crane.dynamics.traced import Sweep
 from crane.identification.mechanics.base import random_samples
+from crane.identification.mechanics.friction import friction
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.model import (
-    Direction,
-    GasScale,
-    Inertial,
-    Model,
-    SpringForce,
-    default_terms,
-    friction,
-)
+from crane.identification.mechanics.inertias import Inertial
+from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.passive import GasScale, SpringForce
+from crane.identification.mechanics.term import Direction
+from crane.identification.mechanics.terms import default_terms
 from crane.identification.mechanics.write import write_identified
 from crane.identification.signals.motion import Motion
 

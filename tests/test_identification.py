@@ -9,17 +9,11 @@ import pytest
 import crane
 from crane.common.errors import InputError
 from crane.identification.mechanics.base import base_parameters, group, random_samples
-from crane.identification.mechanics.model import (
-    Along,
-    Direction,
-    GasScale,
-    Inertial,
-    Model,
-    Presliding,
-    RotorInertia,
-    SpringForce,
-    friction,
-)
+from crane.identification.mechanics.friction import Along, Presliding, friction
+from crane.identification.mechanics.inertias import Inertial, RotorInertia
+from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.passive import GasScale, SpringForce
+from crane.identification.mechanics.term import Direction
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 FINGERS = {"panda_finger_joint1": 0.0, "panda_finger_joint2": 0.0}
@@ -286,7 +280,8 @@ def test_friction_along_a_coupled_motor():
     wanted = np.zeros((20, 6, 4))
     wanted[:, 4] = wanted[:, 5] = np.column_stack(shapes)
     np.testing.assert_allclose(W, wanted, atol=1e-15)
-    assert model.names == ("motor6.coulomb", "motor6.viscous", "motor6.stiction", "motor6.rotor")
+    assert model.names == ("motor6.coulomb", "motor6.viscous", "motor6.stiction",
+                           "motor6.rotor_inertia")  # fmt: skip
 
 
 def test_presliding_winds_up_over_a_distance():

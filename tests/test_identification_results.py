@@ -19,15 +19,12 @@ import crane
 from crane import cli
 from crane.common.errors import InputError, OutputError, RecordingError
 from crane.identification.mechanics.division import divided
+from crane.identification.mechanics.friction import friction
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.model import (
-    Inertial,
-    RotorInertia,
-    body_names,
-    default_terms,
-    friction,
-)
+from crane.identification.mechanics.inertias import Inertial, body_names
+from crane.identification.mechanics.passive import SpringForce
 from crane.identification.mechanics.payload import identify_payload
+from crane.identification.mechanics.terms import default_terms
 from crane.identification.mechanics.write import write_identified, write_parameters
 from crane.identification.signals.motion import Motion
 from crane.view.page.identification import write_report
@@ -188,7 +185,7 @@ def test_what_cannot_be_written(mini, found, tmp_path):
     plain = identify(mini, motion(mini))
     parameters = found.parameters.copy()
     parameters[found.model.names.index("X1.viscous")] = -1.0
-    rotor = [*default_terms(mini), RotorInertia(mini, "q1", 1e-3)]
+    spring = [*default_terms(mini), SpringForce(mini, "q1", np.sin, "spring")]
     bodies = found.parameters.copy()
     bodies[4] = -1.0
     changed = crane.load("mini_forwarder", {"link7.mass": 0.3})
@@ -199,7 +196,7 @@ def test_what_cannot_be_written(mini, found, tmp_path):
             "'X1': viscous of friction is -1, it must not be negative, give feasible=True",
         ),
         (dataclasses.replace(found, parameters=bodies), "the identified machine cannot be: "),
-        (identify(mini, motion(mini), feasible=True, terms=rotor), "the model has 'q1.rotor'"),
+        (identify(mini, motion(mini), feasible=True, terms=spring), "the model has 'q1.spring'"),
         (
             identify(
                 mini, motion(mini), feasible=True,
@@ -530,7 +527,7 @@ def test_wrong_recordings_and_arguments_are_one_line(run, mini, tmp_path):
         assert not (tmp_path / "out").exists()
     for arguments, message in (
         (["--method", "lsq"], "method 'lsq' is unknown"),
-        (["--prior", "-1"], "the prior's relative standard deviation is -1"),
+        (["--prior", "-1"], "--prior is '-1', write NAME=STD, as in bodies=10%"),
         (["--bandwidth", "0"], "the bandwidth is 0.0 Hz"),
         (["--bandwidth", "1e-6"], "the bandwidth is 1e-06 Hz"),
         (["--validation", "none.csv"], "none.csv: no such file"),

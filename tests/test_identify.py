@@ -16,8 +16,10 @@ from crane.identification.estimation.estimators import least_squares
 from crane.identification.excitation.excite import excite
 from crane.identification.mechanics.base import base_parameters, random_samples
 from crane.identification.mechanics.feasible import pseudo_inertia
+from crane.identification.mechanics.friction import friction
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.model import Inertial, Model, friction
+from crane.identification.mechanics.inertias import Inertial
+from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.reading import smoothed_motion
 from crane.identification.signals.motion import Motion
 

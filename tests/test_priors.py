@@ -37,15 +37,16 @@ def one_way(four_bar):
 
 def test_what_neither_prior_nor_motion_tells_is_named(four_bar, one_way):
     assert identify(four_bar, one_way).parameters is None  # base parameters come out
+    names = Model(four_bar).names
+    bodies = np.array([0.1 if "_arm" in name or "coupler" in name else np.inf for name in names])
     with pytest.raises(InputError) as caught:
-        identify(four_bar, one_way, prior=0.3)
+        identify(four_bar, one_way, prior=(Model(four_bar).nominal, bodies))
     assert str(caught.value) == (
         "the prior says nothing of crank.coulomb, crank.coulomb_offset, crank.viscous, "
         "crank.viscous_offset, and this motion does not tell them apart: move the joints both "
         "ways and at several speeds, give prior=(means, deviations) with finite ones for them, "
         "or leave the prior out, which tells of them together"
     )
-    names = Model(four_bar).names
     std = np.array([1.0 if name.startswith("crank.") or "_arm" in name else np.inf
                     for name in names])  # fmt: skip
     assert len(identify(four_bar, one_way, prior=(np.zeros(len(names)), std)).parameters) == 36
@@ -62,7 +63,10 @@ def test_what_neither_prior_nor_motion_tells_is_named(four_bar, one_way):
         (([0.0] * 36, [np.nan] * 36), False, "the prior's deviations is nan at crank_arm.m"),
         (([0.0] * 36, [1.0] * 36), True, "the prior's mean of 'crank_arm' has the mass 0 kg"),
         ((1, 2, 3), False, "the prior is no pair, give means"),
-        ({}, False, "the prior is no pair, give means"),
+        ({"crank_arm": 0.1}, False, "prior 'crank_arm' is 0.1, of bodies give a share of mass and "
+         "size, as 10 %, or name one of their parameters, such as crank_arm.m"),
+        ({"crank.viscous": "0 %"}, False, "'0 %' says no standard deviation above 0, write 50"),
+        ({"crank.viscuos": 1}, False, "prior 'crank.viscuos' is unknown, did you mean"),
         (-1.0, False, "the prior's relative standard deviation is -1.0, give a number above"),
     ],
 )  # fmt: skip

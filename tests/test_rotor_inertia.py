@@ -10,7 +10,8 @@ from broken import DATA
 import crane
 from crane.common.errors import CraneError, CraneWarning
 from crane.dynamics.dynamics import BACKENDS
-from crane.identification.mechanics.model import Inertial, Model, RotorInertia
+from crane.identification.mechanics.inertias import Inertial, RotorInertia
+from crane.identification.mechanics.model import Model
 
 BARE = {"friction": {}, "forces": (), "end_stops": ()}
 RATIO, DISC = 2.0, 5e-3  # rotor's speed over the joint's, [kg m2]
@@ -123,8 +124,10 @@ def test_rotors_are_known_to_identification_unless_a_term_has_them(rotors):
     q_a[:, 1:] *= 0.03
     wanted = crane.Dynamics(rotors).inverse(q_a, v_a, a_a)
     given = Model(rotors, [Inertial(rotors)])
-    asked = Model(rotors, [Inertial(rotors), RotorInertia(rotors, "X1", ROTORS["X1"])])
-    for model, count in ((given, 110), (asked, 111)):
+    asked = Model(
+        rotors, [Inertial(rotors), RotorInertia(rotors, "X1"), RotorInertia(rotors, "q3")]
+    )
+    for model, count in ((given, 110), (asked, 112)):
         at = model.samples(q_a, v_a, a_a)
         found = model.regressor(at) @ model.nominal + model.known(at)
         assert len(model.nominal) == count

@@ -6,7 +6,20 @@ from typing import Annotated
 
 import typer
 
-from crane.cli.shared import Change, Force, Lock, MachineName, app, load, names, progress_bar
+from crane.cli.shared import (
+    Change,
+    Columns,
+    Force,
+    Lock,
+    MachineName,
+    Train,
+    Validation,
+    app,
+    load,
+    names,
+    progress_bar,
+    window,
+)
 from crane.common.errors import InputError
 
 _FORM = "NAME, NAME=START, or NAME=START,LOW~HIGH"
@@ -28,18 +41,9 @@ def calibrate(
             help="A number to fit, as payload.mass, friction.*.viscous, sensor.q2.zero.",
         ),
     ],
-    train: Annotated[
-        str | None,
-        typer.Option(metavar="FROM:TO", help="Seconds that are fitted; the rest is held out."),
-    ] = None,
-    validation: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="FILE", help="A recording that is held out; may be repeated."),
-    ] = None,
-    columns: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Which columns of raw logs are which, as for import."),
-    ] = None,
+    train: Train = None,
+    validation: Validation = None,
+    columns: Columns = None,
     sensors: Annotated[
         str | None,
         typer.Option(metavar="COLUMNS", help="What is compared, as X_lift,pressure_X_lift_a."),
@@ -61,7 +65,7 @@ def calibrate(
     if out is not None:
         check_folder(out, force)
     wanted = fits(fit)
-    span = _window(train)
+    span = window(train)
     loaded = load(machine, lock, change)
     with progress_bar("simulating") as progress:
         found = run(
@@ -103,15 +107,3 @@ def fits(words: list[str]) -> dict[str, object]:
         except ValueError:
             raise InputError(f"--fit is '{word}', write {_FORM}") from None
     return found
-
-
-def _window(text: str | None) -> tuple[float, float]:
-    if text is None:
-        return 0.0, float("inf")
-    first, colon, last = text.partition(":")
-    try:
-        if not colon:
-            raise ValueError
-        return float(first or 0.0), float(last or "inf")
-    except ValueError:
-        raise InputError(f"--train is '{text}', write FROM:TO in seconds, as 0:13.5") from None

@@ -1,24 +1,18 @@
 """Commands that change or find parameters: study, excite, identify, payload."""
 
 import os
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from crane.cli.shared import (
     Force,
-    Lock,
     MachineName,
-    Method,
     Out,
-    RecordingFile,
-    Trust,
     app,
     by_joint,
     load,
     progress_bar,
-    status,
 )
 
 
@@ -109,95 +103,3 @@ def excite(
         found.to_yaml(part / "coefficients.yaml")
         plot_excitation(found, part / "reference.png")
     print(f"{found.to_text()}\n\nwritten to {out}; see it with: crane view {out}/reference.csv")
-
-
-@app.command()
-def identify(
-    machine: MachineName,
-    recording: RecordingFile,
-    out: Out,
-    validation: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A recording to be judged by.")
-    ] = None,
-    method: Method = "wls",
-    prior: Annotated[
-        float | None,
-        typer.Option(help="Relative standard deviation of the described bodies, such as 0.3."),
-    ] = None,
-    feasible: Annotated[
-        bool, typer.Option("--feasible", help="Only bodies and friction that can exist.")
-    ] = False,
-    bandwidth: Annotated[
-        float | None,
-        typer.Option(metavar="HZ", help="Of the low-pass; by the motion if not given."),
-    ] = None,
-    slow: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="JOINT=VALUE",
-            help="Velocity below which its rows are left out, in m/s or rad/s.",
-        ),
-    ] = None,
-    lock: Lock = None,
-    trust: Trust = False,
-    force: Force = False,
-) -> None:
-    """Find a machine's parameters from a recording, and how well they predict."""
-    from crane.cli.runs import check_folder, read_run, write_identification
-    from crane.common.samples import as_number
-    from crane.identification.mechanics.identify import identify as run
-    from crane.identification.mechanics.write import check_rewritable
-
-    check_folder(out, force)
-    loaded = load(machine, lock)
-    if feasible:
-        check_rewritable(loaded)
-    with status(f"reading {recording.name}"):
-        learned = read_run(recording, loaded)
-    if bandwidth is not None:
-        span = max(float(learned.time[-1] - learned.time[0]), 1e-3)
-        as_number(bandwidth, "the bandwidth", "Hz", above=5 / span)
-    judge = None
-    if validation is not None:
-        with status(f"reading {validation.name}"):
-            judge = read_run(validation, loaded)
-    with progress_bar("identifying") as progress:
-        result = run(
-            loaded,
-            learned,
-            judge,
-            method,
-            prior,
-            feasible,
-            bandwidth=bandwidth,
-            slow=by_joint("--slow", slow),
-            trust=trust,
-            progress=progress,
-        )
-    with status("writing the report"):
-        name = "" if validation is None else validation.name
-        write_identification(out, result, recording.name, name)
-    print(f"{result.to_text()}\nwritten to {out}; see {out}/report.html")
-
-
-@app.command()
-def payload(
-    machine: MachineName,
-    recording: RecordingFile,
-    frame: Annotated[
-        str | None, typer.Option(help="Link that carries the load; the tip if not given.")
-    ] = None,
-    method: Method = "wls",
-    lock: Lock = None,
-    trust: Trust = False,
-) -> None:
-    """Estimate mass and centre of mass of what a machine carries from a recording."""
-    from crane.cli.runs import read_run
-    from crane.identification.mechanics.payload import identify_payload
-
-    loaded = load(machine, lock)
-    with status(f"reading {recording.name}"):
-        carried = read_run(recording, loaded)
-    with progress_bar("estimating") as progress:
-        estimate = identify_payload(loaded, carried, frame, method, trust=trust, progress=progress)
-    print(estimate.to_text(), end="")

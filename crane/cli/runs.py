@@ -18,6 +18,7 @@ from crane.description.sources import find, unchanged
 from crane.formats import recalled
 from crane.machine import Machine
 from crane.recordings import timeseries
+from crane.recordings.logs import read_log
 from crane.recordings.measured import completed, is_measured, read_measured
 from crane.recordings.recording import Recording
 from crane.recordings.summary import subject, summarize, title
@@ -201,11 +202,10 @@ def write_identification(
 ) -> None:
     """Write report and parameters into a folder, and the machine where all are known.
 
-    A machine about a prior that cannot be is left out with a warning.
+    A machine that cannot be, or that no machine file can say, is left out with a warning.
 
     Raises:
         OutputError: The folder or a file cannot be written.
-        InputError: A feasible estimate that is no machine.
     """
     from crane.identification.mechanics.write import write_parameters
     from crane.view.page.identification import write_report
@@ -223,13 +223,12 @@ def _write_machine(result: "Identification", folder: Path) -> None:
     try:
         write_identified(result, folder)
     except InputError as error:
-        if result.feasible:
-            raise
-        text = f"no machine files are written: {error} (on the command line --feasible)"
+        hint = "" if result.feasible else " (on the command line --feasible)"
+        text = f"no machine files are written: {error}{hint}"
         warnings.warn(text, CraneWarning, stacklevel=3)
 
 
-def read_run(path: Path, machine: Machine | None = None) -> Recording:
+def read_run(path: Path, machine: Machine | None = None, columns: Path | None = None) -> Recording:
     """The recording of a run's folder or of a CSV or npz file.
 
     Args:
@@ -237,6 +236,7 @@ def read_run(path: Path, machine: Machine | None = None) -> Recording:
         machine: What was recorded. Coordinates and forces that the file does not have are
             computed with it, see `crane.recordings.measured`; where no machine is given, with the
             one that the file names, if it has pressures or angles instead of forces.
+        columns: Says which columns of a raw log are which, see `crane.recordings.logs`.
 
     Raises:
         RecordingError: There is none, it is malformed, or it does not tell enough.
@@ -246,6 +246,8 @@ def read_run(path: Path, machine: Machine | None = None) -> Recording:
         if not (path / RECORDING).is_file():
             raise RecordingError(f"{path}: no {RECORDING} in this folder, give a run's folder")
         path = path / RECORDING
+    if machine is not None and columns is not None:
+        return completed(machine, read_log(path, columns), path)
     if machine is not None:
         return read_measured(machine, path)
     table = timeseries.read(path)

@@ -83,6 +83,24 @@ Argument = Annotated[
 Floating = Annotated[
     bool, typer.Option("--floating", help="Let the root float: a vehicle, a humanoid.")
 ]
+Recordings = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="RECORDING...", help="Recordings (CSV or npz) with forces or pressures."
+    ),
+]
+Validation = Annotated[
+    list[Path] | None,
+    typer.Option(metavar="FILE", help="A recording that is held out; may be repeated."),
+]
+Columns = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Which columns of raw logs are which, as for import."),
+]
+Train = Annotated[
+    str | None,
+    typer.Option(metavar="FROM:TO", help="Seconds that are fitted; the rest is held out."),
+]
 Trust = Annotated[
     bool,
     typer.Option(
@@ -115,6 +133,22 @@ def by_joint(
             raise InputError(f"{option} names '{joint}' twice, give it once")
         out[joint] = as_number(value, f"{option} {joint}", "")
     return out
+
+
+def window(text: str | None) -> tuple[float, float]:
+    """From when to when --train is [s]; everything if not given.
+
+    Raises:
+        InputError: Something else is written.
+    """
+    first, colon, last = (text or ":").partition(":")
+    try:
+        start, end = float(first or 0.0), float(last or "inf")
+    except ValueError:
+        start, end = 0.0, 0.0
+    if not colon or not start < end:
+        raise InputError(f"--train is '{text}', write FROM:TO in seconds, as 0:13.5")
+    return start, end
 
 
 def load(

@@ -168,6 +168,7 @@ def _assembled(
         gas_springs=spec.gas_springs,
         ropes=spec.ropes,
         end_stops=spec.end_stops,
+        estimation=spec.estimation,
         tip=spec.tip,
         tasks=MappingProxyType(dict(spec.tasks)),
         control=MappingProxyType(dict(spec.control)),

@@ -31,6 +31,7 @@ from crane.description import (
     examples,
     inertia_problem,
 )
+from crane.description.estimation import Estimation
 from crane.description.rigid import loaded
 from crane.description.sources import WITH
 from crane.description.tree import Tree
@@ -83,6 +84,7 @@ class Machine:
         tasks: Named reference motions.
         control: PI gains by active joint.
         hydraulics: The circuit that drives it, None for a machine without.
+        estimation: What `identify` estimates, and knows before.
         free: Active joints that nothing drives: no force but friction, springs and stops.
         motors: What the file says that motors act on (actuators of a MJCF), or all drives where
             there are more than freedoms; empty where `drives` are the active joints.
@@ -113,6 +115,7 @@ class Machine:
     tasks: Mapping[str, Task]
     control: Mapping[str, PIGains]
     hydraulics: Hydraulics | None
+    estimation: Estimation
     free: tuple[str, ...]
     motors: tuple[Drive, ...]
     changes: Mapping[str, float]
@@ -265,8 +268,9 @@ class Machine:
         ropes: tuple[Rope, ...] | None = None,
         end_stops: tuple[EndStop, ...] | None = None,
         hydraulics: Hydraulics | None = None,
+        estimation: Estimation | None = None,
     ) -> "Machine":
-        """The same machine with other friction, springs, ropes, end stops or hydraulics.
+        """The same machine with other friction, springs, ropes, stops, hydraulics or estimation.
 
         Raises:
             InputError: A joint is unknown, has two gas springs, an end stop or a cylinder but no
@@ -310,6 +314,7 @@ class Machine:
             ropes=self.ropes if ropes is None else tuple(ropes),
             end_stops=self.end_stops if end_stops is None else tuple(end_stops),
             hydraulics=self.hydraulics if hydraulics is None else hydraulics,
+            estimation=self.estimation if estimation is None else estimation,
         )
 
     def driven_by(self, names: Sequence[str]) -> "Machine":

@@ -19,7 +19,7 @@ displacements and forces, crane.recordings.measured turns into them.
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import InitVar, dataclass, field
+from dataclasses import InitVar, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -166,6 +166,27 @@ class Recording:
         joints = [*self.q.T, *self.v.T, *self.tau.T]
         columns = [self.time, *joints, *self.channels.values()]
         return dict(zip(self._names(), columns, strict=True))
+
+    def between(self, start: float, end: float) -> "Recording":
+        """What was recorded from `start` to `end` [s], both included.
+
+        Raises:
+            RecordingError: Nothing was.
+        """
+        kept = (self.time >= start) & (self.time <= end)
+        if not kept.any():
+            raise RecordingError(
+                f"nothing lies between {start:g} and {end:g} s, the recording goes from "
+                f"{self.time[0]:g} to {self.time[-1]:g} s"
+            )
+        return self.at(kept)
+
+    def at(self, kept: np.ndarray) -> "Recording":
+        """Only the samples of a mask (N,)."""
+        return replace(
+            self, time=self.time[kept], q=self.q[kept], v=self.v[kept], tau=self.tau[kept],
+            channels={name: values[kept] for name, values in self.channels.items()},
+        )  # fmt: skip
 
     def to_csv(self, path: str | Path) -> None:
         """Write the recording as CSV, whole or not at all.

@@ -6,9 +6,11 @@ import numpy as np
 
 import crane
 from crane.common.samples import Array
+from crane.identification.mechanics.friction import friction
 from crane.identification.mechanics.identify import identify
-from crane.identification.mechanics.model import Inertial, Samples, Term, body_names, friction
+from crane.identification.mechanics.inertias import Inertial, body_names
 from crane.identification.mechanics.result import Identification
+from crane.identification.mechanics.term import Samples, Term
 from crane.identification.signals.motion import Motion, differentiate, low_pass
 from hydraulic_forwarder.experiment import CYLINDERS, STEP, Crane, averaged
 from hydraulic_forwarder.paper import ANGLES

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from crane.common.errors import DescriptionError, known
+from crane.description.estimation import Estimation
 from crane.description.findings import Anything, FollowUpError, flag, recoverable
 from crane.description.sources import find
 from crane.description.spec import (
@@ -24,6 +25,7 @@ from crane.description.spec import (
 )
 from crane.description.tree import with_rotors
 from crane.formats.machine_file.circuit import check_active, read_hydraulics
+from crane.formats.machine_file.estimation import read_estimation
 from crane.formats.machine_file.forces import (
     read_end_stops,
     read_forces,
@@ -46,7 +48,7 @@ Part = TypeVar("Part")
 _KEYS = (
     "name", "source", "chains", "loops", "active", "free", "drives", "home", "friction", "forces",
     "gas_springs", "ropes", "end_stops", "rotor_inertia", "couplings",
-    "tip", "payload", "tasks", "control", "hydraulics",
+    "tip", "payload", "tasks", "control", "hydraulics", "identification",
 )  # fmt: skip
 
 
@@ -144,6 +146,7 @@ def _read_machine(path: Path) -> MachineSpec:
         name, source, path, chains, with_rotors(tree.tree, rotors), loops, active, home, friction,
         forces, gas_springs, end_stops, tip, tasks, control, hydraulics, couplings, where, payload,
         free, _part(_drives, (), top, tree), _part(read_ropes, (), top, tree),
+        _part(read_estimation, Estimation(), top),
     )  # fmt: skip
 
 

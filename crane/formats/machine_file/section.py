@@ -182,6 +182,17 @@ class Section:
             raise self.fail(key, f"'{key}' of {self.title} is empty, give its value")
         return value
 
+    def raw(self, key: str) -> Any:
+        """A value, whatever it is.
+
+        Raises:
+            DescriptionError: There is none.
+        """
+        value = self._take(key, _MISSING)
+        if value is None:
+            raise self.fail(key, f"'{key}' of {self.title} is empty, give its value")
+        return value
+
     @overload
     def text(self, key: str, default: str = ...) -> str: ...
     @overload

@@ -12,6 +12,7 @@ from lxml import etree
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
 from crane.common.output import file_name, staging
 from crane.description import Task
+from crane.formats.machine_file.estimation import estimation_data
 from crane.formats.machine_file.read import read
 from crane.formats.parts import (
     add_joint,
@@ -187,6 +188,7 @@ def _content(machine: Machine) -> dict[str, Any]:
     data["tip"] = machine.tip
     data["tasks"] = {name: _task(task) for name, task in machine.tasks.items()}
     data["control"] = {joint: _numbers(gains) for joint, gains in machine.control.items()}
+    data["identification"] = estimation_data(machine)
     if machine.hydraulics is not None:
         data["hydraulics"] = _hydraulics(machine.hydraulics)
     return data

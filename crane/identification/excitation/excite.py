@@ -17,7 +17,8 @@ from crane.identification.excitation.information import CRITERIA, Information, Q
 from crane.identification.excitation.limits import QUANTITIES, Limits, by_joint, gear, limits
 from crane.identification.excitation.search import COARSE, Search
 from crane.identification.mechanics.base import Base, base_parameters, random_samples
-from crane.identification.mechanics.model import Model, Samples
+from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.term import Samples
 from crane.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS
@@ -258,7 +259,7 @@ def excite(
         Fourier(search.coefficients(x), period, periods) for x in (draws[0], best)
     )
     first, last = (
-        information.quality(model.samples(*one(one.lead + time)), count)
+        information.quality(model.samples(*one(one.lead + time), float(time[1] - time[0])), count)
         for one in (before, trajectory)
     )
     return Excitation(
@@ -321,4 +322,4 @@ def _anywhere(model: Model, bounds: Limits, fastest: float) -> Samples:
     v_max = np.minimum(bounds.velocity, fastest * bounds.half)
     a_max = np.minimum(bounds.acceleration, fastest * v_max)
     v_a, a_a = (limit * rng.uniform(-1, 1, q_a.shape) for limit in (v_max, a_max))
-    return model.samples(q_a, v_a, a_a)
+    return model.samples(q_a, v_a, a_a, at.step)

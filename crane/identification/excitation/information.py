@@ -9,7 +9,8 @@ from numpy.typing import ArrayLike
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_sample
 from crane.identification.mechanics.base import Base
-from crane.identification.mechanics.model import Model, Samples
+from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.term import Samples
 
 
 @dataclass(frozen=True, eq=False)

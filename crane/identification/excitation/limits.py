@@ -8,7 +8,7 @@ import numpy as np
 from crane.common.errors import InputError, known
 from crane.common.samples import Array, as_number
 from crane.identification.mechanics.base import strokes
-from crane.identification.mechanics.model import Samples
+from crane.identification.mechanics.term import Samples
 from crane.machine import Machine
 
 QUANTITIES = ("stroke", "velocity", "acceleration", "force")

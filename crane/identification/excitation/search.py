@@ -11,7 +11,7 @@ from crane.dynamics import Dynamics
 from crane.identification.excitation.fourier import Fourier, bases
 from crane.identification.excitation.information import Information
 from crane.identification.excitation.limits import QUANTITIES, Limits, gear
-from crane.identification.mechanics.model import Samples
+from crane.identification.mechanics.term import Samples
 
 DENSE = 64  # samples per period of the highest harmonic, to see that limits hold
 COARSE = 12  # the same to optimise with
@@ -87,7 +87,9 @@ class Search:
         sets, n = len(x), self._unit.shape[1]
         coefficients = self.coefficients(x)
         q, v, a = ((basis @ coefficients).reshape(-1, n) for basis in self._bases)
-        at = self._information.model.samples(q, v, a, range(0, len(q), len(q) // sets))
+        at = self._information.model.samples(
+            q, v, a, self._period * sets / len(q), range(0, len(q), len(q) // sets)
+        )
         costs = self._criterion(self._information.sizes(at, self._count, sets))
         shares = self._shares(at).reshape(sets, len(q) // sets, -1)
         most = shares.max(axis=1, keepdims=True) + np.finfo(float).tiny

@@ -9,7 +9,8 @@ import numpy as np
 from crane.closure.structure import Indices
 from crane.common.errors import ClosureError, InputError
 from crane.common.samples import Array, Brief
-from crane.identification.mechanics.model import Model, Samples
+from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.term import Samples
 from crane.machine import Machine
 
 _RANK = 1e-8  # of a column's norm, what of it must be new
@@ -116,7 +117,7 @@ def random_samples(model: Model, count: int, seed: int = 0) -> Samples:
     v_a, a_a = (
         size * span * rng.normal(size=(count, len(lower))) for size in (1.0 / pace, 3.0 / pace**2)
     )
-    return model.samples(np.array(q_a), v_a, a_a)
+    return model.samples(np.array(q_a), v_a, a_a, pace)
 
 
 def strokes(machine: Machine) -> tuple[Array, Array]:

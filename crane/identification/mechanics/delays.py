@@ -59,7 +59,7 @@ def delays(model: Model, base: Base, motion: Motion, slow: Array) -> tuple[Array
     blocks = min(_BLOCKS, int(frequency * (time[-1] - time[0]) / _PERIODS))
     if blocks < _FEWEST or len(time) < 10 * reach:
         return unknown
-    at = model.samples(motion.q[chosen], motion.v[chosen], motion.a[chosen])
+    at = model.samples(motion.q[chosen], motion.v[chosen], motion.a[chosen], step * every)
     W = model.regressor(at)[:, :, base.independent]
     for i in range(n):
         W[:, i] = low_pass(time, W[:, i], cutoff)

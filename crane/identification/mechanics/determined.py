@@ -13,16 +13,27 @@ from crane.machine import Machine
 
 _LEAST = 0.25  # share in a direction that is named
 _MOST = 4  # parameters that are named of a direction
+_FORCES = ("coulomb", "stiction", "presliding", "memory")
 _STROKE = 0.5  # of its stroke, that a joint should move over
 
 
-def magnitudes(model: Model, base: Base, factors: Array) -> Array:
-    """How large base parameters (r,) can be on such a machine.
+def magnitudes(base: Base, sizes: Array) -> Array:
+    """How large base parameters (r,) can be: sqrt(sum_j (K_ij s_j)^2) of the group K_i.
 
-    sqrt(sum_j (K_ij s_j)^2) of the group K_i, with s_j of a body its described mass m, m l and
-    m l^2, l the root of the mean square distance of its mass from its joint (bodies without mass
-    count as the mean of the others); and s_j of friction and the like what would alone make as
-    much force as a drive's whole force in this recording.
+    Args:
+        base: What of its base parameters a recording tells.
+        sizes: s of all parameters (p,), see `sizes_of`.
+    """
+    return np.asarray(np.sqrt(base.grouping**2 @ sizes**2))
+
+
+def sizes_of(model: Model, base: Base, factors: Array) -> Array:
+    """How large parameters (p,) can be on such a machine, of one without any effect 0.
+
+    A body's are its described mass m, m l and m l^2, l the root of the mean square distance of its
+    mass from its joint (bodies without mass count as the mean of the others); of friction and the
+    like what would alone make as much force as a drive's whole force in this recording; of all
+    parts of one joint's friction that are forces the least of these.
 
     Args:
         model: The model.
@@ -44,7 +55,15 @@ def magnitudes(model: Model, base: Base, factors: Array) -> Array:
     share = np.divide(force[:, None], alone, out=np.full_like(alone, np.inf), where=there)
     whole = share.min(axis=0, initial=np.inf)
     out[count:] = np.where(np.isfinite(whole), whole, 0.0)
-    return np.sqrt(base.grouping**2 @ out**2)
+    # friction that fades with speed or time is a force too, which few rows show
+    alike: dict[str, list[int]] = {}
+    for i, name in enumerate(model.names[count:], start=count):
+        where, _, kind = name.rpartition(".")
+        if kind.startswith(_FORCES) and out[i] > 0:
+            alike.setdefault(where, []).append(i)
+    for several in alike.values():
+        out[several] = out[several].min()
+    return out
 
 
 def weak_directions(
@@ -78,10 +97,11 @@ def weak_directions(
     return found
 
 
-def advice(machine: Machine, motion: Motion) -> str:
+def advice(machine: Machine, motions: Sequence[Motion]) -> str:
     """What to move more, to tell what was not told."""
     span = machine.upper - machine.lower
-    shares = np.ptp(motion.q, axis=0) / np.where(np.isfinite(span), span, np.inf)
+    moved = np.concatenate([[motion.q.min(axis=0), motion.q.max(axis=0)] for motion in motions])
+    shares = np.ptp(moved, axis=0) / np.where(np.isfinite(span), span, np.inf)
     little = [
         f"{joint} ({100 * share:.0f} % of its stroke so far)"
         for joint, share, size in zip(machine.active, shares.tolist(), span.tolist(), strict=True)

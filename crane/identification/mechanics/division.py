@@ -6,7 +6,7 @@ from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.dynamics import Dynamics
 from crane.identification.mechanics.feasible import body_parameters, pseudo_inertia
-from crane.identification.mechanics.model import body_names
+from crane.identification.mechanics.inertias import body_names
 from crane.identification.mechanics.possible import thick
 from crane.machine import Machine
 

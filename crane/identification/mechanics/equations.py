@@ -1,8 +1,9 @@
 """y = W beta along a motion, filtered and thinned, in blocks that fit into memory."""
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 
@@ -21,8 +22,61 @@ _HELD = 3 << 27  # bytes of filtered blocks that are held; others are computed a
 Progress = Callable[[float], None]
 
 
+class _Part:
+    """One of the motions, through the low-pass.
+
+    Attributes:
+        motion: The motion.
+        step: Of its samples [s].
+        thinning: One of so many samples is left.
+        reach: Samples that the filter sees to each side, a multiple of the thinning.
+        moving: (M, n) which of the rows that are left count.
+    """
+
+    def __init__(self, motion: Motion, bandwidth: float, slow: Array):
+        from scipy.ndimage import maximum_filter1d
+
+        self.motion, self.step = motion, float(motion.time[1] - motion.time[0])
+        duration = float(motion.time[-1] - motion.time[0])
+        if bandwidth * duration < _FEWEST:
+            raise InputError(
+                f"a bandwidth of {bandwidth:g} Hz leaves nothing of {duration:g} s, give at least "
+                f"{_FEWEST / duration:.2g} Hz"
+            )
+        self.thinning, seen = 1, 0
+        if bandwidth * self.step < 0.25:
+            self.thinning = max(1, int(0.25 / (self.step * bandwidth)))
+            seen = len(filter_kernel(self.step, bandwidth)) // 2
+        self.reach = -(-seen // self.thinning) * self.thinning
+        # near standstill friction is none of its shapes, and in no row that the filter mixes it in
+        stuck = ~moving(motion.v, slow)
+        near = maximum_filter1d(stuck.view(np.uint8), 2 * seen + 1, axis=0, mode="constant")
+        self.moving = near[:: self.thinning] == 0
+
+    def __len__(self) -> int:
+        """How many instants are left."""
+        return len(self.moving)
+
+
+@dataclasses.dataclass
+class _Block:
+    """Rows that are computed at once.
+
+    Attributes:
+        part: Whose.
+        rows: Which of the part's.
+        span: Which of all.
+        memory: What terms that depend on the past keep, before the first sample that it needs.
+    """
+
+    part: _Part
+    rows: slice
+    span: slice
+    memory: dict[object, object] = dataclasses.field(default_factory=dict)
+
+
 class Equations:
-    """tau_A + gamma^T f = W(q_A, v_A, a_A) beta of a motion, both sides through one low-pass.
+    """tau_A + gamma^T f = W(q_A, v_A, a_A) beta of motions, both sides through one low-pass.
 
     The regressor of a long recording is larger than memory. It is computed, filtered and thinned
     block by block, each with as many samples before and after as the filter's kernel has,
@@ -31,13 +85,13 @@ class Equations:
     Args:
         model: The model.
         base: Its base parameters; W has their columns.
-        motion: The motion.
+        motions: The motions, one after the other.
         bandwidth: [Hz] of the low-pass.
         slow: (n,) velocities below which rows do not count.
-        progress: Takes the finished share of each pass over the motion.
+        progress: Takes the finished share of each pass over the motions.
 
     Attributes:
-        time: (M,) instants that are left [s].
+        time: (M,) instants that are left [s]; those of a motion after another follow it.
         forces: (M, n) measured, filtered.
         offset: (M, n) of these what no parameter changes; known when all blocks have been read.
         moving: (M, n) which rows count.
@@ -51,46 +105,33 @@ class Equations:
         self,
         model: Model,
         base: Base,
-        motion: Motion,
+        motions: Sequence[Motion],
         bandwidth: float,
         slow: Array,
         progress: Progress | None = None,
     ):
-        from scipy.ndimage import maximum_filter1d
-
-        step = float(motion.time[1] - motion.time[0])
-        duration = float(motion.time[-1] - motion.time[0])
-        if bandwidth * duration < _FEWEST:
-            raise InputError(
-                f"a bandwidth of {bandwidth:g} Hz leaves nothing of {duration:g} s, give at least "
-                f"{_FEWEST / duration:.2g} Hz"
-            )
         self.base, self.bandwidth, self.slow = base, bandwidth, slow
-        self._model, self._motion = model, motion
-        self._progress = progress
-        self._step = step
-        self._thinning, seen = 1, 0
-        if bandwidth * step < 0.25:
-            self._thinning = max(1, int(0.25 / (step * bandwidth)))
-            seen = len(filter_kernel(step, bandwidth)) // 2
-        self._reach = -(-seen // self._thinning) * self._thinning
-        # near standstill friction is none of its shapes, and in no row that the filter mixes it in
-        stuck = ~moving(motion.v, slow)
-        near = maximum_filter1d(stuck.view(np.uint8), 2 * seen + 1, axis=0, mode="constant")
-        self.moving = near[:: self._thinning] == 0
-        self.time = motion.time[:: self._thinning]
+        self._model, self._progress = model, progress
+        self._parts = [_Part(motion, bandwidth, slow) for motion in motions]
+        self.moving = np.concatenate([part.moving for part in self._parts])
+        self.time = _one_after_the_other(
+            [part.motion.time[:: part.thinning] for part in self._parts]
+        )
         self.forces, self.offset = np.empty((2, *self.moving.shape))
-        wanted = _BLOCK // (8 * len(model.names) * motion.q.shape[1])
-        length = max(wanted, 2 * self._reach) // self._thinning + 1
-        starts = np.arange(0, len(self.time), length)
-        self._spans = [slice(i, min(i + length, len(self.time))) for i in starts.tolist()]
-        # of the terms that depend on the past, at the first sample that each block needs
-        self._memories: dict[int, dict[object, object]] = {0: {}}
+        wanted = _BLOCK // (8 * len(model.names) * len(model.machine.active))
+        self._blocks, first = list[_Block](), 0
+        for part in self._parts:
+            length = max(wanted, 2 * part.reach) // part.thinning + 1
+            for i in range(0, len(part), length):
+                rows = slice(i, min(i + length, len(part)))
+                span = slice(first + rows.start, first + rows.stop)
+                self._blocks.append(_Block(part, rows, span))
+            first += len(part)
         self._held: dict[int, Array] = {}
 
     def blocks(self, backwards: bool = False) -> Iterator[tuple[slice, Array]]:
         """Which of the instants, and W there (L, n, r)."""
-        numbers = range(len(self._spans))
+        numbers = range(len(self._blocks))
         for done, number in enumerate(reversed(numbers) if backwards else numbers):
             W = self._held.get(number)
             if W is None:
@@ -98,48 +139,53 @@ class Equations:
                 if sum(one.nbytes for one in self._held.values()) + W.nbytes <= _HELD:
                     self._held[number] = W
             if self._progress is not None:
-                self._progress((done + 1) / len(self._spans))
-            yield self._spans[number], W
+                self._progress((done + 1) / len(self._blocks))
+            yield self._blocks[number].span, W
 
     def _block(self, number: int) -> Array:
         """W (L, n, r) of a block, filtered; its forces and offset are written down on the way."""
-        span, thinning, motion = self._spans[number], self._thinning, self._motion
-        start = max(0, span.start * thinning - self._reach)
-        stop = min(len(motion.q), span.stop * thinning + self._reach)
+        block = self._blocks[number]
+        part, rows, thinning = block.part, block.rows, block.part.thinning
+        start = max(0, rows.start * thinning - part.reach)
+        stop = min(len(part.motion.q), rows.stop * thinning + part.reach)
         both = self._unfiltered(number, start, stop)
-        tau = motion.tau[start:stop]
-        if self._reach:
-            both, tau = filter_rows(both, tau, self._step, self.bandwidth, thinning)
-        here = slice(span.start - start // thinning, span.stop - start // thinning)
-        self.forces[span], self.offset[span] = tau[here], both[here, :, -1]
+        tau = part.motion.tau[start:stop]
+        if part.reach:
+            both, tau = filter_rows(both, tau, part.step, self.bandwidth, thinning)
+        here = slice(rows.start - start // thinning, rows.stop - start // thinning)
+        self.forces[block.span], self.offset[block.span] = tau[here], both[here, :, -1]
         return np.ascontiguousarray(both[here, :, :-1])
 
     def _unfiltered(self, number: int, start: int, stop: int) -> Array:
         """[W, offset] (stop - start, n, r + 1), little by little."""
-        following = number + 1
+        part, following = self._blocks[number].part, self._blocks[number + 1 : number + 2]
+        motion = part.motion
         first = None  # sample at which the next block's filter begins
-        if following < len(self._spans):
-            first = max(0, self._spans[following].start * self._thinning - self._reach)
-        size = _BLOCK // (8 * len(self._model.names) * self._motion.q.shape[1])
+        if following and following[0].part is part:
+            first = max(0, following[0].rows.start * part.thinning - part.reach)
+        size = _BLOCK // (8 * len(self._model.names) * motion.q.shape[1])
         cuts = {*range(start, stop, max(size, 1)), stop, *([first] if first else [])}
-        memory = dict(self._memories[number])
-        both = np.empty((stop - start, self._motion.q.shape[1], self.base.rank + 1))
-        edges = sorted(cuts)
-        for low, high in zip(edges[:-1], edges[1:], strict=True):
-            q, v, a = (x[low:high] for x in (self._motion.q, self._motion.v, self._motion.a))
-            at = self._model.samples(q, v, a, starts=(0,) if low == 0 else ())
+        memory = dict(self._blocks[number].memory)
+        both = np.empty((stop - start, motion.q.shape[1], self.base.rank + 1))
+        for low, high in pairwise(sorted(cuts)):
+            q, v, a = (x[low:high] for x in (motion.q, motion.v, motion.a))
+            at = self._model.samples(q, v, a, part.step, (0,) if low == 0 else ())
             at = dataclasses.replace(at, memory=memory)
-            part = both[low - start : high - start]
-            part[:, :, :-1] = self._model.regressor(at)[:, :, self.base.independent]
-            part[:, :, -1] = self._model.known(at)
+            here = both[low - start : high - start]
+            here[:, :, :-1] = self._model.regressor(at)[:, :, self.base.independent]
+            here[:, :, -1] = self._model.known(at)
             if high == first:
-                self._memories.setdefault(following, dict(memory))
+                following[0].memory = dict(memory)
         return both
 
-    def thinned(self) -> Motion:
-        """The motion at the instants that are left, with the filtered forces."""
-        q, v, a = (x[:: self._thinning] for x in (self._motion.q, self._motion.v, self._motion.a))
-        return Motion(self.time, q, v, a, self.forces)
+    def thinned(self) -> list[Motion]:
+        """The motions at the instants that are left, with the filtered forces."""
+        forces = np.split(self.forces, np.cumsum([len(part) for part in self._parts[:-1]]))
+        out = []
+        for part, tau in zip(self._parts, forces, strict=True):
+            x, kept = part.motion, slice(None, None, part.thinning)
+            out.append(Motion(x.time[kept], x.q[kept], x.v[kept], x.a[kept], tau))
+        return out
 
     def modelled(self, values: Array) -> Array:
         """W values (M, n) for columns of parameters (r,), or (r, k) at once: (M, n, k)."""
@@ -202,6 +248,14 @@ class Equations:
     def columns(self, T: Array) -> "Columns":
         """W T, the rows that count, for T (r, p)."""
         return Columns(self, T)
+
+
+def _one_after_the_other(times: Sequence[Array]) -> Array:
+    """Instants of motions, each after the one before."""
+    out = [times[0]]
+    for time in times[1:]:
+        out.append(out[-1][-1] + (time - time[0]) + (time[1] - time[0]))
+    return np.concatenate(out)
 
 
 class Columns:

@@ -78,13 +78,13 @@ def feasible(
     weights: Array,
     bodies: Sequence[str],
     prior: Array,
-    prior_weight: float,
+    prior_weight: float | Array,
     spread: Array | None = None,
     nonnegative: Sequence[int] = (),
 ) -> Feasible:
     """Minimise misfit and distance to a prior over all bodies that can exist.
 
-        |weights (W theta - y)|^2 + prior_weight sum_b 2 d(P_b, P0_b)
+        |weights (W theta - y)|^2 + sum_b prior_weight_b 2 d(P_b, P0_b)
             + sum_i ((theta_i - prior_i) / spread_i)^2
 
         d(P, P0) = tr(P0^-1 P) - log det(P0^-1 P) - 4,   L^-1 P_b L^-T >= 1e-4,  P0_b = L L^T.
@@ -101,7 +101,7 @@ def feasible(
         weights: One over the noise of each row (m,).
         bodies: Names (nb,).
         prior: Parameters (p,), those of bodies that can exist.
-        prior_weight: > 0.
+        prior_weight: > 0, of each body (nb,) or of all.
         spread: Standard deviations (p - 10 nb,) of the others about the prior; infinite, as all
             are if left out, where it says nothing.
         nonnegative: Columns among the others that are not negative, such as friction.
@@ -116,6 +116,7 @@ def feasible(
 
     size, split = np.shape(W)[1], 10 * len(bodies)
     spread = np.full(size - split, np.inf) if spread is None else np.asarray(spread)
+    prior_weight = np.broadcast_to(np.asarray(prior_weight, np.float64), len(bodies))
     _check_arguments(W, y, weights, prior, prior_weight, spread, nonnegative, split)
     factors = [
         _factor(body, p) for body, p in zip(bodies, prior[:split].reshape(-1, 10), strict=True)
@@ -138,7 +139,7 @@ def feasible(
     start[bounded] = np.maximum(start[bounded], 0)
     d, centre = d - R[:, split:] @ start, prior[split:] - start
 
-    scale = 1 / np.sqrt(max(1.0, 2 * prior_weight))
+    scale = 1 / np.sqrt(max(1.0, 2 * prior_weight.max()))
     X = [cp.Variable((4, 4), symmetric=True) for _ in bodies]
     z = cp.Variable(size - split)
     model = (R[:, split:] * unit) @ z - d
@@ -147,7 +148,7 @@ def feasible(
     for b, x in enumerate(X):
         block = R[:, 10 * b : 10 * b + 10] @ maps[b]
         model = model + block @ cp.vec(x - np.eye(4), order="F")
-        cost += 2 * prior_weight * scale**2 * (cp.trace(x) - cp.log_det(x) - 4)
+        cost += 2 * prior_weight[b] * scale**2 * (cp.trace(x) - cp.log_det(x) - 4)
         constraints.append(x >> _MARGIN * np.eye(4))
     problem = cp.Problem(cp.Minimize(cp.sum_squares(scale * model) + cost), constraints)
     # its own tolerances where ours are out of reach, and a solver that needs no factors where
@@ -199,7 +200,7 @@ def _check_arguments(
     y: Array,
     weights: Array,
     prior: Array,
-    prior_weight: float,
+    prior_weight: Array,
     spread: Array,
     nonnegative: Sequence[int],
     split: int,
@@ -216,7 +217,7 @@ def _check_arguments(
     for name, array in (("regressor", W), ("y", y), ("weights", weights), ("prior", prior)):
         if not np.isfinite(array).all():
             raise InputError(f"{name} is not finite, leave such rows out")
-    if not prior_weight > 0 or not (spread > 0).all():
+    if not (prior_weight > 0).all() or not (spread > 0).all():
         raise InputError("weight and spread of the prior are not above 0, give larger ones")
     if not all(split <= i < size for i in nonnegative):
         raise InputError(

@@ -1,5 +1,6 @@
 """From a recording to parameters."""
 
+import fnmatch
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, RecordingError, known
 from crane.common.samples import Array, as_number
+from crane.description.estimation import Known
 from crane.identification.estimation.estimators import (
     Prior,
     conditions,
@@ -19,18 +21,22 @@ from crane.identification.estimation.estimators import (
 from crane.identification.mechanics.against import check_forces, tell_delays, tell_validation
 from crane.identification.mechanics.base import Base, base_parameters
 from crane.identification.mechanics.delays import delays
-from crane.identification.mechanics.determined import advice, magnitudes
+from crane.identification.mechanics.determined import advice, magnitudes, sizes_of
 from crane.identification.mechanics.equations import Equations, Progress
-from crane.identification.mechanics.model import Model, Term
-from crane.identification.mechanics.possible import possible, prior_of_bodies
-from crane.identification.mechanics.priors import check_told, checked
+from crane.identification.mechanics.laws import Frictional
+from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.possible import possible
+from crane.identification.mechanics.priors import check_told, checked, stated
 from crane.identification.mechanics.reading import smoothed_motion
 from crane.identification.mechanics.result import Identification
+from crane.identification.mechanics.term import Term
+from crane.identification.mechanics.terms import Changes
 from crane.identification.signals.motion import Motion
 from crane.identification.signals.spectrum import below
 from crane.machine import Machine
 from crane.recordings.recording import Recording
 
+Recorded = Recording | Motion
 METHODS = {"ols": least_squares, "wls": weighted, "huber": huber}
 _SLOW = 0.02  # of a joint's largest velocity, below which its rows are left out
 _RESTING = {"rad": 1e-2, "m": 1e-3}  # [rad/s], [m/s] where stiction ends that nobody described
@@ -40,18 +46,20 @@ _KNOWN = 0.75  # of the frequency where a smoother passes half: there it passes 
 _TIMES = 3.0  # times the frequency below which 99 % of the velocities are, the filter's least
 _POWER = 0.99
 _FAST = 40.0  # times the frequency below which 99 % of the accelerations are
+_PRIORS = 1e-7, 1e6  # above and up to which a relative standard deviation lies
+_SAMPLES = 2000  # at which the speeds of joints are looked at
 _PART = 0.3  # of what is left to do that one pass over a recording is taken for
 
 
 def identify(
     machine: Machine,
-    recording: Recording | Motion,
-    validation: Recording | Motion | None = None,
+    recording: Recorded | Sequence[Recorded],
+    validation: Recorded | Sequence[Recorded] | None = None,
     method: str = "wls",
-    prior: float | Prior | None = None,
+    prior: float | Mapping[str, object] | Prior | None = None,
     feasible: bool = False,
     *,
-    terms: Sequence[Term] | None = None,
+    terms: Sequence[Term] | Changes | None = None,
     bandwidth: float | None = None,
     slow: Mapping[str, float] | ArrayLike | None = None,
     trust: bool = False,
@@ -60,26 +68,30 @@ def identify(
     """Base parameters of a machine from recorded strokes and forces.
 
     tau_A + gamma^T f = W(q_A, v_A, a_A) beta on both sides of a zero-phase low-pass, thinned;
-    rows of a joint near standstill left out.
+    rows of a joint near standstill left out. What the machine file says under `identification`
+    (terms, prior, bandwidth, slow) counts, with what is given here beside it, or in its place.
 
     Args:
         machine: The machine, whose geometry is taken as known.
-        recording: What to learn from; a `Motion` if velocities and accelerations are known.
-        validation: What to be judged by, not learned from.
+        recording: What to learn from, one or several; a `Motion` if velocities and accelerations
+            are known.
+        validation: What to be judged by, not learned from, likewise.
         method: "ols", "wls" (rows of each joint by its noise) or "huber" (robust).
-        prior: Relative standard deviation of the bodies of the machine's description, about
-            which the estimate is regularised; or means and standard deviations (p,) of all
+        prior: What is known before, about which the estimate is regularised: by name, such as
+            {"bodies": "10 %", "q1.viscous": "200 +- 50"}, see `priors.stated`; the share to which
+            all of the description holds; or means and standard deviations (p,) of all
             parameters. All parameters come out then, not only the base parameters.
         feasible: Whether the bodies have to be able to exist and friction must not be negative;
             all parameters come out.
-        terms: Of the model; bodies and friction if not given, see `model.default_terms`.
+        terms: Of the model; or by name what changes of the usual ones, such as
+            {"q*.rotor_inertia": (), "q1.coulomb": None}, see `terms.terms_of`.
         bandwidth: [Hz] of the low-pass; if not given, far above the frequencies of the motion,
             but no higher than the motion is known where noise asked for smoothing, as of a coarse
             potentiometer.
-        slow: Velocities below which rows are left out, (n,) or by joint: a few times that over
-            which friction at rest fades. If not given, 4 times the description's smoothing and
-            Stribeck velocity, of friction that sticks with neither 0.01 rad/s and 1 mm/s, or 2 %
-            of a joint's largest.
+        slow: Velocities below which rows are left out, (n,) or by joint or pattern: a few times
+            that over which friction at rest fades. If not given, 4 times the description's
+            smoothing and Stribeck velocity, of friction that sticks with neither 0.01 rad/s and
+            1 mm/s, or 2 % of a joint's largest.
         trust: Whether a recording that is most likely wrong is taken nevertheless: why it is so
             is told as a warning, and outliers are left in.
         progress: Takes the finished share.
@@ -97,47 +109,50 @@ def identify(
     if feasible and not model.bodies:
         raise InputError("the model has no bodies, so nothing has to be feasible")
     finished, progress = progress, in_parts(progress)
-    motion = _motion(machine, recording, trust, progress)
-    rows, told = equations_of(model, motion, bandwidth, slow, progress)
+    motions = _motions(machine, recording, trust, progress)
+    rows, told = equations_of(model, motions, bandwidth, slow, progress)
     if model.bodies:
-        _check_forces(model, motion, rows, trust)
+        _check_forces(model, motions, rows, trust)
     selection = rows.selection(told)
-    if isinstance(prior, int | float):
-        prior = prior_of_bodies(model, prior)
-    elif prior is not None:
-        prior = checked(model, rows.base, prior, feasible)
-    parameters = None
     columns = rows.columns(selection)
-    if prior is None or feasible:
+    sizes = sizes_of(model, told, columns.factors(rows.y, rows.groups))
+    before = _prior(model, prior, rows.base, sizes, feasible)
+    parameters = None
+    if before is None or feasible:
         estimate = METHODS[method](columns, rows.y, rows.groups, rows.samples)
     else:
         every = rows.columns(selection @ told.grouping)
         told_by = np.vstack(list(rows.factors[:, :, :-1] @ selection @ told.grouping))
-        check_told(model.names, told_by, prior)
-        estimate = METHODS[method](every, rows.y, rows.groups, rows.samples, prior)
+        check_told(model.names, told_by, before)
+        estimate = METHODS[method](every, rows.y, rows.groups, rows.samples, before)
     values, covariance = estimate.values, estimate.covariance
     if feasible:
-        estimate = possible(model, told, rows, selection, estimate, prior)
-    if feasible or prior is not None:
+        estimate = possible(model, told, rows, selection, estimate, before)
+    if feasible or before is not None:
         plain, scaled = conditions(np.vstack(list(rows.factors[:, :, :-1] @ selection)))
         estimate = replace(estimate, condition=plain, scaled_condition=scaled)
         parameters = estimate.values
         values = told.values(parameters)
         covariance = told.grouping @ estimate.covariance @ told.grouping.T
     training, judged = rows.compare(selection @ values), None
-    size = magnitudes(model, told, columns.factors(rows.y, rows.groups))
-    base, bandwidth, limits, remedy = rows.base, rows.bandwidth, rows.slow, advice(machine, motion)
-    del rows, columns, motion
+    base, bandwidth, limits, remedy = (
+        rows.base,
+        rows.bandwidth,
+        rows.slow,
+        advice(machine, motions),
+    )
+    speeds = _speeds(model, motions, limits)
+    del rows, columns, motions
     if validation is not None:
-        other = _motion(machine, validation, trust, progress)
-        judge = Equations(model, base, other, bandwidth, limits, progress)
+        others = _motions(machine, validation, trust, progress)
+        judge = Equations(model, base, others, bandwidth, limits, progress)
         judged = judge.compare(selection @ values)
         tell_validation(training, judged)
     if finished is not None:
         finished(1.0)
     found = Identification(
-        model, told, values, covariance, parameters, estimate, method, feasible, training, size,
-        remedy, judged,
+        model, told, values, covariance, parameters, estimate, method, feasible, training,
+        magnitudes(told, sizes), remedy, speeds, judged,
     )  # fmt: skip
     if found.doubt:
         warnings.warn(found.doubt, CraneWarning, stacklevel=2)
@@ -146,39 +161,88 @@ def identify(
 
 def equations_of(
     model: Model,
-    motion: Motion,
+    motions: Sequence[Motion],
     bandwidth: float | None = None,
     slow: Mapping[str, float] | ArrayLike | None = None,
     progress: Progress | None = None,
 ) -> tuple[Equations, Base]:
-    """Equations of a motion, and what of the base parameters it tells.
+    """Equations of motions, and what of the base parameters they tell.
 
     Arguments and errors as for `identify`.
     """
     if bandwidth is None:
-        bandwidth = _bandwidth(motion)
+        bandwidth = model.machine.estimation.bandwidth or min(map(_bandwidth, motions))
     bandwidth = as_number(bandwidth, "the bandwidth", "Hz", above=0)
-    limits = _slow(model.machine, slow, np.abs(motion.v).max(axis=0))
-    rows = Equations(model, base_parameters(model), motion, bandwidth, limits, progress)
+    fastest = np.max([np.abs(motion.v).max(axis=0) for motion in motions], axis=0)
+    limits = _slow(model.machine, slow, fastest)
+    rows = Equations(model, base_parameters(model), motions, bandwidth, limits, progress)
     if not rows.moving.any():
         raise RecordingError("no joint moves faster than what counts as standstill, move it more")
     # of columns, the triangular factors tell what all rows tell
     return rows, rows.base.narrowed(np.vstack(list(rows.factors[:, :, :-1])))
 
 
-def _motion(
-    machine: Machine, recording: Recording | Motion, trust: bool, progress: Progress | None
-) -> Motion:
-    if isinstance(recording, Motion):
-        return recording
-    return smoothed_motion(machine, recording, trust=trust, progress=progress)
+def _prior(
+    model: Model,
+    given: float | Mapping[str, object] | Prior | None,
+    base: Base,
+    sizes: Array,
+    feasible: bool,
+) -> Prior | None:
+    """Means and standard deviations (p,) of all parameters; None where nothing is known."""
+    if given is not None and not isinstance(given, Mapping | int | float):
+        return checked(model, base, given, feasible)
+    known = dict(model.machine.estimation.prior)
+    if isinstance(given, Mapping):
+        known |= {
+            name: what if isinstance(what, Known) else Known.read(what)
+            for name, what in given.items()
+        }
+    elif given is not None:
+        share = as_number(given, "the prior's relative standard deviation", "", *_PRIORS)
+        known["*"] = Known(share, relative=True)
+    return stated(model, known, sizes) if known else None
 
 
-def _check_forces(model: Model, motion: Motion, rows: Equations, trust: bool) -> None:
-    """Doubts about the forces of a recording, by what the model can say."""
-    modelled = rows.compare(rows.base.values(model.nominal)).modelled
-    check_forces(rows.thinned(), modelled, model.machine.active, trust=trust)
-    tell_delays(model.machine.active, *delays(model, rows.base, motion, rows.slow))
+def _motions(
+    machine: Machine,
+    recorded: Recorded | Sequence[Recorded],
+    trust: bool,
+    progress: Progress | None,
+) -> list[Motion]:
+    several = [recorded] if isinstance(recorded, Recording | Motion) else list(recorded)
+    if not several:
+        raise InputError("no recording is given, give at least one")
+    return [
+        x if isinstance(x, Motion) else smoothed_motion(machine, x, trust=trust, progress=progress)
+        for x in several
+    ]
+
+
+def _check_forces(model: Model, motions: Sequence[Motion], rows: Equations, trust: bool) -> None:
+    """Doubts about the forces of recordings, by what the model can say."""
+    modelled, first = rows.compare(rows.base.values(model.nominal)).modelled, 0
+    for motion, thinned in zip(motions, rows.thinned(), strict=True):
+        here = modelled[first : first + len(thinned.time)]
+        check_forces(thinned, here, model.machine.active, trust=trust)
+        tell_delays(model.machine.active, *delays(model, rows.base, motion, rows.slow))
+        first += len(here)
+
+
+def _speeds(
+    model: Model, motions: Sequence[Motion], slow: Array
+) -> dict[str, tuple[float, float]]:
+    """Least and largest speed along each direction of friction, of so many samples."""
+    directions = {x.direction.name: x.direction for x in model.terms if isinstance(x, Frictional)}
+    fastest = dict.fromkeys(directions, 0.0)
+    for motion in motions:
+        some = slice(None, None, max(1, len(motion.time) // _SAMPLES))
+        at = model.samples(motion.q[some], motion.v[some], motion.a[some])
+        for name, direction in directions.items():
+            speed = np.einsum("ij,ij->i", direction.rows(model.machine, at), at.v_a)
+            fastest[name] = max(fastest[name], float(np.abs(speed).max()))
+    least = dict(zip(model.machine.active, slow.tolist(), strict=True))
+    return {name: (least.get(name, _SLOW * most), most) for name, most in fastest.items()}
 
 
 def in_parts(progress: Progress | None) -> Progress | None:
@@ -210,15 +274,16 @@ def _slow(machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastes
             turns = law.smoothing or (_RESTING[machine.unit(joint)] if law.sticks else 0.0)
             near = _SETTLED * (max(law.stribeck, law.smoothing) if law.stiction else turns)
             out[i] = max(out[i], min(near, _MOVING * fastest[i]))
-    if isinstance(slow, Mapping):
-        for joint, value in slow.items():
-            if joint not in machine.active:
-                raise InputError(f"slow is for '{joint}', {known(machine.active, joint)}")
-            if (limit := as_number(value, f"slow of '{joint}'", "")) < 0:
-                raise InputError(f"slow of '{joint}' is {limit:g}, it must not be negative")
-            out[machine.active.index(joint)] = limit
-        return out
-    return out if slow is None else np.broadcast_to(np.asarray(slow, np.float64), out.shape)
+    if slow is not None and not isinstance(slow, Mapping):
+        return np.broadcast_to(np.asarray(slow, np.float64), out.shape)
+    for name, value in (*machine.estimation.slow.items(), *(slow or {}).items()):
+        joints = fnmatch.filter(machine.active, name)
+        if not joints and name not in machine.locks:
+            raise InputError(f"slow is for '{name}', {known(machine.active, name)}")
+        if (limit := as_number(value, f"slow of '{name}'", "")) < 0:
+            raise InputError(f"slow of '{name}' is {limit:g}, it must not be negative")
+        out[[machine.active.index(joint) for joint in joints]] = limit
+    return out
 
 
 def _bandwidth(motion: Motion) -> float:

@@ -14,16 +14,13 @@ from crane.identification.mechanics.against import check_forces
 from crane.identification.mechanics.base import Base
 from crane.identification.mechanics.equations import Equations, Progress
 from crane.identification.mechanics.feasible import body_parameters, pseudo_inertia
+from crane.identification.mechanics.friction import friction
 from crane.identification.mechanics.identify import METHODS, equations_of, in_parts
-from crane.identification.mechanics.model import (
-    PER_BODY,
-    Model,
-    Samples,
-    friction,
-    inertial_columns,
-)
+from crane.identification.mechanics.inertias import PER_BODY, inertial_columns
+from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.reading import smoothed_motion
 from crane.identification.mechanics.result import ForceComparison, aligned
+from crane.identification.mechanics.term import Samples
 from crane.identification.signals.motion import Motion, moving
 from crane.machine import Machine
 from crane.recordings.recording import Recording
@@ -207,8 +204,8 @@ def identify_payload(
     extra = [friction(bare, joint, ("coulomb",), smoothing=0.0) for joint in names]
     model = Model(bare, [load, *extra], own)
     # weight tells a load: what smoothing takes from the accelerations bounds no bandwidth
-    rows, base = equations_of(model, replace(motion, passed=math.inf), progress=progress)
-    thinned = rows.thinned()
+    rows, base = equations_of(model, [replace(motion, passed=math.inf)], progress=progress)
+    (thinned,) = rows.thinned()
     q, v, a, tau = (x[:, moves] for x in (thinned.q, thinned.v, thinned.a, thinned.tau))
     moved = Motion(thinned.time, q, v, a, tau)
     check_forces(moved, rows.offset[:, moves], names, trust=trust)

@@ -1,8 +1,8 @@
-"""Parameters of bodies that can exist: a prior by the machine's description, and the estimate."""
+"""Parameters of bodies that can exist."""
 
 import numpy as np
 
-from crane.common.samples import Array, as_number
+from crane.common.samples import Array
 from crane.identification.estimation.estimators import Estimate, Prior, judged
 from crane.identification.mechanics.base import Base
 from crane.identification.mechanics.equations import Equations
@@ -16,28 +16,10 @@ from crane.identification.mechanics.feasible import (
 from crane.identification.mechanics.model import Model
 
 _EXACT = 1e-4  # of the forces, noise that a feasible estimate counts with at least
-_PRIORS = 1e-7, 1e6  # above and up to which a relative standard deviation lies
 _PRIOR = 0.3  # relative standard deviation of a body towards which a feasible estimate is drawn
+_UNKNOWN = 1e3  # that of a body of which a prior says nothing
+_ROUNDING = 1e-9
 _THICKNESS = 0.05  # of a body's size, added to what is thinner in a prior
-
-
-def prior_of_bodies(model: Model, relative: float) -> Prior:
-    """Bodies as described, each known to a share of its mass and size; of others nothing.
-
-    Returns:
-        Means (p,) and standard deviations (p,), infinite for what is no body.
-
-    Raises:
-        InputError: The share is not from 1e-7 to 1e6.
-    """
-    relative = as_number(relative, "the prior's relative standard deviation", "", *_PRIORS)
-    std = np.full(len(model.names), np.inf)
-    for i in range(len(model.bodies)):
-        mass, length = body_size(model.nominal[10 * i : 10 * i + 10])
-        units = np.array([1.0, *[length] * 3, *[length**2] * 6])
-        std[10 * i : 10 * i + 10] = relative * mass * units
-    mean = np.where(np.isfinite(std), model.nominal, 0.0)
-    return mean, std
 
 
 def possible(
@@ -71,13 +53,12 @@ def possible(
         All parameters (p,).
     """
     count = 10 * len(model.bodies)
-    mean, weight = model.nominal.copy(), _PRIOR**-2
-    spread = np.full(len(mean) - count, np.inf)
+    mean, weight = model.nominal.copy(), np.full(len(model.bodies), _PRIOR**-2)
+    spread, single = np.full(len(mean) - count, np.inf), np.zeros(count)
     if prior is not None:
         mean = prior[0].copy()
         spread = prior[1][count:]
-        sizes = [body_size(mean[i : i + 10])[0] for i in range(0, count, 10)]
-        weight = float(np.median(prior[1][:count:10] / sizes)) ** -2
+        weight, single = _of_bodies(mean[:count], prior[1][:count])
     for i in range(0, count, 10):
         mean[i : i + 10] = thick(mean[i : i + 10])
     signs = [i for i, sign in enumerate(model.signs) if sign and i >= count]
@@ -92,14 +73,37 @@ def possible(
     alone = np.linalg.norm(W[:, count:], axis=0) / np.sqrt(len(rows.y))
     spread = np.minimum(spread, size / np.where(alone > 0, alone, size))
     weights = np.repeat(1 / noise, rows.factors.shape[1])
+    # what is known of one parameter of a body beyond what is of the whole body
+    more = np.diag(np.sqrt(single))[single > 0]
+    W = np.vstack([W, np.column_stack([more, np.zeros((len(more), len(spread)))])])
+    y = np.append(y, more @ (mean if prior is None else prior[0])[:count])
+    weights = np.append(weights, np.ones(len(more)))
     found = feasible(W, y, weights, model.bodies, mean, weight, spread, signs)
-    pull = np.zeros((16 * len(model.bodies) + len(spread), len(mean)))
-    for i in range(len(model.bodies)):
+    pull = np.zeros((16 * len(model.bodies) + len(mean), len(mean)))
+    for i, each in enumerate(weight):
         body = slice(10 * i, 10 * i + 10)
-        pull[16 * i : 16 * i + 16, body] = curvature(found.values[body])
-    pull *= np.sqrt(weight)
-    pull[-len(spread) :, count:] = np.diag(1 / spread)
+        pull[16 * i : 16 * i + 16, body] = np.sqrt(each) * curvature(found.values[body])
+    pull[-len(mean) :] = np.diag(np.append(np.sqrt(single), 1 / spread))
     return judged(rows.columns(K), rows.y, rows.groups, rows.samples, found.values, noise, pull)
+
+
+def _of_bodies(mean: Array, std: Array) -> tuple[Array, Array]:
+    """What a prior of bodies (10 nb,) is in the divergence, and beyond it.
+
+    Returns:
+        Per body (nb,) one over the square of the share of mass and size to which all of it is
+        known at least; and per parameter (10 nb,) what is known beyond that, one over a variance.
+    """
+    units = np.array([_units(mean[i : i + 10]) for i in range(0, len(mean), 10)])
+    share = np.minimum((std.reshape(-1, 10) / units).max(axis=1), _UNKNOWN)
+    beyond = std**-2.0 - (share[:, None] * units).ravel() ** -2.0
+    return share**-2.0, np.where(beyond * std**2 > _ROUNDING, beyond, 0.0)
+
+
+def _units(body: Array) -> Array:
+    """m, m l, m l^2 (10,) of a body."""
+    mass, length = body_size(body)
+    return mass * np.array([1.0, *[length] * 3, *[length**2] * 6])
 
 
 def thick(body: Array) -> Array:

@@ -1,19 +1,73 @@
-"""What is wrong with a prior, in terms of the parameters that it is about."""
+"""What is known of parameters before: by name, or as numbers for all of them."""
 
-from collections.abc import Sequence
+import fnmatch
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from scipy.linalg import qr
 
 from crane.common.errors import InputError
+from crane.common.errors import known as known_names
 from crane.common.samples import Array, as_sample
+from crane.description.estimation import Known
 from crane.identification.estimation.estimators import Prior
 from crane.identification.mechanics.base import Base
 from crane.identification.mechanics.model import Model
 
 _DEPENDENT = 1e-10  # relative size of a pivot below which columns say the same
 _LISTED = 8
+
+
+def stated(model: Model, known: Mapping[str, Known], sizes: Array) -> Prior:
+    """Means (p,) and standard deviations (p,) of parameters of which something is known by name.
+
+    A name is that of a parameter, of a body for its mass and all moments, "bodies" for all, or a
+    pattern; "*" is everything, and the last that speaks of a parameter counts. Of a body only a
+    share r is known: r m, r m l, r m l^2. A share of another parameter is one of its described
+    value. What nothing is said of, and shares of what is described as zero, are within the sizes
+    that such a machine can have.
+
+    Args:
+        model: The model.
+        known: By name.
+        sizes: See `determined.sizes_of` (p,).
+
+    Raises:
+        InputError: A name that nothing has, or a body that more is said of than a share.
+    """
+    mean, std = model.nominal.copy(), np.where(sizes > 0, sizes, 1.0)
+    count = 10 * len(model.bodies)
+    for name, what in known.items():
+        everything = name == "*"
+        bodies = (
+            list(model.bodies)
+            if everything or name == "bodies"
+            else _named(model.bodies, name if "." not in name or name in model.bodies else "")
+        )
+        if bodies and (not what.relative or what.mean is not None):
+            raise InputError(
+                f"prior '{name}' is {what}, of bodies give a share of mass and size, as 10 %, or "
+                f"name one of their parameters, such as {bodies[0]}.m"
+            )
+        for body in bodies:
+            ten = slice(10 * (at := model.bodies.index(body)), 10 * at + 10)
+            mean[ten], std[ten] = model.nominal[ten], what.std * sizes[ten]
+        others = model.names[count:] if everything else _named(model.names, name)
+        for i in map(model.names.index, others):
+            mean[i] = model.nominal[i] if what.mean is None else what.mean
+            size = what.std * (abs(mean[i]) if what.relative else 1.0)
+            std[i] = size or (sizes[i] or 1.0)
+        place = name.rpartition(".")[0]
+        if not bodies and not others and not fnmatch.filter(model.machine.locks, place):
+            names = (*model.bodies, *model.names[count:])
+            raise InputError(f"prior '{name}' is unknown, {known_names(names, name)}")
+    return mean, std
+
+
+def _named(names: Sequence[str], pattern: str) -> list[str]:
+    """The name itself, or those that a pattern is about."""
+    return [pattern] if pattern in names else fnmatch.filter(names, pattern)
 
 
 def checked(model: Model, base: Base, prior: Any, feasible: bool) -> Prior:

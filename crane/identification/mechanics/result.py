@@ -1,6 +1,6 @@
 """What an identification found, and how well it predicts."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -86,6 +86,8 @@ class Identification:
         training: On the recording it was identified from.
         magnitude: (r,) how large they can be on such a machine, see `determined.magnitudes`.
         advice: What motion would tell what this one does not.
+        speeds: By direction along which there is friction, least and largest speed of the
+            training [m/s], [rad/s].
         validation: On another one, if there was one.
     """
 
@@ -100,6 +102,7 @@ class Identification:
     training: ForceComparison
     magnitude: Array
     advice: str
+    speeds: Mapping[str, tuple[float, float]]
     validation: ForceComparison | None = None
 
     def __repr__(self) -> str:
@@ -119,7 +122,7 @@ class Identification:
     @property
     def std(self) -> Array:
         """(r,) standard deviations."""
-        return np.sqrt(np.diag(self.covariance))
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))  # below it by rounding
 
     def interval(self, level: float = 0.95) -> Array:
         """(r, 2) ends of what covers the truth with this probability."""
@@ -180,18 +183,21 @@ class Identification:
         """(r,) what the machine's description says."""
         return self.base.values(self.model.nominal)
 
-    def predict(self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike) -> Array:
+    def predict(
+        self, q_a: ArrayLike, v_a: ArrayLike, a_a: ArrayLike, step: float | None = None
+    ) -> Array:
         """Forces of a motion by the identified parameters.
 
         Args:
             q_a: (N, n) [m], [rad].
             v_a: (N, n).
             a_a: (N, n).
+            step: From one sample to the next [s], for terms that remember time.
 
         Returns:
             (N, n) [N], [N m].
         """
-        at = self.model.samples(q_a, v_a, a_a)
+        at = self.model.samples(q_a, v_a, a_a, step)
         W = self.model.regressor(at)[:, :, self.base.independent]
         return W @ self.values + self.model.known(at)
 
@@ -217,6 +223,8 @@ class Identification:
                 relative = f"{100 * fit.relative[i]:.2f} %"
                 squared = f"{fit.percentage_error[i]:.3f} %"
                 rows.append([joint, f"{fit.rmse[i]:.4g}", unit, relative, squared])
+            mean = f"{100 * np.nanmean(fit.relative):.2f} %"
+            rows.append(["mean of the joints", "", "", mean, ""])
             rows.append(["all, stacked", "", "", f"{100 * fit.stacked:.2f} %", ""])
             lines += [f"{title}, moving rows", *aligned(rows, (0, 2)), ""]
         rows = [["parameter", "value", "std", "rel. std", "description", ""]]

@@ -19,7 +19,9 @@ from crane.formats import load, read
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base import random_samples
 from crane.identification.mechanics.division import divided
-from crane.identification.mechanics.model import PER_BODY
+from crane.identification.mechanics.inertias import PER_BODY
+from crane.identification.mechanics.laws import Frictional, Written, laws
+from crane.identification.mechanics.motors import combinations, motor_chain
 from crane.identification.mechanics.result import Identification
 from crane.identification.mechanics.urdf import changed_urdf
 from crane.machine import Machine
@@ -51,7 +53,10 @@ def write_identified(result: Identification, folder: str | Path) -> Path:
     """Write the identified machine: a URDF per sub-chain and a machine file beside them.
 
     Each body's parameters stand in the link that its joint moves, and the inertials of links
-    fixed to it are removed. Friction is the identified one, passive forces are the machine's.
+    fixed to it are removed. Friction, rotor inertias and pressures of gas are the identified ones,
+    other passive forces the machine's. Friction that a machine file has no law for is written as
+    the nearest law at steady speeds, with a warning that says how near, see `laws.laws`. A motor
+    that turns with several joints becomes a rotor that a coupling turns.
     What locked joints made one body is divided among its links as they are described, see
     `division.divided`. Everything else is as in the files that the machine was read from; what
     they draw is found where it is. The written files are loaded, and compared where the machine
@@ -88,7 +93,8 @@ def write_identified(result: Identification, folder: str | Path) -> Path:
                 f"{place}: is what '{machine.name}' was read from, choose another folder"
             )
     how = f"identified by {result.method}{', feasible' if result.feasible else ''}"
-    content = _content(result, spec, names, how)
+    written = laws(result.model, parameters, result.speeds)
+    content, more = _content(result, spec, names, how, written)
     with staging(folder) as part:
         for chain in spec.chains:
             tree = changed_urdf(chain.urdf, bodies, _carried(spec), how)
@@ -97,8 +103,11 @@ def write_identified(result: Identification, folder: str | Path) -> Path:
         if spec.payload is not None:
             carried = spec.payload.chain
             shutil.copyfile(carried.urdf, part / names[carried.name])
+        for name, text in more.items():
+            (part / name).write_text(text, encoding="utf-8")
         (part / file).write_text(content, encoding="utf-8")
-        _check(result, part / file)
+        _check(result, part / file, exact=not any(each.off for each in written.values()))
+    _tell(machine, written)
     return Path(folder) / file
 
 
@@ -150,8 +159,14 @@ def _carried(spec: MachineSpec) -> set[str]:
     return found
 
 
-def _content(result: Identification, spec: MachineSpec, names: Mapping[str, str], how: str) -> str:
-    """The machine file."""
+def _content(
+    result: Identification,
+    spec: MachineSpec,
+    names: Mapping[str, str],
+    how: str,
+    written: Mapping[str, Written],
+) -> tuple[str, dict[str, str]]:
+    """The machine file, and the URDFs of motors that turn with several joints, by name."""
     import yaml
 
     machine = result.machine
@@ -172,7 +187,15 @@ def _content(result: Identification, spec: MachineSpec, names: Mapping[str, str]
         chain["urdf"] = names[chain["name"]]
     if spec.payload is not None:
         data["payload"] = {"urdf": names[spec.payload.chain.name]}
-    data["friction"], scales = _identified(result, spec)
+    more = {}
+    for direction in combinations(result.model):
+        chain, coupling, text = motor_chain(direction, spec.tree.root)
+        data["chains"].append(chain)
+        data["couplings"] = [*(data.get("couplings") or ()), coupling]
+        more[chain["urdf"]] = text
+    data["friction"] = _friction(result, spec, written)
+    data["rotor_inertia"] = _rotors(result, spec)
+    scales = _values(result, "gas_scale")
     moving = locked(spec, machine.locks) if machine.locks else spec
 
     def of(kind: str) -> list[Any]:
@@ -189,49 +212,62 @@ def _content(result: Identification, spec: MachineSpec, names: Mapping[str, str]
     }
     data["ropes"] = [_numbers(item) for item in of("ropes")]
     data["end_stops"] = {item.joint: _numbers(item, joint=None) for item in of("end_stops")}
-    for key in ("loops", "forces", "gas_springs", "ropes", "end_stops"):
+    for key in ("loops", "forces", "gas_springs", "ropes", "end_stops", "rotor_inertia"):
         if not data.get(key):
             data.pop(key, None)
-    return str(
-        yaml.safe_dump(
-            data, sort_keys=False, allow_unicode=True, width=100, default_flow_style=None
-        )
+    text = yaml.safe_dump(
+        data, sort_keys=False, allow_unicode=True, width=100, default_flow_style=None
     )
+    return str(text), more
 
 
-def _identified(
-    result: Identification, spec: MachineSpec
-) -> tuple[dict[str, dict[str, float]], dict[str, float]]:
-    """Friction and scales of gas springs by joint.
-
-    A joint that the model gives no friction has none, whatever its files say.
-    """
-    machine, model = result.machine, result.model
+def _values(result: Identification, kind: str) -> dict[str, float]:
+    """Identified parameters of a kind by what they are of."""
     assert result.parameters is not None
-    found: dict[str, dict[str, float]] = {}
-    scales: dict[str, float] = {}
-    values = result.parameters.tolist()
-    for name, value in list(zip(model.names, values, strict=True))[10 * len(model.bodies) :]:
-        joint, _, kind = name.rpartition(".")
-        if joint in machine.joints and kind in _FRICTION:
-            found.setdefault(joint, {})[kind] = value
-        elif kind == "gas_scale":
-            scales[joint] = value
+    named = zip(result.model.names, result.parameters.tolist(), strict=True)
+    return {
+        name.removesuffix(f".{kind}"): value for name, value in named if name.endswith(f".{kind}")
+    }
+
+
+def _rotors(result: Identification, spec: MachineSpec) -> dict[str, float]:
+    """Rotor inertia by joint, the described one where none was identified."""
+    described = {joint.name: joint.rotor_inertia for joint in spec.tree.moving}
+    found = described | _values(result, "rotor_inertia")
+    for joint, value in found.items():
+        if value < 0:
+            raise InputError(f"'{joint}': rotor inertia is {value:g}, give feasible=True")
+    return {joint: value for joint, value in found.items() if value}
+
+
+def _friction(
+    result: Identification, spec: MachineSpec, written: Mapping[str, Written]
+) -> dict[str, dict[str, float]]:
+    """Friction by joint; one that the model gives none has none, whatever its files say."""
+    machine = result.machine
     friction = {
         joint: _numbers(spec.friction[joint]) for joint in spec.friction if joint in machine.locks
     }
-    for joint in machine.joints:
-        if joint in found:
-            # a joint without friction of its own is identified with a sign that jumps
-            law = machine.friction.get(joint, Friction(smoothing=0.0))
-            try:
-                new = Friction(smoothing=law.smoothing, stribeck=law.stribeck, **found[joint])
-            except InputError as error:
-                raise InputError(f"'{joint}': {error}, give feasible=True") from None
-            friction[joint] = _numbers(new) or {"viscous": 0.0}
+    for joint in (*machine.joints, *(x.name for x in combinations(result.model))):
+        if joint in written:
+            friction[joint] = _numbers(written[joint].law) or {"viscous": 0.0}
         elif joint in spec.friction:
             friction[joint] = {"viscous": 0.0}
-    return friction, scales
+    return friction
+
+
+def _tell(machine: Machine, written: Mapping[str, Written]) -> None:
+    """Warn of friction that is not written as it was identified."""
+    off = {name: each.off for name, each in written.items() if each.off}
+    if off:
+        worst = max(off, key=lambda name: off[name])
+        unit = "N" if worst in machine.joints and machine.unit(worst) == "m" else "N m"
+        text = (
+            f"a machine file has no place for all of the friction of {', '.join(off)}: the "
+            f"nearest law at steady speeds is written, off by at most {off[worst]:.3g} {unit} "
+            f"({worst})"
+        )
+        warnings.warn(text, CraneWarning, stacklevel=3)
 
 
 def _numbers(item: Any, **changed: Any) -> dict[str, Any]:
@@ -245,8 +281,14 @@ def _numbers(item: Any, **changed: Any) -> dict[str, Any]:
     return {key: value for key, value in values.items() if value != defaults[key]}
 
 
-def _check(result: Identification, file: Path) -> None:
-    """Load what was written and compare its forces with those of the parameters."""
+def _check(result: Identification, file: Path, exact: bool) -> None:
+    """Load what was written and compare its forces with those of the parameters.
+
+    Args:
+        result: See above.
+        file: The machine file.
+        exact: Whether friction is the identified one; where it is not, all else is compared.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CraneWarning)
@@ -257,13 +299,18 @@ def _check(result: Identification, file: Path) -> None:
     model, parameters = result.model, result.parameters
     assert parameters is not None
     at = random_samples(model, 20)
-    wanted = model.regressor(at) @ parameters + model.known(at)
+    counted, first = parameters.copy(), 0
+    for term in model.terms:
+        if isinstance(term, Frictional) and not exact:
+            counted[first : first + len(term.names)] = 0.0
+        first += len(term.names)
+    wanted = model.regressor(at) @ counted + model.known(at)
     dynamics = Dynamics(written, backend="pinocchio")
-    found = dynamics.inverse(at.q_a, at.v_a, at.a_a, friction=True)
+    found = dynamics.inverse(at.q_a, at.v_a, at.a_a, friction=exact)
     off = np.abs(found - wanted).max(axis=0)
     if off.max() <= _SAME * np.abs(wanted).max():
         return
-    kinds = {*_FRICTION, "gas_scale", *PER_BODY}
+    kinds = {*_FRICTION, "gas_scale", "rotor_inertia", *PER_BODY}
     others = [name for name in model.names if name.rpartition(".")[2] not in kinds]
     what = f"'{others[0]}'" if others else "friction over other velocities than the machine's"
     raise InputError(f"the model has {what}, for which a machine file has no place, leave it out")

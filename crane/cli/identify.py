@@ -1,0 +1,203 @@
+"""Commands that find parameters from strokes and forces: identify, payload."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from crane.cli.shared import (
+    Columns,
+    Force,
+    Lock,
+    MachineName,
+    Method,
+    Out,
+    RecordingFile,
+    Recordings,
+    Train,
+    Trust,
+    Validation,
+    app,
+    by_joint,
+    load,
+    progress_bar,
+    status,
+    window,
+)
+from crane.common.errors import InputError
+
+if TYPE_CHECKING:
+    from crane.description.estimation import Known, Numbers
+    from crane.machine import Machine
+    from crane.recordings.recording import Recording
+
+_FEWEST = 50  # samples of a part that is held out
+_TERM = "NAME, NAME=NUMBERS or NAME=off, as in q1.presliding=1e-4"
+_PRIOR = "NAME=STD, as in bodies=10%, q1.viscous=50 or q1.viscous=200+-50, a share, or none"
+
+
+@app.command()
+def identify(
+    machine: MachineName,
+    recording: Recordings,
+    out: Out,
+    train: Train = None,
+    validation: Validation = None,
+    columns: Columns = None,
+    method: Method = "wls",
+    term: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME[=NUMBERS]",
+            help="A term of the model, as q*.rotor_inertia, q1.presliding=1e-4, q5+q6.viscous; "
+            "NAME=off leaves it out.",
+        ),
+    ] = None,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[NAME=]STD",
+            help="What is known before: a share of all that is described, as 0.3; or by name, as "
+            "bodies=10%, q1.viscous=200+-50; none: nothing.",
+        ),
+    ] = None,
+    feasible: Annotated[
+        bool, typer.Option("--feasible", help="Only bodies and friction that can exist.")
+    ] = False,
+    bandwidth: Annotated[
+        float | None,
+        typer.Option(metavar="HZ", help="Of the low-pass; by the motion if not given."),
+    ] = None,
+    slow: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="JOINT=VALUE",
+            help="Velocity below which its rows are left out, in m/s or rad/s.",
+        ),
+    ] = None,
+    lock: Lock = None,
+    trust: Trust = False,
+    force: Force = False,
+) -> None:
+    """Find a machine's parameters from recordings, and how well they predict."""
+    from crane.cli.runs import check_folder, write_identification
+    from crane.common.samples import as_number
+    from crane.identification.mechanics.identify import identify as run
+    from crane.identification.mechanics.write import check_rewritable
+
+    check_folder(out, force)
+    span, changes, known = window(train), terms(term), priors(prior)
+    slowest = by_joint("--slow", slow)
+    loaded = load(machine, lock)
+    if known is None:
+        estimation = dataclasses.replace(loaded.estimation, prior={})
+        loaded = loaded.replace(estimation=estimation)
+    if feasible:
+        check_rewritable(loaded)
+    learned, judges = _divided(_read(recording, loaded, columns), span)
+    judges += _read(validation or [], loaded, columns)
+    if bandwidth is not None:
+        shortest = max(min(float(x.time[-1] - x.time[0]) for x in learned), 1e-3)
+        as_number(bandwidth, "the bandwidth", "Hz", above=5 / shortest)
+    with progress_bar("identifying") as progress:
+        result = run(
+            loaded, learned, judges or None, method, known, feasible, terms=changes,
+            bandwidth=bandwidth, slow=slowest, trust=trust, progress=progress,
+        )  # fmt: skip
+    with status("writing the report"):
+        named = [", ".join(path.name for path in paths or ()) for paths in (recording, validation)]
+        if train is not None:
+            named = [f"{named[0]}, {train} s", ", ".join(filter(None, ["the rest", named[1]]))]
+        write_identification(out, result, *named)
+    print(f"{result.to_text()}\nwritten to {out}; see {out}/report.html")
+
+
+def terms(words: Sequence[str] | None) -> "dict[str, Numbers | None]":
+    """Terms by name: their numbers, None of those that are off.
+
+    Raises:
+        InputError: Something else is written, or a name twice.
+    """
+    found: dict[str, Numbers | None] = {}
+    for word in words or ():
+        name, equals, text = word.partition("=")
+        try:
+            numbers = tuple(map(float, text.split(","))) if equals and text != "off" else ()
+        except ValueError:
+            raise InputError(f"--term is '{word}', write {_TERM}") from None
+        if name in found:
+            raise InputError(f"--term names '{name}' twice, give it once")
+        found[name] = None if text == "off" else numbers
+    return found
+
+
+def priors(words: Sequence[str] | None) -> "dict[str, Known] | None":
+    """What is known by name, "*" of a share without one; None of `none`.
+
+    Raises:
+        InputError: Something else is written, or a name twice.
+    """
+    from crane.description.estimation import Known
+
+    found: dict[str, Known] = {}
+    if words and list(words) == ["none"]:
+        return None
+    for word in words or ():
+        name, equals, text = word.rpartition("=")
+        name = name.strip() if equals else "*"
+        try:
+            known = Known.read(text)
+        except InputError:
+            raise InputError(f"--prior is '{word}', write {_PRIOR}") from None
+        if name in found:
+            raise InputError(f"--prior says two things of '{name}', give one")
+        found[name] = known if equals else dataclasses.replace(known, relative=True)
+    return found
+
+
+def _read(paths: Sequence[Path], machine: "Machine", columns: Path | None) -> "list[Recording]":
+    from crane.cli.runs import read_run
+
+    found = []
+    for path in paths:
+        with status(f"reading {path.name}"):
+            found.append(read_run(path, machine, columns))
+    return found
+
+
+def _divided(
+    recordings: "list[Recording]", span: tuple[float, float]
+) -> "tuple[list[Recording], list[Recording]]":
+    """What lies within a window [s], and what of use lies before and after it."""
+    inside = [recording.between(*span) for recording in recordings]
+    outside = [
+        recording.at(part)
+        for recording in recordings
+        for part in (recording.time < span[0], recording.time > span[1])
+        if part.sum() >= _FEWEST
+    ]
+    return inside, outside
+
+
+@app.command()
+def payload(
+    machine: MachineName,
+    recording: RecordingFile,
+    columns: Columns = None,
+    frame: Annotated[
+        str | None, typer.Option(help="Link that carries the load; the tip if not given.")
+    ] = None,
+    method: Method = "wls",
+    lock: Lock = None,
+    trust: Trust = False,
+) -> None:
+    """Estimate mass and centre of mass of what a machine carries from a recording."""
+    from crane.identification.mechanics.payload import identify_payload
+
+    loaded = load(machine, lock)
+    (carried,) = _read([recording], loaded, columns)
+    with progress_bar("estimating") as progress:
+        estimate = identify_payload(loaded, carried, frame, method, trust=trust, progress=progress)
+    print(estimate.to_text(), end="")

@@ -1,0 +1,282 @@
+"""Terms of a model and what is known before, by name: in the machine file and in calls."""
+
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+import yaml
+from typed import typed
+
+import crane
+from crane.common.errors import CraneError, CraneWarning, InputError
+from crane.description import Friction
+from crane.description.estimation import Estimation, Known
+from crane.formats import write_machine
+from crane.identification.mechanics.friction import Presliding, RestMemory, friction, root
+from crane.identification.mechanics.identify import identify
+from crane.identification.mechanics.inertias import Inertial, RotorInertia
+from crane.identification.mechanics.laws import laws
+from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.priors import stated
+from crane.identification.mechanics.term import Direction
+from crane.identification.mechanics.write import write_identified
+from crane.identification.signals.motion import Motion
+
+STEP = 5e-3
+TIME = STEP * np.arange(1600)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return crane.load("tx40").replace(estimation=Estimation())
+
+
+def moved(machine, seed=0, terms=None, parameters=None):
+    """Joints in sines of their own about home, and the forces of parameters, or the described."""
+    rng, n = np.random.default_rng(seed), len(machine.active)
+    w = 2 * np.pi * rng.uniform(0.3, 0.9, n)
+    phase, size = rng.uniform(0, 2 * np.pi, n), 0.1 * (machine.upper - machine.lower)
+    angle = TIME[:, None] * w + phase
+    q = machine.home[machine.closure.active] + size * np.sin(angle)
+    v, a = size * w * np.cos(angle), -size * w**2 * np.sin(angle)
+    model = Model(machine, terms)
+    at = model.samples(q, v, a, STEP)
+    tau = model.regressor(at) @ (model.nominal if parameters is None else parameters)
+    return Motion(TIME, q, v, a, tau + model.known(at))
+
+
+def test_names_are_the_terms_that_they_say(arm):
+    changes = {
+        "q*.coulomb_offset": None, "q*.viscous_offset": None, "q[1-4].rotor_inertia": (),
+        "q1.presliding": (1e-3,), "q1.root": (), "q2.memory": (0.2, 0.1), "q3.stiction": (0.1, 1),
+        "q6+0.5*q5.coulomb": (), "q6+0.5*q5.rotor_inertia": (), "q4.viscous": None,
+    }  # fmt: skip
+    both = Direction("q6+0.5*q5", {"q6": 1.0, "q5": 0.5})
+    kinds = ("coulomb", "viscous")
+    wanted = [
+        Inertial(arm),
+        *(RotorInertia(arm, joint) for joint in ("q1", "q2", "q3", "q4", both)),
+        friction(arm, "q1", ("viscous",)), root(arm, "q1"), Presliding(arm, "q1", 1e-3),
+        friction(arm, "q2", kinds), RestMemory(arm, "q2", 0.2, 0.1),
+        friction(arm, "q3", kinds, stribeck=(0.1, 1.0)), friction(arm, "q4", ("coulomb",)),
+        friction(arm, "q5", kinds), friction(arm, "q6", kinds), friction(arm, both, ("coulomb",)),
+    ]  # fmt: skip
+    one, other = Model(arm, changes), Model(arm, wanted)
+    assert set(one.names) == set(other.names) and len(one.names) == len(other.names)
+    motion = moved(arm)
+    columns = [
+        dict(zip(m.names, np.moveaxis(m.regressor(m.samples(*x, STEP)), 2, 0), strict=True))
+        for m, x in zip((one, other), 2 * [(motion.q, motion.v, motion.a)], strict=True)
+    ]
+    for name, column in columns[0].items():
+        np.testing.assert_array_equal(column, columns[1][name])
+
+
+def test_the_memory_of_rest_is_its_differential_equation(arm):
+    """At a steady speed from rest w = v (1 - e^(-t / lag)), in parts as in one."""
+    v = np.zeros((1600, 6))
+    v[:, 0] = -0.3
+    q = np.zeros_like(v)
+    q[:, 0] = -0.3 * TIME
+    term = RestMemory(arm, "q1", 0.2, 0.1)
+    model = Model(arm, [term])
+    found = term.columns(model.samples(q, v, 0 * v, STEP))[:, 0, 0]
+    w = 0.3 * (1 - np.exp(-(TIME + STEP) / 0.2))
+    np.testing.assert_allclose(found, -np.exp(-w / 0.1), rtol=1e-12)
+    parts, memory = [], {}
+    for part in (slice(0, 700), slice(700, None)):
+        starts = (0,) if part.start == 0 else ()
+        at = model.samples(q[part], v[part], 0 * v[part], STEP, starts)
+        at = dataclasses.replace(at, memory=memory)
+        parts.append(term.columns(at)[:, 0, 0])
+    np.testing.assert_allclose(np.concatenate(parts), found, rtol=1e-13)
+    with pytest.raises(InputError, match="'q1.memory' remembers time, give the step"):
+        term.columns(model.samples(q, v, 0 * v))
+
+
+@pytest.mark.parametrize(
+    ("terms", "message"),
+    [
+        ({"q1.rotor": ()}, "term 'q1.rotor': 'rotor' is unknown, known: "),
+        ({"presliding": ()}, "term 'presliding': 'presliding' is unknown"),
+        ({"q9.viscous": ()}, "term 'q9.viscous': 'q9' is unknown, known: q1"),
+        (
+            {"q1.presliding": ()},
+            "term 'q1.presliding' has 0 numbers, give the distance over which",
+        ),
+        ({"q1.viscous": (1.0,)}, "term 'q1.viscous' has 1 numbers, it takes none"),
+        ({"q1.presliding": (-1.0,)}, "the length of presliding of 'q1' is -1"),
+        ({"q1.stiction": ()}, "term 'q1.stiction' needs the velocity over which it fades"),
+        ({"q5+x*q6.viscous": ()}, "'q5+x*q6': 'x' is no factor, write q5+0.5*q6"),
+        ({"q5+q9.viscous": ()}, "'q5+q9' combines 'q9', which is not active"),
+        ({"q1.gas_scale": ()}, "term 'q1.gas_scale': 'q1' is unknown, there are none"),
+    ],
+)
+def test_terms_that_are_none(arm, terms, message):
+    with pytest.raises(InputError) as caught:
+        model = Model(arm, terms)
+        model.regressor(model.samples(*np.zeros((3, 2, 6))))
+    assert str(caught.value).startswith(message) and str(caught.value).isprintable()
+
+
+def test_what_is_known_by_name(arm):
+    """The last that speaks of a parameter counts; shares are of what is described."""
+    rough = arm.replace(friction={"q1": Friction(coulomb=8.0)})
+    model = Model(rough)
+    sizes = np.linspace(1.0, 2.0, len(model.names))
+    known = {"*": "30 %", "link[12]": "10 %", "link2.m": "5 +- 0.1", "*.viscous": 7,
+             "q1.viscous": "2 +- 50 %"}  # fmt: skip
+    mean, std = stated(model, {k: Known.read(x) for k, x in known.items()}, sizes)
+    by = {name: (mean[i], std[i], sizes[i]) for i, name in enumerate(model.names)}
+    assert by["link1.Izz"][1] == pytest.approx(0.1 * by["link1.Izz"][2])
+    assert by["link3.m"][1] == pytest.approx(0.3 * by["link3.m"][2])
+    assert by["link2.m"][:2] == (5.0, 0.1)
+    assert by["q2.viscous"][:2] == (0.0, 7.0) and by["q1.viscous"][:2] == (2.0, 1.0)
+    assert by["q1.coulomb"][:2] == (8.0, pytest.approx(2.4))
+    assert by["q3.coulomb"][1] == by["q3.coulomb"][2]  # described as none: what can be
+
+
+@pytest.mark.parametrize("feasible", [False, True])
+def test_a_parameter_that_is_known_stays_where_it_is(arm, feasible):
+    """And it may be one of a body: its mass, of which forces say nothing, is what was weighed."""
+    prior = {"bodies": "30 %", "link6.m": "0.5 +- 1e-7", "q2.viscous": "3 +- 1e-7"}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        found = identify(arm, moved(arm), prior=prior, feasible=feasible, bandwidth=10.0)
+    values = dict(zip(found.model.names, found.parameters, strict=True))
+    assert values["link6.m"] == pytest.approx(0.5, abs=1e-4)
+    assert values["q2.viscous"] == pytest.approx(3.0, abs=1e-4)
+    i = found.names.index("q2.viscous")
+    assert found.std[i] <= 2e-6  # of the estimate that is printed, not of one without a prior
+
+
+def test_the_machine_file_says_it_and_keeps_it(arm, tmp_path):
+    kr300 = crane.load("kr300")
+    assert "q1.memory" in Model(kr300).names and "q1.coulomb" not in Model(kr300).names
+    again = crane.load(write_machine(kr300, tmp_path / "out"))
+    assert again.estimation == kr300.estimation
+    assert Model(again).names == Model(kr300).names
+    held = crane.load("kr300", lock={"q6": 0.0})  # what is said of a locked joint is of nobody
+    assert not [name for name in Model(held).names if name.startswith("q6")]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{term: {}}", "unknown key 'term' in 'identification', did you mean 'terms'?"),
+        ("{terms: {q1.root: maybe}}", "'q1.root' of 'terms' is 'maybe', give a number"),
+        ("{terms: {q1.root: }}", "'q1.root' of 'terms' is empty, give its value"),
+        ("{prior: {q1.viscous: about 5}}", "'q1.viscous' of 'prior': 'about 5' says no standard"),
+        ("{bandwidth: 0}", "'bandwidth' is 0, give one in Hz"),
+        ("{slow: {q1: -1}}", "'q1' of 'slow' is -1, give at least 0"),
+    ],
+)
+def test_a_section_that_is_wrong(edited, text, message):
+    with pytest.raises(CraneError) as caught:
+        edited("four_bar.yaml", "tip: coupler_pin", f"tip: coupler_pin\nidentification: {text}")
+    assert message in str(caught.value) and "four_bar.yaml:" in str(caught.value)
+
+
+# --- what becomes of them in a machine file ---------------------------------------------------
+
+
+def test_a_motor_of_two_joints_is_written_as_a_rotor_that_a_coupling_turns(arm, tmp_path):
+    """The machine that is read back has its forces, by Pinocchio and by the formulas."""
+    terms = {"q5+q6.rotor_inertia": (), "q5+q6.viscous": (), "q5+q6.coulomb": (),
+             "q*.rotor_inertia": (), "q*.viscous_offset": None}  # fmt: skip
+    model = Model(arm, terms)
+    truth = model.nominal.copy()
+    for i, name in enumerate(model.names):
+        kind = name.rpartition(".")[2]
+        truth[i] += {"rotor_inertia": 0.2, "viscous": 3.0, "coulomb": 5.0}.get(kind, 0.0)
+    motion = moved(arm, terms=terms, parameters=truth)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        found = identify(arm, motion, terms=terms, feasible=True, bandwidth=40.0, trust=True)
+        machine = crane.load(write_identified(found, tmp_path / "out"))
+    assert machine.active == arm.active and "q5+q6" in machine.joints
+    assert machine.tree.joints["q5+q6"].rotor_inertia == pytest.approx(0.2, rel=0.02)
+    assert machine.friction["q5+q6"].coulomb == pytest.approx(5.0, rel=0.05)
+    dynamics = crane.Dynamics(machine)
+    forces = dynamics.inverse(motion.q, motion.v, motion.a, friction=True)
+    moving = (np.abs(motion.v) > 0.05).all(axis=1)
+    gap = np.linalg.norm((forces - motion.tau)[moving], axis=0)
+    assert (gap < 0.01 * np.linalg.norm(motion.tau[moving], axis=0)).all()
+
+
+def test_friction_without_a_place_is_written_as_the_nearest_law(arm):
+    """Presliding at steady speeds is Coulomb's; of the root, least squares over the speeds."""
+    terms = {"q1.presliding": (1e-3,), "q2.root": (), "q3.stiction": (0.1,), "q3.viscous": None}
+    model = Model(arm, terms)
+    values = np.zeros(len(model.names))
+    for name, value in {"q1.presliding": 4.0, "q1.viscous": 2.0, "q2.root": 3.0, "q3.coulomb": 1.0,
+                        "q3.stiction": 0.5}.items():  # fmt: skip
+        values[model.names.index(name)] = value
+    found = laws(model, values, dict.fromkeys(arm.active, (0.01, 1.0)))
+    law = found["q1"].law
+    assert found["q1"].off < 1e-9 and law.coulomb + law.stiction == pytest.approx(4.0)
+    assert law.viscous == pytest.approx(2.0)
+    assert found["q3"].off == 0 and found["q3"].law == Friction(1.0, stiction=0.5, stribeck=0.1)
+    v = np.linspace(0.01, 1.0, 500)
+    law, off = found["q2"].law, found["q2"].off
+    written = law.coulomb + law.viscous * v + law.stiction * np.exp(-((v / law.stribeck) ** 2))
+    assert np.abs(written - 3 * np.sqrt(v)).max() == pytest.approx(off, rel=0.02)
+    assert 0 < off < 0.53  # what the best straight line, 0.8 + 2.4 v, is off at 0.01
+
+
+# --- the command line -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            ["--term", "crank.root=x"],
+            "--term is 'crank.root=x', write NAME, NAME=NUMBERS or NAME=o",
+        ),
+        (["--term", "crank.root", "--term", "crank.root=off"], "--term names 'crank.root' twice"),
+        (["--term", "crank.rot"], "term 'crank.rot': 'rot' is unknown, did you mean 'root'?"),
+        (["--prior", "a=b"], "--prior is 'a=b', write NAME=STD, as in bodies=10%"),
+        (["--prior", "0.3", "--prior", "0.1"], "--prior says two things of '*', give one"),
+        (["--prior", "q8.m=1"], "prior 'q8.m' is unknown, known: "),
+        (["--train", "5"], "--train is '5', write FROM:TO in seconds, as 0:13.5"),
+        (["--train", "90:99"], "nothing lies between 90 and 99 s, the recording goes from 0 to "),
+        (["--columns", "none.txt"], "none.txt: no such file or directory, give a file of columns"),
+    ],
+)
+def test_options_that_are_wrong_are_one_line(tmp_path, crank, arguments, message):
+    done = typed("identify", *crank, "--out", tmp_path / "out", *arguments)
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("warning")]
+    assert (done.returncode, done.stdout, len(lines)) == (2, "", 1), done.stderr
+    assert lines[0].startswith("error: ") and message in lines[0]
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_window_is_trained_on_and_the_rest_judges(tmp_path, crank):
+    done = typed(
+        "identify", *crank, "--train", "0:5", "--prior", "0.3", "--term", "crank.rotor_inertia",
+        "--out", tmp_path / "out", "--feasible",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "validation, moving rows" in done.stdout and "mean of the joints" in done.stdout
+    data = yaml.safe_load((tmp_path / "out" / "machine" / "four_bar.yaml").read_text())
+    assert data["rotor_inertia"]["crank"] > 0
+
+
+@pytest.fixture(scope="module")
+def crank(tmp_path_factory):
+    """A machine and a recording of it, as arguments."""
+    from broken import DATA
+
+    folder = tmp_path_factory.mktemp("crank")
+    machine = crane.load(DATA / "four_bar.yaml")
+    q = 0.6 + 0.3 * np.sin(2 * TIME) + 0.1 * np.sin(5.3 * TIME + 1)
+    v = 0.6 * np.cos(2 * TIME) + 0.53 * np.cos(5.3 * TIME + 1)
+    a = -1.2 * np.sin(2 * TIME) - 2.809 * np.sin(5.3 * TIME + 1)
+    tau = crane.Dynamics(machine).inverse(q[:, None], v[:, None], a[:, None], friction=True)
+    recording = crane.Recording(
+        time=TIME, joints=("crank",), q=q[:, None], v=v[:, None], tau=tau, units={"crank": "rad"}
+    )
+    recording.to_csv(folder / "crank.csv")
+    return DATA / "four_bar.yaml", folder / "crank.csv"
