@@ -35,7 +35,8 @@ class Oracle:
         model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
         self.data, self.machine = mujoco.MjData(model), machine
         for i in range(model.neq):  # what a program moves is no part of a machine
-            if model.eq_type[i] < 2 and model.body_mocapid[model.eq_obj1id[i]] >= 0:
+            of_bodies = model.eq_type[i] < 2 and model.eq_objtype[i] == mujoco.mjtObj.mjOBJ_BODY
+            if of_bodies and model.body_mocapid[model.eq_obj1id[i]] >= 0:
                 self.data.eq_active[i] = 0
         self.names = [model.joint(i).name or f"joint{i + 1}" for i in range(model.njnt)]
 

@@ -132,3 +132,44 @@ def test_rotors_are_known_to_identification_unless_a_term_has_them(rotors):
         found = model.regressor(at) @ model.nominal + model.known(at)
         assert len(model.nominal) == count
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())
+
+
+def test_what_forces_change_by_a_rotor_is_its_regressor(rotors):
+    """d tau_A / d I = gamma_j^T (gamma_j a_A + drift_j), of an active and of a passive joint."""
+    q_a, v_a, a_a, _ = states(rotors, 10, seed=4)
+    q_a[:, 1:] *= 0.03
+    names = [f"{joint}.rotor_inertia" for joint in ROTORS]
+    found = crane.Dynamics(rotors).derivatives("inverse", q_a, v_a, a_a, by=names)
+    q = rotors.closure.solve(q_a)
+    gamma = rotors.closure.gamma(q)
+    drift = rotors.closure.drift(q, np.einsum("kij,kj->ki", gamma, v_a))
+    for joint in ROTORS:
+        row, more = gamma[:, rotors.column(joint)], drift[:, rotors.column(joint)]
+        wanted = row * (np.einsum("kj,kj->k", row, a_a) + more)[:, None]
+        np.testing.assert_allclose(
+            found[f"{joint}.rotor_inertia"], wanted, rtol=0, atol=1e-10 * np.abs(wanted).max()
+        )
+
+
+def test_armature_is_mujoco_s_in_closed_loops(rotors, tmp_path):
+    """Written as `armature`, and read again: MuJoCo's accelerations of the closed machine."""
+    pytest.importorskip("mujoco")
+    from mujoco_oracle import Oracle
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        crane.write_mjcf(rotors, tmp_path / "rotors.xml")
+        again = crane.load(tmp_path / "rotors.xml").driven_by(rotors.active)
+    assert {x: again.tree.joints[x].rotor_inertia for x in ROTORS} == ROTORS
+    oracle, dynamics = Oracle(tmp_path / "rotors.xml", rotors), crane.Dynamics(rotors)
+    for q_a, v_a, _, tau in zip(*states(rotors, 5, seed=5), strict=True):
+        q_a[1:], v_a[1:] = 0.03 * q_a[1:], 0.03 * v_a[1:]  # [m] of stroke
+        q = rotors.closure.solve(q_a)
+        gamma = rotors.closure.gamma(q)
+        oracle.place(q, gamma @ v_a)
+        along = np.zeros(len(rotors.joints))
+        along[rotors.closure.active] = tau
+        wanted = oracle.accelerations(oracle.forces(q, along))
+        a = gamma @ dynamics.forward(q_a, v_a, tau) + rotors.closure.drift(q, gamma @ v_a)
+        found = oracle.motion(q, gamma @ v_a, a)
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
