@@ -7,15 +7,17 @@ from functools import partial
 import motions
 import numpy as np
 import pytest
+from broken import DATA
 from motions import NOISE, noisy
 
 import crane
-from crane.common.errors import CraneWarning
+from crane.common.errors import CraneWarning, RecordingError
 from crane.identification.mechanics.determined import weak_directions
 from crane.identification.mechanics.feasible import body_parameters, curvature, pseudo_inertia
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.possible import thick
+from crane.identification.mechanics.reading import smoothed_motion
 from crane.identification.signals.motion import Motion
 
 motion = partial(motions.motion, period=8.0, duration=16.0)
@@ -191,3 +193,33 @@ def test_feasible_intervals_cover_machines_that_are_not_as_described(mini, prior
         wanted = found.base.values(truth)
         covered.append(np.mean((low <= wanted) & (wanted <= high)))
     assert 0.90 < np.mean(covered) <= 0.99
+
+
+@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+def test_a_motion_that_determines_nothing_is_refused_unless_trusted():
+    """A crank that creeps one way at one speed: weight and all friction are one, but for noise."""
+    crank = crane.load(DATA / "four_bar.yaml")
+    time = 0.01 * np.arange(1500)
+    q = 0.5 + 1e-3 * time + 1e-6 * np.sin(2 * time)
+    v, a = 1e-3 + 2e-6 * np.cos(2 * time), -4e-6 * np.sin(2 * time)
+    q, v, a = q[:, None], v[:, None], a[:, None]
+    tau = crane.Dynamics(crank).inverse(q, v, a)
+    given = Motion(time, q, v, a, tau + 0.1 * np.random.default_rng(0).normal(size=tau.shape))
+    with pytest.raises(RecordingError, match=r"does not determine (\d+) of \1 base parameters"):
+        identify(crank, given, bandwidth=5.0)
+    assert set(identify(crank, given, bandwidth=5.0, trust=True).marks) == {"not determined"}
+
+
+def test_a_joint_that_only_trembles_stands_still(mini):
+    """Its rows tell nothing: friction at rest makes any force."""
+    rng, time = np.random.default_rng(1), 0.01 * np.arange(3000)
+    home = mini.home[mini.closure.active]
+    q = home + np.outer(np.sin(1.5 * time), [0.3, 5e-3, 0.0]) + 1e-5 * rng.normal(size=(3000, 3))
+    tau = crane.Dynamics(mini).inverse(q, 0 * q, 0 * q) + 1e-3 * rng.normal(size=(3000, 3))
+    units = {joint: mini.unit(joint) for joint in mini.active}
+    recording = crane.Recording(time, mini.active, q, 0 * q, tau, units)
+    with pytest.warns(CraneWarning) as told:
+        motion = smoothed_motion(mini, recording)
+    still = [str(one.message) for one in told if "stands still" in str(one.message)]
+    assert len(still) == 1 and still[0].startswith("'X2' stands still but for noise: its forces ")
+    assert not motion.v[:, 2].any() and motion.v[:, :2].any(axis=0).all()

@@ -6,8 +6,11 @@ from broken import DATA
 
 import crane
 from crane.common.errors import InputError
+from crane.description import Friction
+from crane.description.estimation import Known
 from crane.identification.mechanics.identify import Motion, identify
 from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.priors import stated
 
 TIME = np.arange(0, 8, 0.01)
 W = np.pi
@@ -74,3 +77,19 @@ def test_a_prior_that_is_none(four_bar, one_way, prior, feasible, message):
     with pytest.raises(InputError) as caught:
         identify(four_bar, one_way, prior=prior, feasible=feasible)
     assert str(caught.value).startswith(message) and str(caught.value).isprintable()
+
+
+def test_a_share_of_the_description_is_about_friction_too(four_bar, one_way):
+    """Friction has the described size, its offset that of what it is the offset of."""
+    rough = four_bar.replace(
+        friction={"crank": Friction(coulomb=4.0, viscous=0.5, smoothing=1e-3)}
+    )
+    model = Model(rough)
+    _, std = stated(model, {"*": Known(0.3, relative=True)}, np.ones(len(model.names)))
+    by = dict(zip(model.names, std, strict=True))
+    assert by["crank.coulomb"] == by["crank.coulomb_offset"] == pytest.approx(1.2)
+    assert by["crank.viscous"] == by["crank.viscous_offset"] == pytest.approx(0.15)
+    found = identify(rough, one_way, prior=0.3)  # Coulomb friction and offset apart, by the prior
+    values = dict(zip(found.model.names, found.parameters, strict=True))
+    assert abs(values["crank.coulomb_offset"]) < abs(values["crank.coulomb"] + 4.0) + 3 * 1.2
+    assert len(found.parameters) == 36

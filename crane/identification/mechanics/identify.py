@@ -20,6 +20,7 @@ from crane.identification.estimation.estimators import (
 )
 from crane.identification.mechanics.against import check_forces, tell_delays, tell_validation
 from crane.identification.mechanics.base import Base, base_parameters
+from crane.identification.mechanics.checks import doubt
 from crane.identification.mechanics.delays import delays
 from crane.identification.mechanics.determined import advice, magnitudes, sizes_of
 from crane.identification.mechanics.equations import Equations, Progress
@@ -101,7 +102,7 @@ def identify(
 
     Raises:
         InputError: Arguments that do not fit.
-        RecordingError: A recording that cannot serve, and why.
+        RecordingError: A recording that cannot serve, and why; one that determines nothing.
     """
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
@@ -154,7 +155,9 @@ def identify(
         model, told, values, covariance, parameters, estimate, method, feasible, training,
         magnitudes(told, sizes), remedy, speeds, judged,
     )  # fmt: skip
-    if found.doubt:
+    if all(mark == "not determined" for mark in found.marks):
+        doubt(found.doubt, trust)
+    elif found.doubt:
         warnings.warn(found.doubt, CraneWarning, stacklevel=2)
     return found
 

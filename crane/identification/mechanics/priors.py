@@ -25,8 +25,9 @@ def stated(model: Model, known: Mapping[str, Known], sizes: Array) -> Prior:
     A name is that of a parameter, of a body for its mass and all moments, "bodies" for all, or a
     pattern; "*" is everything, and the last that speaks of a parameter counts. Of a body only a
     share r is known: r m, r m l, r m l^2. A share of another parameter is one of its described
-    value. What nothing is said of, and shares of what is described as zero, are within the sizes
-    that such a machine can have.
+    value, of friction that is described as zero of what the same joint's friction of that kind is
+    described as. What nothing is said of, and shares of what is described by no number, are within
+    the sizes that such a machine can have.
 
     Args:
         model: The model.
@@ -56,13 +57,22 @@ def stated(model: Model, known: Mapping[str, Known], sizes: Array) -> Prior:
         others = model.names[count:] if everything else _named(model.names, name)
         for i in map(model.names.index, others):
             mean[i] = model.nominal[i] if what.mean is None else what.mean
-            size = what.std * (abs(mean[i]) if what.relative else 1.0)
+            usual = abs(mean[i]) or _usual(model, i)
+            size = what.std * (usual if what.relative else 1.0)
             std[i] = size or (sizes[i] or 1.0)
         place = name.rpartition(".")[0]
         if not bodies and not others and not fnmatch.filter(model.machine.locks, place):
             names = (*model.bodies, *model.names[count:])
             raise InputError(f"prior '{name}' is unknown, {known_names(names, name)}")
     return mean, std
+
+
+def _usual(model: Model, i: int) -> float:
+    """The largest described friction of the same joint and kind as that of a parameter."""
+    where, _, kind = model.names[i].rpartition(".")
+    alike = kind.removesuffix("_offset")
+    law = model.machine.friction.get(where)
+    return float(getattr(law, alike, 0.0)) if alike != kind else 0.0
 
 
 def _named(names: Sequence[str], pattern: str) -> list[str]:

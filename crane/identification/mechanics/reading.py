@@ -1,10 +1,11 @@
 """From a recording to a motion: what is wrong with it is told, derivatives are found."""
 
 import math
+import warnings
 
 import numpy as np
 
-from crane.common.errors import RecordingError, known
+from crane.common.errors import CraneWarning, RecordingError, known
 from crane.common.samples import Array
 from crane.identification.mechanics.checks import (
     check,
@@ -65,7 +66,9 @@ def smoothed_motion(
     lowest = _HUM * motion_frequency(columns[:, :n], step)
     tell_hum(time, dict(zip(names, columns.T, strict=True)), lowest)
     found = differentiate(time, columns[:, :n], derivatives, cutoff, progress)
-    return Motion(time, found.q, found.v, found.a, columns[:, n:], _passed(found))
+    v, a = np.where(_moves(found), (found.v, found.a), 0.0)
+    _tell_still(machine, found, v)
+    return Motion(time, found.q, v, a, columns[:, n:], _passed(found))
 
 
 def _columns(machine: Machine, recording: Recording) -> list[int]:
@@ -106,7 +109,23 @@ def _passed(found: Derivatives) -> float:
     """Least of the frequencies [Hz] of which half is left, of the joints that move."""
     if found.passed is None:
         return math.inf
+    return float(found.passed[_moves(found)].min(initial=math.inf))
+
+
+def _moves(found: Derivatives) -> np.ndarray:
+    """Which joints (n,) move by more than what is uncertain of their velocities."""
     if found.std_v is None:
-        return float(found.passed.min())
-    moves = found.v.std(axis=0) > _MOVES * np.sqrt(np.mean(found.std_v**2, axis=0))
-    return float(found.passed[moves].min(initial=math.inf))
+        return np.ones(found.v.shape[1], dtype=bool)
+    uncertain = np.sqrt(np.mean(found.std_v**2, axis=0))
+    return np.asarray(found.v.std(axis=0) > _MOVES * uncertain)
+
+
+def _tell_still(machine: Machine, found: Derivatives, v: Array) -> None:
+    """Warn of joints that tremble, but do not move: friction at rest makes any force."""
+    for i in np.flatnonzero(~v.any(axis=0) & found.v.any(axis=0)).tolist():
+        joint, place = machine.active[i], float(found.q[:, i].mean())
+        text = (
+            f"'{joint}' stands still but for noise: its forces tell nothing, move it, or lock it "
+            f"({joint}={place:.4g})"
+        )
+        warnings.warn(text, CraneWarning, stacklevel=3)

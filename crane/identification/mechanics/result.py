@@ -222,7 +222,8 @@ class Identification:
                 unit = "N" if self.machine.unit(joint) == "m" else "N m"
                 relative = f"{100 * fit.relative[i]:.2f} %"
                 squared = f"{fit.percentage_error[i]:.3f} %"
-                rows.append([joint, f"{fit.rmse[i]:.4g}", unit, relative, squared])
+                told = [joint, f"{fit.rmse[i]:.4g}", unit, relative, squared]
+                rows.append(told if fit.moving[:, i].any() else [joint, "-", "", "-", "-"])
             mean = f"{100 * np.nanmean(fit.relative):.2f} %"
             rows.append(["mean of the joints", "", "", mean, ""])
             rows.append(["all, stacked", "", "", f"{100 * fit.stacked:.2f} %", ""])

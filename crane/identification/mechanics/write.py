@@ -93,6 +93,8 @@ def write_identified(result: Identification, folder: str | Path) -> Path:
                 f"{place}: is what '{machine.name}' was read from, choose another folder"
             )
     how = f"identified by {result.method}{', feasible' if result.feasible else ''}"
+    if vague := result.marks.count("not determined"):
+        how += f", {vague} of {len(result.marks)} base parameters not determined"
     written = laws(result.model, parameters, result.speeds)
     content, more = _content(result, spec, names, how, written)
     with staging(folder) as part:

@@ -54,6 +54,8 @@ def spectrum_figure(fits: list[tuple[str, ForceComparison, str]], i: int, unit: 
     grid = {"left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
     axes = figure.subplots(gridspec_kw=grid)
     for name, fit, color in fits:
+        if not fit.moving[:, i].any():  # its joint stood still
+            continue
         kept = np.where(fit.moving[:, i], fit.residuals[:, i], 0.0)
         rate = 1 / float(np.median(np.diff(fit.time)))
         frequency, power = welch(kept, rate, nperseg=-(-len(kept) // _SEGMENTS))
