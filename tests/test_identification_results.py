@@ -6,6 +6,7 @@ import re
 import sys
 import warnings
 from functools import partial
+from pathlib import Path
 
 import motions
 import numpy as np
@@ -17,6 +18,7 @@ from scipy.interpolate import CubicSpline
 
 import crane
 from crane import cli
+from crane.cli.runs import read_run
 from crane.common.errors import InputError, OutputError, RecordingError
 from crane.identification.mechanics.division import divided
 from crane.identification.mechanics.friction import friction
@@ -29,6 +31,9 @@ from crane.identification.mechanics.write import write_identified, write_paramet
 from crane.identification.signals.motion import Motion
 from crane.view.page.identification import write_report
 
+HERE = Path(__file__).parents[1]
+RAW = HERE / ".." / "shared" / "data" / "patu655" / "lifting_first_half.csv"
+COLUMNS = HERE / "scripts" / "columns" / "patu655.txt"
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 motion = partial(motions.motion, duration=20.0, noise=1.0)
 
@@ -359,6 +364,38 @@ def test_motion_one_way_does_not_tell_friction_from_weight(mini):
         low, high = right.interval()[0]
         assert low < 0.2 < high and high - low < 0.05
     assert right.friction == {}
+
+
+def test_one_speed_each_way_tells_friction_and_a_load_as_a_point(mini):
+    """X1 up and down at one speed, at friction three times the described; nothing else moves."""
+    point = crane.Payload("link7_tip", 0.2)
+    rough = rougher(mini, 3.0).with_payload(point)
+    step, speed, turn = 4e-3, 2e-3, 50
+    ramp = np.sin(np.linspace(0, np.pi / 2, turn)) ** 2
+    up = np.concatenate([ramp, np.ones(1000), ramp[::-1]])
+    v = np.zeros((2 * len(up), 3))
+    v[:, 1] = speed * np.concatenate([up, -up])
+    q = np.array([0.0, 0.008, 0.01]) + step * np.cumsum(v, axis=0)
+    a = np.gradient(v, step, axis=0)
+    tau = crane.Dynamics(rough).inverse(q, v, a, friction=True)
+    tau += NOISE * np.random.default_rng(0).normal(size=tau.shape)
+    estimate = identify_payload(mini, Motion(step * np.arange(len(v)), q, v, a, tau))
+    low, high = estimate.interval()[0]
+    assert np.isnan(estimate.com).all() and low < 0.2 < high and high - low < 0.05
+    wanted = 2 * mini.friction["X1"].coulomb
+    assert estimate.friction["X1"] == pytest.approx(wanted, rel=0.1)
+    assert "load on link7_tip, taken as a point there" in estimate.to_text()
+
+
+@pytest.mark.skipif(not RAW.is_file(), reason="the recording, ../shared/data, is not there")
+def test_a_lift_that_was_recorded_is_weighed():
+    """211.4 kg are said to hang there; it goes one way, nothing tells the centre."""
+    machine = crane.load("patu655", lock={"slew": 0.0, "X_ext": 0.0})
+    estimate = identify_payload(machine, read_run(RAW, machine, COLUMNS))
+    low, high = estimate.interval()[0]
+    mass, band = estimate.static
+    assert low < 211.4 < high and low < mass < high and high - low < 250
+    assert np.isnan(estimate.com).all() and estimate.friction == {}
 
 
 def test_a_machine_that_is_not_as_described_widens_the_interval(mini):

@@ -48,7 +48,7 @@ _TIMES = 3.0  # times the frequency below which 99 % of the velocities are, the 
 _POWER = 0.99
 _FAST = 40.0  # times the frequency below which 99 % of the accelerations are
 _PRIORS = 1e-7, 1e6  # above and up to which a relative standard deviation lies
-_SAMPLES = 2000  # at which the speeds of joints are looked at
+_SAMPLES = 500  # at which the speeds of joints are looked at
 _PART = 0.3  # of what is left to do that one pass over a recording is taken for
 
 

@@ -1,27 +1,29 @@
 """Mass and centre of mass of a load from a recording of a machine that is known."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NoReturn
 
 import numpy as np
 
 from crane.common.errors import InputError, RecordingError, known
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
 from crane.dynamics import Dynamics
+from crane.identification.estimation.estimators import Estimate
 from crane.identification.estimation.regressor import triangular
 from crane.identification.mechanics.against import check_forces
 from crane.identification.mechanics.base import Base
+from crane.identification.mechanics.delays import motion_frequency
 from crane.identification.mechanics.equations import Equations, Progress
-from crane.identification.mechanics.feasible import body_parameters, pseudo_inertia
 from crane.identification.mechanics.friction import friction
 from crane.identification.mechanics.identify import METHODS, equations_of, in_parts
-from crane.identification.mechanics.inertias import PER_BODY, inertial_columns
+from crane.identification.mechanics.load import Load, PayloadEstimate
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.reading import smoothed_motion
-from crane.identification.mechanics.result import ForceComparison, aligned
+from crane.identification.mechanics.result import ForceComparison
 from crane.identification.mechanics.term import Samples
-from crane.identification.signals.motion import Motion, moving
+from crane.identification.signals.motion import Motion, low_pass, moving
 from crane.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -32,121 +34,9 @@ _VAGUE = 0.1  # of the machine's moving mass, that half of an interval may be at
 _REST = 0.05  # of a joint's largest velocity, below which it rests
 _RESTS = 0.25  # s of rest, that tell a mass
 _LEAST_BAND = 0.01  # of a drive's force, that its friction and its sensor may hide at rest
-
-
-class Load:
-    """A rigid body on a frame: its ten parameters about the frame's origin.
-
-    Args:
-        machine: The machine.
-        frame: A link of it, which moves.
-        inertia: Whether with the six of its inertia, or with mass and first moments only.
-    """
-
-    def __init__(self, machine: Machine, frame: str, inertia: bool = True):
-        place = machine.model.frames[machine.frame(frame)]
-        if place.parentJoint == 0:
-            raise InputError(f"frame '{frame}' does not move, choose another")
-        first = 10 * (place.parentJoint - 1)
-        count = 10 if inertia else 4
-        A = place.placement.homogeneous  # P about the joint is A P A^T
-        self._turn = body_parameters(A @ pseudo_inertia(np.eye(10)) @ A.T)[:count].T
-        self._columns = slice(first, first + 10)
-        self._dynamics = Dynamics(machine)
-        self.names = tuple(f"load.{key}" for key in PER_BODY[:count])
-        self.nominal, self.signs = np.zeros(count), (False,) * count
-
-    def columns(self, at: Samples) -> Array:
-        """See `model.Term`."""
-        return inertial_columns(self._dynamics, at)[:, :, self._columns] @ self._turn
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class PayloadEstimate(Brief):
-    """A load on a frame.
-
-    Attributes:
-        frame: A link of the machine.
-        mass: [kg].
-        com: (3,) centre of mass in the frame [m]; nan along axes that the motion does not tell.
-        covariance: (4, 4) of mass and com, to first order; nan as `com`. The larger of what the
-            noise makes and of what leaving out a tenth of the recording changes (jackknife).
-        freedom: (4,) degrees of freedom behind each.
-        directions: (k, 3) orthonormal directions of the frame along which the motion tells where
-            the centre of mass is.
-        friction: By drive, Coulomb friction that the machine's own lacks [N], [N m], of those
-            that moved both ways.
-        static: Mass that the forces at rest tell with that centre of mass, and by how much
-            friction may be in it [kg]; None where nothing rests, or the centre is not told.
-        fit: What of the forces is not the machine's, and what the load explains.
-    """
-
-    frame: str
-    mass: float
-    com: Array
-    covariance: Array
-    freedom: Array
-    directions: Array
-    friction: dict[str, float]
-    static: tuple[float, float] | None
-    fit: ForceComparison
-
-    @property
-    def std_mass(self) -> float:
-        """Standard deviation of the mass [kg]."""
-        return float(np.sqrt(self.covariance[0, 0]))
-
-    @property
-    def std_com(self) -> Array:
-        """(3,) standard deviations of the centre of mass [m]."""
-        return np.sqrt(np.diag(self.covariance)[1:])
-
-    def interval(self, level: float = 0.95) -> Array:
-        """(4, 2) ends of what covers mass and centre of mass with this probability each."""
-        from scipy.stats import t
-
-        half = t.ppf(0.5 + 0.5 * level, self.freedom) * np.sqrt(np.diag(self.covariance))
-        values = np.append(self.mass, self.com)
-        return np.column_stack([values - half, values + half])
-
-    @property
-    def doubt(self) -> str:
-        """Why the mass should not be believed, "" where nothing is against it."""
-        low, high = self.interval()[0].tolist()
-        if self.static is None:
-            return ""
-        mass, band = self.static
-        if low - band <= mass <= high + band:
-            return ""
-        return (
-            f"the forces at rest say {mass:.4g} +- {band:.2g} kg (friction): the machine is not "
-            "as described, identify it without the load first"
-        )
-
-    def to_text(self) -> str:
-        """A table of mass and centre of mass."""
-        rows = [["", "value", "std", "95 % interval", ""]]
-        values, names = np.append(self.mass, self.com), ("mass", "com x", "com y", "com z")
-        units = ("kg", "m", "m", "m")
-        std = np.sqrt(np.diag(self.covariance))
-        table = zip(names, units, values, std, self.interval(), strict=True)
-        for name, unit, value, deviation, (low, high) in table:
-            if np.isnan(value):
-                rows.append([name, "-", "", "not told by this motion", ""])
-                continue
-            told = f"{low:.5g} to {high:.5g} {unit}"
-            rows.append([name, f"{value:.5g}", f"{deviation:.2g}", told, ""])
-        lines = [f"load on {self.frame}", *aligned(rows, (0, 3))]
-        if self.interval()[0, 0] <= 0:
-            lines.append("the mass may be zero: do not trust its centre")
-        if self.static is not None:
-            lines.append("mass by the forces at rest: {:.5g} +- {:.2g} kg".format(*self.static))
-        if self.doubt:
-            lines.append(f"do not trust this: {self.doubt}")
-        lines.append(
-            f"forces left unexplained: {100 * self.fit.stacked:.3g} % of the load's share"
-        )
-        return "\n".join(lines) + "\n"
+_GRAVITY = 9.81  # [m/s^2]
+_WEIGHT = 10.0  # times the motion's frequency, below which weights are compared
+_FEWEST = 5.0  # periods of that in a recording
 
 
 def identify_payload(
@@ -166,6 +56,12 @@ def identify_payload(
     load, temperature and wear, and looks like weight where a drive moves one way only. Else the
     machine counts as known; what it is not as described shows as parts of the recording that tell
     different loads, which widens the intervals (delete-one jackknife over ten parts).
+
+    Where that does not tell the mass, the load counts as a point at the frame's origin: one number
+    beside friction, by its weight, all low-passed at ten times the motion's frequency.
+    Friction of a drive that moved one way only is known there to what the machine describes, or a
+    hundredth of the drive's force if that is more. What the forces at rest say otherwise widens
+    the interval.
 
     Args:
         machine: Without the load, identified.
@@ -191,70 +87,203 @@ def identify_payload(
     motion, progress = recording, in_parts(progress)
     if not isinstance(motion, Motion):
         motion = smoothed_motion(machine, motion, trust=trust, progress=progress)
-    load = Load(machine, frame, inertia)
     moves = np.ptp(motion.v, axis=0) > 0
     names = [joint for joint, moved in zip(machine.active, moves, strict=True) if moved]
-    dynamics = Dynamics(machine)
+    v = _slowed(motion).v.T
+    one_way = [joint for joint, v in zip(names, v[moves], strict=True) if _one_way(v)]
+    case = _Case(machine, frame, motion, method, names, one_way)
+    first, why = None, ""
+    try:
+        first = case.body(10 if inertia else 4, trust, progress)
+        if not case.vague(first):
+            low, high = first.interval()[0].tolist()
+            told = not low <= 0 <= high
+            com = np.nan_to_num(first.com)
+            return replace(first, static=case.static(first.friction, com) if told else None)
+    except _NotToldError as error:
+        why = str(error)
+    point = case.point(progress)
+    if point is None or case.vague(point):
+        _refuse(one_way, first or point, why, case.static({}, np.zeros(3)))
+    return point
 
-    def own(at: Samples) -> Array:
-        """Forces (N, n) of the machine without the load."""
-        return dynamics.at("inverse with friction", at.q, at.v_a, at.a_a)
 
-    bare = machine.replace(friction={}, forces=(), gas_springs=(), ropes=(), end_stops=())
-    extra = [friction(bare, joint, ("coulomb",), smoothing=0.0) for joint in names]
-    model = Model(bare, [load, *extra], own)
-    # weight tells a load: what smoothing takes from the accelerations bounds no bandwidth
-    rows, base = equations_of(model, [replace(motion, passed=math.inf)], progress=progress)
-    (thinned,) = rows.thinned()
-    q, v, a, tau = (x[:, moves] for x in (thinned.q, thinned.v, thinned.a, thinned.tau))
-    moved = Motion(thinned.time, q, v, a, tau)
-    check_forces(moved, rows.offset[:, moves], names, trust=trust)
-    columns = rows.selection(base)
-    found = METHODS[method](rows.columns(columns), rows.y, rows.groups, rows.samples)
-    told, directions = _told(base)
-    if not told[:, 0].any():
-        raise RecordingError("this motion does not tell the mass, move all joints")
-    mass, *first = (told.T @ found.values).tolist()
-    com = np.where(told[:, 1:].any(axis=0), np.array(first) / mass, np.nan)
-    change = np.eye(4)  # derivatives of mass and com by mass and first moments
-    change[1:] /= mass
-    change[1:, 0] = -np.nan_to_num(com) / mass
-    change = change @ told.T
+class _NotToldError(RecordingError):
+    """A motion does not tell the mass."""
+
+
+@dataclass(frozen=True)
+class _Case:
+    """A recording of a machine with a load.
+
+    Attributes:
+        machine: Without the load.
+        frame: That carries it.
+        motion: Recorded.
+        method: Of the estimate.
+        names: Drives that moved.
+        one_way: Those that hardly moved back.
+    """
+
+    machine: Machine
+    frame: str
+    motion: Motion
+    method: str
+    names: Sequence[str]
+    one_way: Sequence[str]
+
+    def model(self, count: int) -> Model:
+        """The load of so many parameters, and what Coulomb friction is beyond the described."""
+        machine, dynamics = self.machine, Dynamics(self.machine)
+
+        def own(at: Samples) -> Array:
+            """Forces (N, n) of the machine without the load."""
+            return dynamics.at("inverse with friction", at.q, at.v_a, at.a_a)
+
+        bare = machine.replace(friction={}, forces=(), gas_springs=(), ropes=(), end_stops=())
+        extra = [friction(bare, joint, ("coulomb",), smoothing=0.0) for joint in self.names]
+        return Model(bare, [Load(machine, self.frame, count), *extra], own)
+
+    def body(self, count: int, trust: bool, progress: Progress | None) -> PayloadEstimate:
+        """A load of 10 or 4 parameters.
+
+        Raises:
+            _NotToldError: The motion does not tell its mass.
+        """
+        model = self.model(count)
+        # weight tells a load: what smoothing takes from the accelerations bounds no bandwidth
+        motion = replace(self.motion, passed=math.inf)
+        rows, base = equations_of(model, [motion], progress=progress)
+        (thinned,) = rows.thinned()
+        moves = [self.machine.active.index(joint) for joint in self.names]
+        q, v, a, tau = (x[:, moves] for x in (thinned.q, thinned.v, thinned.a, thinned.tau))
+        moved = Motion(thinned.time, q, v, a, tau)
+        check_forces(moved, rows.offset[:, moves], self.names, trust=trust)
+        columns = rows.selection(base)
+        found = METHODS[self.method](rows.columns(columns), rows.y, rows.groups, rows.samples)
+        told, directions = _told(base)
+        if not told[:, 0].any():
+            raise _NotToldError("this motion does not tell the mass, move all joints")
+        mass, *first = (told.T @ found.values).tolist()
+        com = np.where(told[:, 1:].any(axis=0), np.array(first) / mass, np.nan)
+        change = np.eye(4)  # derivatives of mass and com by mass and first moments
+        change[1:] /= mass
+        change[1:, 0] = -np.nan_to_num(com) / mass
+        change = change @ told.T
+        covariance, freedom = _widened(rows, columns, found, change)
+        unknown = np.append(False, np.isnan(com))
+        covariance[unknown] = covariance[:, unknown] = np.nan
+        names = [base.names[i] for i in base.independent]
+        corrections = {
+            joint: float(found.values[names.index(f"{joint}.coulomb")])
+            for joint in self.names
+            if f"{joint}.coulomb" in names and joint not in self.one_way
+        }
+        fit = self._fit(rows, columns @ found.values)
+        return PayloadEstimate(
+            self.frame, mass, com, covariance, freedom, directions, corrections, None, fit
+        )
+
+    def point(self, progress: Progress | None) -> PayloadEstimate | None:
+        """A mass at the frame's origin; None where its weight loads no drive that moved."""
+        motion, model = _slowed(self.motion), self.model(1)
+        if not self._weighs(motion):
+            return None
+        try:
+            rows, base = equations_of(model, [motion], _weights(motion), progress=progress)
+        except RecordingError:  # no row is far enough from standstill
+            return None
+        columns = rows.selection(base) @ base.grouping
+        std = [math.inf]
+        for joint in self.names:
+            i = self.machine.active.index(joint)
+            least = _LEAST_BAND * float(np.sqrt(np.mean(motion.tau[:, i] ** 2)))
+            band = max(_sticking(self.machine, joint), least)
+            std.append(band if joint in self.one_way else math.inf)
+        prior = np.zeros(len(std)), np.array(std)
+        found = METHODS[self.method](
+            rows.columns(columns), rows.y, rows.groups, rows.samples, prior
+        )
+        change = np.zeros((4, len(std)))
+        change[0, 0] = 1.0
+        covariance, freedom = _widened(rows, columns, found, change, np.diag(1 / prior[1]))
+        covariance[1:] = covariance[:, 1:] = np.nan
+        nowhere = np.full(3, np.nan)
+        corrections = {
+            joint: float(value)
+            for joint, value in zip(self.names, found.values[1:], strict=True)
+            if joint not in self.one_way
+        }
+        estimate = PayloadEstimate(
+            self.frame, float(found.values[0]), nowhere, covariance, freedom, np.zeros((0, 3)),
+            corrections, self.static(corrections, np.zeros(3)),
+            self._fit(rows, columns @ found.values),
+        )  # fmt: skip
+        if estimate.static is not None:  # two answers are as uncertain as they are apart
+            covariance[0, 0] += (estimate.static[0] - estimate.mass) ** 2
+        return estimate
+
+    def _weighs(self, motion: Motion) -> bool:
+        """Whether the weight of a point loads a drive that moves."""
+        load, q = Load(self.machine, self.frame, 1), motion.q[:: max(1, len(motion.q) // 100)]
+        at = Model(self.machine, [load]).samples(q, 0 * q, 0 * q)
+        moves = [self.machine.active.index(joint) for joint in self.names]
+        weight = np.abs(load.columns(at)[:, moves, 0])
+        return bool(weight.max(initial=0.0) > _TOLD * _GRAVITY * self.machine.closure.size)
+
+    def _fit(self, rows: Equations, values: Array) -> ForceComparison:
+        left = rows.forces - rows.offset
+        joints = self.machine.active
+        return ForceComparison(rows.time, left, rows.modelled(values), rows.moving, joints)
+
+    def vague(self, estimate: PayloadEstimate) -> bool:
+        """Whether an interval is wider than the mass, and than a share of the machine's own."""
+        low, high = estimate.interval()[0].tolist()
+        own = sum(inertia.mass for inertia in list(self.machine.model.inertias)[1:])
+        return not high - low <= 2 * max(abs(estimate.mass), _VAGUE * own)
+
+    def static(self, friction: dict[str, float], com: Array) -> tuple[float, float] | None:
+        """See `_static`."""
+        load = Load(self.machine, self.frame, 4)
+        return _static(self.machine, load, self.motion, friction, com)
+
+
+def _slowed(motion: Motion) -> Motion:
+    """A motion without what trembles beyond `_weights`."""
+    cutoff, step = _weights(motion), float(motion.time[1] - motion.time[0])
+    if 4 * cutoff >= 1 / step:
+        return motion
+    v, a = (low_pass(motion.time, x, cutoff) for x in (motion.v, motion.a))
+    return replace(motion, v=v, a=a)
+
+
+def _weights(motion: Motion) -> float:
+    """Low-pass [Hz] below which forces are weights and friction."""
+    step, duration = float(motion.time[1] - motion.time[0]), float(np.ptp(motion.time))
+    wanted = max(_WEIGHT * motion_frequency(motion.q, step), _FEWEST / duration)
+    return min(wanted, 0.24 / step)
+
+
+def _widened(
+    rows: Equations, columns: Array, found: Estimate, change: Array, pull: Array | None = None
+) -> tuple[Array, Array]:
+    """Covariance (4, 4) by noise, or by what leaving parts out changes, and its freedom (4,)."""
     covariance = change @ found.covariance @ change.T
-    parts = np.diag(change @ _left_out(rows, columns, found.noise) @ change.T)
+    parts = np.diag(change @ _left_out(rows, columns, found.noise, pull) @ change.T)
     more = parts / np.maximum(np.diag(covariance), np.finfo(float).tiny)
     scale = np.sqrt(np.maximum(more, 1.0))
-    covariance *= np.outer(scale, scale)
-    unknown = np.append(False, np.isnan(com))
-    covariance[unknown] = covariance[:, unknown] = np.nan
     freedom = np.where(more > 1, _SEGMENTS - 1, found.freedom)
-    there = {base.names[i]: float(x) for i, x in zip(base.independent, found.values, strict=True)}
-    one_way = [joint for joint, v in zip(names, motion.v.T[moves], strict=True) if _one_way(v)]
-    corrections = {
-        joint: there[f"{joint}.coulomb"]
-        for joint in names
-        if f"{joint}.coulomb" in there and joint not in one_way
-    }
-    estimate = PayloadEstimate(
-        frame, mass, com, covariance, freedom, directions, corrections, None,
-        ForceComparison(
-            rows.time, rows.forces - rows.offset, rows.modelled(columns @ found.values),
-            rows.moving, machine.active,
-        ),
-    )  # fmt: skip
-    low, high = estimate.interval()[0].tolist()
-    own_mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
-    if not high - low <= 2 * max(abs(mass), _VAGUE * own_mass):
-        _refuse(one_way, estimate, _static(machine, load, motion, corrections, np.zeros(3)))
-    if low <= 0 <= high:
-        return estimate
-    static = _static(machine, load, motion, corrections, np.nan_to_num(com))
-    return replace(estimate, static=static)
+    return covariance * np.outer(scale, scale), freedom
 
 
 def _refuse(
-    one_way: list[str], estimate: PayloadEstimate, static: tuple[float, float] | None
+    one_way: Sequence[str],
+    estimate: PayloadEstimate | None,
+    why: str,
+    static: tuple[float, float] | None,
 ) -> NoReturn:
+    if estimate is None:
+        raise RecordingError(why)
     low, high = estimate.interval()[0].tolist()
     text = f"this recording does not tell the mass ({low:.3g} to {high:.3g} kg): "
     if one_way:
@@ -278,7 +307,8 @@ def _static(
     Each drive counts by its friction, described and found, as by a standard deviation.
     """
     step = float(motion.time[1] - motion.time[0])
-    still = ~moving(motion.v, _REST * np.abs(motion.v).max(axis=0)).any(axis=1)
+    v = _slowed(motion).v
+    still = ~moving(v, _REST * np.abs(v).max(axis=0)).any(axis=1)
     edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=0, append=0))
     runs = [(i, j) for i, j in edges.reshape(-1, 2).tolist() if (j - i) * step >= _RESTS]
     if not runs:
@@ -307,15 +337,20 @@ def _sticking(machine: Machine, joint: str) -> float:
     return 0.0 if law is None else law.coulomb + law.stiction + abs(law.coulomb_offset)
 
 
-def _left_out(rows: Equations, columns: Array, noise: Array) -> Array:
-    """Covariance (s, s) of parameters by what leaving out each part of the recording changes."""
+def _left_out(rows: Equations, columns: Array, noise: Array, pull: Array | None) -> Array:
+    """Covariance (s, s) of parameters by what leaving out each part of the recording changes.
+
+    Rows of a prior about zero (k, s) belong to all parts.
+    """
     size = columns.shape[1]
+    known = np.zeros((0, size)) if pull is None else pull
+    known = np.column_stack([known, np.zeros(len(known))])
     T = np.zeros((len(columns) + 1, size + 1))
     T[:-1, :-1], T[-1, -1] = columns, 1.0
     parts = rows.segments(_SEGMENTS) @ T / noise[:, None, None]
     found = []
     for i in range(_SEGMENTS):
-        R = triangular(np.delete(parts, i, axis=0).reshape(-1, size + 1))
+        R = triangular(np.vstack([np.delete(parts, i, axis=0).reshape(-1, size + 1), known]))
         found.append(np.linalg.lstsq(R[:-1, :-1], R[:-1, -1])[0])
     spread = np.array(found) - np.mean(found, axis=0)
     return np.asarray((_SEGMENTS - 1) / _SEGMENTS * spread.T @ spread)
