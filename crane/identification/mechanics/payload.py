@@ -14,7 +14,6 @@ from crane.identification.estimation.estimators import Estimate
 from crane.identification.estimation.regressor import triangular
 from crane.identification.mechanics.against import check_forces
 from crane.identification.mechanics.base import Base
-from crane.identification.mechanics.delays import motion_frequency
 from crane.identification.mechanics.equations import Equations, Progress
 from crane.identification.mechanics.friction import friction
 from crane.identification.mechanics.identify import METHODS, equations_of, in_parts
@@ -22,8 +21,15 @@ from crane.identification.mechanics.load import Load, PayloadEstimate
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.reading import smoothed_motion
 from crane.identification.mechanics.result import ForceComparison
+from crane.identification.mechanics.statics import (
+    LEAST_BAND,
+    slowed,
+    static_mass,
+    sticking,
+    weights_cutoff,
+)
 from crane.identification.mechanics.term import Samples
-from crane.identification.signals.motion import Motion, low_pass, moving
+from crane.identification.signals.motion import Motion
 from crane.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -31,12 +37,7 @@ _TOLD = 1e-6  # what of a direction may be missing from those that forces tell
 _SEGMENTS = 10  # of a recording, that are left out one by one
 _ONE_WAY = 0.1  # of a drive's way, that it goes back at least
 _VAGUE = 0.1  # of the machine's moving mass, that half of an interval may be at most
-_REST = 0.05  # of a joint's largest velocity, below which it rests
-_RESTS = 0.25  # s of rest, that tell a mass
-_LEAST_BAND = 0.01  # of a drive's force, that its friction and its sensor may hide at rest
 _GRAVITY = 9.81  # [m/s^2]
-_WEIGHT = 10.0  # times the motion's frequency, below which weights are compared
-_FEWEST = 5.0  # periods of that in a recording
 
 
 def identify_payload(
@@ -89,7 +90,7 @@ def identify_payload(
         motion = smoothed_motion(machine, motion, trust=trust, progress=progress)
     moves = np.ptp(motion.v, axis=0) > 0
     names = [joint for joint, moved in zip(machine.active, moves, strict=True) if moved]
-    v = _slowed(motion).v.T
+    v = slowed(motion).v.T
     one_way = [joint for joint, v in zip(names, v[moves], strict=True) if _one_way(v)]
     case = _Case(machine, frame, motion, method, names, one_way)
     first, why = None, ""
@@ -186,19 +187,19 @@ class _Case:
 
     def point(self, progress: Progress | None) -> PayloadEstimate | None:
         """A mass at the frame's origin; None where its weight loads no drive that moved."""
-        motion, model = _slowed(self.motion), self.model(1)
+        motion, model = slowed(self.motion), self.model(1)
         if not self._weighs(motion):
             return None
         try:
-            rows, base = equations_of(model, [motion], _weights(motion), progress=progress)
+            rows, base = equations_of(model, [motion], weights_cutoff(motion), progress=progress)
         except RecordingError:  # no row is far enough from standstill
             return None
         columns = rows.selection(base) @ base.grouping
         std = [math.inf]
         for joint in self.names:
             i = self.machine.active.index(joint)
-            least = _LEAST_BAND * float(np.sqrt(np.mean(motion.tau[:, i] ** 2)))
-            band = max(_sticking(self.machine, joint), least)
+            least = LEAST_BAND * float(np.sqrt(np.mean(motion.tau[:, i] ** 2)))
+            band = max(sticking(self.machine, joint), least)
             std.append(band if joint in self.one_way else math.inf)
         prior = np.zeros(len(std)), np.array(std)
         found = METHODS[self.method](
@@ -243,25 +244,9 @@ class _Case:
         return not high - low <= 2 * max(abs(estimate.mass), _VAGUE * own)
 
     def static(self, friction: dict[str, float], com: Array) -> tuple[float, float] | None:
-        """See `_static`."""
+        """See `static_mass`."""
         load = Load(self.machine, self.frame, 4)
-        return _static(self.machine, load, self.motion, friction, com)
-
-
-def _slowed(motion: Motion) -> Motion:
-    """A motion without what trembles beyond `_weights`."""
-    cutoff, step = _weights(motion), float(motion.time[1] - motion.time[0])
-    if 4 * cutoff >= 1 / step:
-        return motion
-    v, a = (low_pass(motion.time, x, cutoff) for x in (motion.v, motion.a))
-    return replace(motion, v=v, a=a)
-
-
-def _weights(motion: Motion) -> float:
-    """Low-pass [Hz] below which forces are weights and friction."""
-    step, duration = float(motion.time[1] - motion.time[0]), float(np.ptp(motion.time))
-    wanted = max(_WEIGHT * motion_frequency(motion.q, step), _FEWEST / duration)
-    return min(wanted, 0.24 / step)
+        return static_mass(self.machine, load, self.motion, friction, com)
 
 
 def _widened(
@@ -297,44 +282,6 @@ def _refuse(
             f"{static[1]:.2g} kg, by the described friction"
         )
     raise RecordingError(text)
-
-
-def _static(
-    machine: Machine, load: Load, motion: Motion, friction: dict[str, float], com: Array
-) -> tuple[float, float] | None:
-    """Mass by the forces at rest, and how much friction may hold of it; None if nothing rests.
-
-    Each drive counts by its friction, described and found, as by a standard deviation.
-    """
-    step = float(motion.time[1] - motion.time[0])
-    v = _slowed(motion).v
-    still = ~moving(v, _REST * np.abs(v).max(axis=0)).any(axis=1)
-    edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=0, append=0))
-    runs = [(i, j) for i, j in edges.reshape(-1, 2).tolist() if (j - i) * step >= _RESTS]
-    if not runs:
-        return None
-    q = np.array([motion.q[i:j].mean(axis=0) for i, j in runs])
-    tau = np.array([motion.tau[i:j].mean(axis=0) for i, j in runs])
-    zero = np.zeros_like(q)
-    tau = tau - Dynamics(machine).inverse(q, zero, zero)
-    at = Model(machine, [load]).samples(q, zero, zero)
-    each = load.columns(at)[:, :, :4] @ np.append(1.0, com)
-    band = np.array([_sticking(machine, joint) for joint in machine.active])
-    band += [abs(friction.get(joint, 0.0)) for joint in machine.active]
-    band = np.maximum(band, _LEAST_BAND * np.sqrt(np.mean(motion.tau**2, axis=0)))
-    information = ((each / band) ** 2).sum()
-    if not information > 0:
-        return None
-    mass = float((each * tau / band**2).sum() / information)
-    # where drives disagree by more than their friction, what they say is worth less
-    misfit = float((((tau - each * mass) / band) ** 2).sum()) / max(each.size - 1, 1)
-    return mass, float(np.sqrt(max(misfit, 1.0) * len(runs) / information))
-
-
-def _sticking(machine: Machine, joint: str) -> float:
-    """Largest friction of a joint at rest [N], [N m]."""
-    law = machine.friction.get(joint)
-    return 0.0 if law is None else law.coulomb + law.stiction + abs(law.coulomb_offset)
 
 
 def _left_out(rows: Equations, columns: Array, noise: Array, pull: Array | None) -> Array:

@@ -1,0 +1,73 @@
+"""Weights in a recording: what is left of its forces where nothing trembles, and at rest."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from crane.common.samples import Array
+from crane.dynamics import Dynamics
+from crane.identification.mechanics.delays import motion_frequency
+from crane.identification.mechanics.load import Load
+from crane.identification.mechanics.model import Model
+from crane.identification.signals.motion import Motion, low_pass, moving
+from crane.machine import Machine
+
+_REST = 0.05  # of a joint's largest velocity, below which it rests
+_RESTS = 0.25  # s of rest, that tell a mass
+LEAST_BAND = 0.01  # of a drive's force, that its friction and its sensor may hide at rest
+_WEIGHT = 10.0  # times the motion's frequency, below which weights are compared
+_FEWEST = 5.0  # periods of that in a recording
+
+
+def slowed(motion: Motion) -> Motion:
+    """A motion without what trembles beyond `weights_cutoff`."""
+    cutoff, step = weights_cutoff(motion), float(motion.time[1] - motion.time[0])
+    if 4 * cutoff >= 1 / step:
+        return motion
+    v, a = (low_pass(motion.time, x, cutoff) for x in (motion.v, motion.a))
+    return replace(motion, v=v, a=a)
+
+
+def weights_cutoff(motion: Motion) -> float:
+    """Low-pass [Hz] below which forces are weights and friction."""
+    step, duration = float(motion.time[1] - motion.time[0]), float(np.ptp(motion.time))
+    wanted = max(_WEIGHT * motion_frequency(motion.q, step), _FEWEST / duration)
+    return min(wanted, 0.24 / step)
+
+
+def static_mass(
+    machine: Machine, load: Load, motion: Motion, friction: dict[str, float], com: Array
+) -> tuple[float, float] | None:
+    """Mass by the forces at rest, and how much friction may hold of it; None if nothing rests.
+
+    Each drive counts by its friction, described and found, as by a standard deviation.
+    """
+    step = float(motion.time[1] - motion.time[0])
+    v = slowed(motion).v
+    still = ~moving(v, _REST * np.abs(v).max(axis=0)).any(axis=1)
+    edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=0, append=0))
+    runs = [(i, j) for i, j in edges.reshape(-1, 2).tolist() if (j - i) * step >= _RESTS]
+    if not runs:
+        return None
+    q = np.array([motion.q[i:j].mean(axis=0) for i, j in runs])
+    tau = np.array([motion.tau[i:j].mean(axis=0) for i, j in runs])
+    zero = np.zeros_like(q)
+    tau = tau - Dynamics(machine).inverse(q, zero, zero)
+    at = Model(machine, [load]).samples(q, zero, zero)
+    each = load.columns(at)[:, :, :4] @ np.append(1.0, com)
+    band = np.array([sticking(machine, joint) for joint in machine.active])
+    band += [abs(friction.get(joint, 0.0)) for joint in machine.active]
+    band = np.maximum(band, LEAST_BAND * np.sqrt(np.mean(motion.tau**2, axis=0)))
+    information = ((each / band) ** 2).sum()
+    if not information > 0:
+        return None
+    mass = float((each * tau / band**2).sum() / information)
+    # where drives disagree by more than their friction, what they say is worth less
+    misfit = float((((tau - each * mass) / band) ** 2).sum()) / max(each.size - 1, 1)
+    return mass, float(np.sqrt(max(misfit, 1.0) * len(runs) / information))
+
+
+def sticking(machine: Machine, joint: str) -> float:
+    """Largest friction of a joint at rest [N], [N m]."""
+    law = machine.friction.get(joint)
+    return 0.0 if law is None else law.coulomb + law.stiction + abs(law.coulomb_offset)
