@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from crane.identification.hydraulics.cylinder_friction import identify_cylinder_friction
     from crane.identification.hydraulics.orifices import identify_orifices
     from crane.identification.hydraulics.valve import identify_valve
+    from crane.identification.mechanics.cross_validation import cross_validate
     from crane.identification.mechanics.identify import identify
     from crane.identification.mechanics.payload import identify_payload
     from crane.identification.mechanics.result import Identification
@@ -82,6 +83,7 @@ _HOMES = {
     "crane.identification.hydraulics.cylinder_friction": "identify_cylinder_friction",
     "crane.identification.hydraulics.orifices": "identify_orifices",
     "crane.identification.hydraulics.valve": "identify_valve",
+    "crane.identification.mechanics.cross_validation": "cross_validate",
     "crane.identification.mechanics.identify": "identify",
     "crane.identification.mechanics.payload": "identify_payload",
     "crane.identification.mechanics.result": "Identification",
@@ -105,7 +107,7 @@ __all__ = [
     "Law", "LinearModel", "Machine", "PDGains", "PIGains", "Payload", "Recording", "Rope",
     "Sampled", "Signals", "Study",
     "TipVelocity", "Trajectory", "ValveDrive", "ValvePD", "Workspace", "add_cylinder", "add_loops",
-    "calibrate", "check", "excite",
+    "calibrate", "check", "cross_validate", "excite",
     "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
     "identify_valve", "joystick", "linear_models", "linearize", "load",
     "point_to_point", "polynomial", "read_measured", "replay", "report",

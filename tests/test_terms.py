@@ -13,6 +13,11 @@ from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.description import Friction
 from crane.description.estimation import Estimation, Known
 from crane.formats import write_machine
+from crane.identification.mechanics.cross_validation import (
+    FOLDS,
+    cross_validate,
+    trials_text,
+)
 from crane.identification.mechanics.friction import Presliding, RestMemory, friction, root
 from crane.identification.mechanics.identify import identify
 from crane.identification.mechanics.inertias import Inertial, RotorInertia
@@ -242,6 +247,8 @@ def test_friction_without_a_place_is_written_as_the_nearest_law(arm):
         (["--prior", "q8.m=1"], "prior 'q8.m' is unknown, known: "),
         (["--train", "5"], "--train is '5', write FROM:TO in seconds, as 0:13.5"),
         (["--train", "90:99"], "nothing lies between 90 and 99 s, the recording goes from 0 to "),
+        (["--try", "bandwidth=x"], "--try is 'bandwidth=x', write each NAME=VALUES once"),
+        (["--try", "5"], "--try is '5', write each NAME=VALUES once, as bandwidth=2,5,10"),
         (["--columns", "none.txt"], "none.txt: no such file or directory, give a file of columns"),
     ],
 )
@@ -256,9 +263,10 @@ def test_options_that_are_wrong_are_one_line(tmp_path, crank, arguments, message
 def test_a_window_is_trained_on_and_the_rest_judges(tmp_path, crank):
     done = typed(
         "identify", *crank, "--train", "0:5", "--prior", "0.3", "--term", "crank.rotor_inertia",
-        "--out", tmp_path / "out", "--feasible",
+        "--out", tmp_path / "out", "--feasible", "--try", "bandwidth=8,12",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    assert "cross-validation within the training" in done.stdout
     assert "validation, moving rows" in done.stdout and "mean of the joints" in done.stdout
     data = yaml.safe_load((tmp_path / "out" / "machine" / "four_bar.yaml").read_text())
     assert data["rotor_inertia"]["crank"] > 0
@@ -280,3 +288,45 @@ def crank(tmp_path_factory):
     )
     recording.to_csv(folder / "crank.csv")
     return DATA / "four_bar.yaml", folder / "crank.csv"
+
+
+# --- settings by cross-validation --------------------------------------------------------------
+
+
+def test_the_prior_that_predicts_is_chosen(arm):
+    """Bodies are as described: held to that they predict what is left out, free they do not."""
+    rng, motion = np.random.default_rng(3), moved(arm)
+    tau = motion.tau + 0.05 * motion.tau.std(axis=0) * rng.normal(size=motion.tau.shape)
+    given = dataclasses.replace(motion, tau=tau)
+    trials = cross_validate(arm, given, {"bodies": ["1 %", "10000 %"]}, bandwidth=5.0)
+    assert [trial.settings["bodies"] for trial in trials] == ["1 %", "10000 %"]
+    assert trials[0].mean < trials[1].mean and trials[0].errors.shape == (FOLDS,)
+    assert "bodies=1 %" in trials_text(trials).splitlines()[2]
+    with pytest.raises(InputError, match="nothing is tried, give values such as bandwidth=2,5,10"):
+        cross_validate(arm, given, {})
+    few = {name: getattr(given, name)[:200] for name in ("time", "q", "v", "a", "tau")}
+    with pytest.raises(InputError, match="200 samples are too few for 5 parts, give at least 250"):
+        cross_validate(arm, Motion(**few), {"bandwidth": [5.0]})
+
+
+def test_parts_are_predicted_by_the_others_alone(arm):
+    """A part whose forces are twice as large is predicted as badly as they say, others hardly."""
+    motion = moved(arm)
+    tau = motion.tau.copy()
+    tau[640:960] *= 2.0  # the third of five parts
+    given = dataclasses.replace(motion, tau=tau)
+    (trial,) = cross_validate(arm, given, {"bandwidth": [5.0]}, prior={"bodies": "1 %"})
+    assert trial.errors.argmax() == 2 and trial.errors[2] > 0.4
+
+
+def test_two_recordings_teach_as_one(arm):
+    """What neither is long enough for alone; a validation of two is judged as both."""
+    one, two = moved(arm, seed=0), moved(arm, seed=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        both = identify(arm, [one, two], [one, two], prior={"bodies": "10 %"}, bandwidth=5.0)
+        alone = identify(arm, one, [two], prior={"bodies": "10 %"}, bandwidth=5.0)
+    assert len(both.training.time) == 2 * len(alone.training.time)
+    assert (np.diff(both.training.time) > 0).all()
+    np.testing.assert_allclose(both.training.modelled, both.validation.modelled, rtol=1e-12)
+    assert both.validation.stacked < 1e-3

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 _FEWEST = 50  # samples of a part that is held out
 _TERM = "NAME, NAME=NUMBERS or NAME=off, as in q1.presliding=1e-4"
+_TRY = "each NAME=VALUES once, as bandwidth=2,5,10 or bodies=1%,10%"
 _PRIOR = "NAME=STD, as in bodies=10%, q1.viscous=50 or q1.viscous=200+-50, a share, or none"
 
 
@@ -77,6 +78,15 @@ def identify(
             help="Velocity below which its rows are left out, in m/s or rad/s.",
         ),
     ] = None,
+    tried: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--try",
+            metavar="NAME=VALUES",
+            help="Values of which cross-validation in the training chooses one, as bandwidth=5,10 "
+            "or, of a prior, bodies=1%,10%.",
+        ),
+    ] = None,
     lock: Lock = None,
     trust: Trust = False,
     force: Force = False,
@@ -84,12 +94,17 @@ def identify(
     """Find a machine's parameters from recordings, and how well they predict."""
     from crane.cli.runs import check_folder, write_identification
     from crane.common.samples import as_number
+    from crane.identification.mechanics.cross_validation import (
+        cross_validate,
+        settings_of,
+        trials_text,
+    )
     from crane.identification.mechanics.identify import identify as run
     from crane.identification.mechanics.write import check_rewritable
 
     check_folder(out, force)
     span, changes, known = window(train), terms(term), priors(prior)
-    slowest = by_joint("--slow", slow)
+    slowest, grid = by_joint("--slow", slow), values_tried(tried)
     loaded = load(machine, lock)
     if known is None:
         estimation = dataclasses.replace(loaded.estimation, prior={})
@@ -101,11 +116,17 @@ def identify(
     if bandwidth is not None:
         shortest = max(min(float(x.time[-1] - x.time[0]) for x in learned), 1e-3)
         as_number(bandwidth, "the bandwidth", "Hz", above=5 / shortest)
+    options: dict[str, Any] = {
+        "method": method, "prior": known, "feasible": feasible, "terms": changes,
+        "bandwidth": bandwidth, "slow": slowest, "trust": trust,
+    }  # fmt: skip
+    if grid:
+        with progress_bar("cross-validating") as progress:
+            trials = cross_validate(loaded, learned, grid, progress, **options)
+        print(f"{trials_text(trials)}\n")
+        options = settings_of(trials[0], options)
     with progress_bar("identifying") as progress:
-        result = run(
-            loaded, learned, judges or None, method, known, feasible, terms=changes,
-            bandwidth=bandwidth, slow=slowest, trust=trust, progress=progress,
-        )  # fmt: skip
+        result = run(loaded, learned, judges or None, progress=progress, **options)
     with status("writing the report"):
         named = [", ".join(path.name for path in paths or ()) for paths in (recording, validation)]
         if train is not None:
@@ -154,6 +175,29 @@ def priors(words: Sequence[str] | None) -> "dict[str, Known] | None":
         if name in found:
             raise InputError(f"--prior says two things of '{name}', give one")
         found[name] = known if equals else dataclasses.replace(known, relative=True)
+    return found
+
+
+def values_tried(words: Sequence[str] | None) -> "dict[str, list[float | Known]]":
+    """Values by name: bandwidths, or what is known of parameters.
+
+    Raises:
+        InputError: Something else is written, or a name twice.
+    """
+    from crane.description.estimation import Known
+
+    found: dict[str, list[float | Known]] = {}
+    for word in words or ():
+        name, _, text = word.rpartition("=")
+        name = name.strip()
+        try:
+            one = float if name == "bandwidth" else Known.read
+            values = [one(each) for each in text.split(",")]
+        except (ValueError, InputError):
+            name = ""
+        if not name or name in found:
+            raise InputError(f"--try is '{word}', write {_TRY}")
+        found[name] = values
     return found
 
 

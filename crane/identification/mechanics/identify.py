@@ -48,6 +48,7 @@ _TIMES = 3.0  # times the frequency below which 99 % of the velocities are, the 
 _POWER = 0.99
 _FAST = 40.0  # times the frequency below which 99 % of the accelerations are
 _PRIORS = 1e-7, 1e6  # above and up to which a relative standard deviation lies
+_COMPARED = 50  # rows from which on forces are compared with the model's
 _SAMPLES = 500  # at which the speeds of joints are looked at
 _PART = 0.3  # of what is left to do that one pass over a recording is taken for
 
@@ -110,7 +111,7 @@ def identify(
     if feasible and not model.bodies:
         raise InputError("the model has no bodies, so nothing has to be feasible")
     finished, progress = progress, in_parts(progress)
-    motions = _motions(machine, recording, trust, progress)
+    motions = motions_of(machine, recording, trust, progress)
     rows, told = equations_of(model, motions, bandwidth, slow, progress)
     if model.bodies:
         _check_forces(model, motions, rows, trust)
@@ -145,7 +146,7 @@ def identify(
     speeds = _speeds(model, motions, limits)
     del rows, columns, motions
     if validation is not None:
-        others = _motions(machine, validation, trust, progress)
+        others = motions_of(machine, validation, trust, progress)
         judge = Equations(model, base, others, bandwidth, limits, progress)
         judged = judge.compare(selection @ values)
         tell_validation(training, judged)
@@ -153,7 +154,7 @@ def identify(
         finished(1.0)
     found = Identification(
         model, told, values, covariance, parameters, estimate, method, feasible, training,
-        magnitudes(told, sizes), remedy, speeds, judged,
+        magnitudes(told, sizes), remedy, speeds, bandwidth, limits, judged,
     )  # fmt: skip
     if all(mark == "not determined" for mark in found.marks):
         doubt(found.doubt, trust)
@@ -207,12 +208,13 @@ def _prior(
     return stated(model, known, sizes) if known else None
 
 
-def _motions(
+def motions_of(
     machine: Machine,
     recorded: Recorded | Sequence[Recorded],
     trust: bool,
     progress: Progress | None,
 ) -> list[Motion]:
+    """Recordings with velocities and accelerations; motions as they are."""
     several = [recorded] if isinstance(recorded, Recording | Motion) else list(recorded)
     if not several:
         raise InputError("no recording is given, give at least one")
@@ -227,7 +229,8 @@ def _check_forces(model: Model, motions: Sequence[Motion], rows: Equations, trus
     modelled, first = rows.compare(rows.base.values(model.nominal)).modelled, 0
     for motion, thinned in zip(motions, rows.thinned(), strict=True):
         here = modelled[first : first + len(thinned.time)]
-        check_forces(thinned, here, model.machine.active, trust=trust)
+        if len(here) >= _COMPARED:
+            check_forces(thinned, here, model.machine.active, trust=trust)
         tell_delays(model.machine.active, *delays(model, rows.base, motion, rows.slow))
         first += len(here)
 

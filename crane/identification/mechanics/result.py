@@ -88,6 +88,8 @@ class Identification:
         advice: What motion would tell what this one does not.
         speeds: By direction along which there is friction, least and largest speed of the
             training [m/s], [rad/s].
+        bandwidth: [Hz] of the low-pass.
+        slow: (n,) velocities below which rows were left out [m/s], [rad/s].
         validation: On another one, if there was one.
     """
 
@@ -103,6 +105,8 @@ class Identification:
     magnitude: Array
     advice: str
     speeds: Mapping[str, tuple[float, float]]
+    bandwidth: float
+    slow: Array
     validation: ForceComparison | None = None
 
     def __repr__(self) -> str:
