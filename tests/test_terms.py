@@ -227,7 +227,7 @@ def test_friction_without_a_place_is_written_as_the_nearest_law(arm):
     law, off = found["q2"].law, found["q2"].off
     written = law.coulomb + law.viscous * v + law.stiction * np.exp(-((v / law.stribeck) ** 2))
     assert np.abs(written - 3 * np.sqrt(v)).max() == pytest.approx(off, rel=0.02)
-    assert 0 < off < 0.53  # what the best straight line, 0.8 + 2.4 v, is off at 0.01
+    assert 0 < off < 0.6  # that of the best straight line, about 0.8 + 2.4 v, at the lowest speed
 
 
 # --- the command line -------------------------------------------------------------------------
@@ -330,3 +330,15 @@ def test_two_recordings_teach_as_one(arm):
     assert (np.diff(both.training.time) > 0).all()
     np.testing.assert_allclose(both.training.modelled, both.validation.modelled, rtol=1e-12)
     assert both.validation.stacked < 1e-3
+
+
+def test_a_body_without_mass_cannot_be_a_share_of_itself(tmp_path, arm):
+    """One line instead of what numpy says of a body of nothing."""
+    text = (arm.chains[0].urdf).read_text()
+    (tmp_path / "arm.urdf").write_text(text.replace('<mass value="0.2"/>', '<mass value="0"/>'))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CraneWarning)
+        machine = crane.load(tmp_path / "arm.urdf")
+        motion = moved(machine)
+        with pytest.raises(InputError, match="'link6' is described without mass, give it a rough"):
+            identify(machine, motion, feasible=True, trust=True, bandwidth=10.0)

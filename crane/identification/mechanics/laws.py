@@ -16,6 +16,7 @@ Speeds = Mapping[str, tuple[float, float]]
 
 _KINDS = tuple(item.name for item in fields(Friction))
 _POINTS = 100  # speeds at which laws are compared, each way
+_FADED = 0.3  # of the largest speed, where stiction is gone
 _VELOCITIES = 30  # that are tried for where stiction fades
 
 
@@ -87,7 +88,8 @@ def _nearest(
     for term in terms:
         wanted += term.steady(v) @ [values[each] for each in term.names]
     sign, best, least = np.sign(v), Friction(), np.inf
-    for stribeck in np.geomspace(max(low, high / 1e3), high, _VELOCITIES).tolist():
+    first = min(max(low, high / 1e3), _FADED * high)
+    for stribeck in np.geomspace(first, _FADED * high, _VELOCITIES).tolist():
         basis = np.column_stack(
             [sign, np.ones_like(v), v, np.abs(v), sign * np.exp(-((v / stribeck) ** 2))]
         )
@@ -96,5 +98,6 @@ def _nearest(
         if found.cost < least:
             least, off = found.cost, float(np.abs(basis @ found.x - wanted).max())
             coulomb, offset, viscous, viscous_offset, stiction = np.round(found.x, 12).tolist()
-            best = Friction(coulomb, offset, viscous, viscous_offset, 0.0, stiction, stribeck)
+            fades = {"stiction": stiction, "stribeck": stribeck} if stiction else {}
+            best = Friction(coulomb, offset, viscous, viscous_offset, 0.0, **fades)
     return Written(best, off)

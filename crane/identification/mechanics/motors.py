@@ -18,8 +18,8 @@ _URDF = """<?xml version="1.0"?>
   </joint>
   <link name="{name}_rotor">
     <inertial>
-      <mass value="0"/>
-      <inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>
+      <mass value="1e-6"/>
+      <inertia ixx="1e-12" ixy="0" ixz="0" iyy="1e-12" iyz="0" izz="1e-12"/>
     </inertial>
   </link>
 </robot>
@@ -37,9 +37,10 @@ def combinations(model: Model) -> list[Direction]:
 
 
 def motor_chain(direction: Direction, parent: str) -> tuple[dict[str, Any], dict[str, Any], str]:
-    """A massless rotor that a coupling turns: its chain, the coupling, and its URDF.
+    """A rotor that a coupling turns: its chain, the coupling, and its URDF.
 
-    Its joint has the direction's name, and is where rotor inertia and friction are.
+    Its joint has the direction's name, and is where rotor inertia and friction are. Its link has a
+    mass of a milligram, as a body wants one.
     """
     name = direction.name
     assert direction.factors is not None

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.identification.estimation.estimators import Estimate, Prior, judged
 from crane.identification.mechanics.base import Base
@@ -51,8 +52,17 @@ def possible(
 
     Returns:
         All parameters (p,).
+
+    Raises:
+        InputError: A body has no mass.
     """
     count = 10 * len(model.bodies)
+    about = model.nominal if prior is None else prior[0]
+    for link, mass in zip(model.bodies, about[:count:10].tolist(), strict=True):
+        if not mass > 0:
+            raise InputError(
+                f"'{link}' is described without mass, give it a rough one, or leave feasible out"
+            )
     mean, weight = model.nominal.copy(), np.full(len(model.bodies), _PRIOR**-2)
     spread, single = np.full(len(mean) - count, np.inf), np.zeros(count)
     if prior is not None:

@@ -161,11 +161,12 @@ def _fit(result: Identification) -> str:
     for i, joint in enumerate(result.training.joints):
         row = [escape(joint)]
         for fit in fits:
-            row += [
+            told = [
                 f"{fit.rmse[i]:.4g} {_unit(result, joint)}",
                 f"{100 * fit.relative[i]:.3g} %",
                 f"{fit.percentage_error[i]:.3g} %",
             ]
+            row += told if fit.moving[:, i].any() else ["-", "-", "-"]
         rows.append(row)
     head = ["drive*", "RMS error", "relative", "squared"]
     words = "Of rows away from standstill: root mean square of measured less modelled force, its "
