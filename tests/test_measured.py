@@ -11,7 +11,7 @@ from typed import typed
 import crane
 from crane.cli.runs import read_run
 from crane.common.errors import CraneError, CraneWarning, RecordingError
-from crane.recordings import measured
+from crane.recordings import postures
 from crane.recordings.measured import read_measured
 from crane.recordings.recording import Recording
 
@@ -368,14 +368,16 @@ def test_sensors_that_disagree_are_told(machine, columns, truth, tmp_path, full)
     if full:
         columns |= {f"X{i} _force [N]".replace(" ", "", 1): truth["tau"][:, i] for i in (1, 2)}
     off = np.rad2deg(late - truth["angles"]["q3"]) + 3.0
-    at = int(np.abs(off).argmax())
     with pytest.warns(CraneWarning) as caught:
         read_measured(machine, write(tmp_path, columns))
     (line,) = [str(one.message) for one in caught if "disagree" in str(one.message)]
-    assert line == (
-        f"sensors disagree: by q1, X1, X2, which are used, 'q3' is {off.mean():+.3g} deg off on "
-        f"the mean, {off[at]:+.3g} at most (at {truth['t'][at]:.4g} s)"
+    assert line.startswith(
+        f"sensors disagree: 'q3' is {off.mean():+.3g} deg off on the mean ({off.min():+.3g} to "
+        f"{off.max():+.3g} over the motion) against X2: an offset and a delay explain it but "
     )
+    told = dict(part.split(" = ") for part in line.split("deg, ")[1].split(", "))
+    assert float(told["sensor.q3.zero"]) == pytest.approx(np.deg2rad(3.0), abs=np.deg2rad(0.1))
+    assert float(told["sensor.q3.delay"]) == pytest.approx(0.1, abs=0.01)
 
 
 def test_sensors_that_agree_within_their_noise_are_not(machine, columns, truth, tmp_path):
@@ -391,7 +393,7 @@ def test_strokes_do_not_depend_on_the_blocks(machine, columns, truth, tmp_path, 
     """Nor does what an error calls a sample: it counts from the first of all."""
     file = write(tmp_path, columns)
     whole = read_measured(machine, file)
-    monkeypatch.setattr(measured, "_AT_ONCE", 50)
+    monkeypatch.setattr(postures, "_AT_ONCE", 50)
     blocks = read_measured(machine, file)
     for name in ("q", "v", "tau"):
         assert close(getattr(blocks, name), getattr(whole, name), 1e-12)

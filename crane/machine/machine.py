@@ -26,6 +26,7 @@ from crane.description import (
     GasSpring,
     PIGains,
     Rope,
+    Sensor,
     Task,
     bundled,
     examples,
@@ -83,6 +84,7 @@ class Machine:
         tasks: Named reference motions.
         control: PI gains by active joint.
         hydraulics: The circuit that drives it, None for a machine without.
+        sensors: What is known of its sensors by quantity, see `crane.description.sensors`.
         free: Active joints that nothing drives: no force but friction, springs and stops.
         motors: What the file says that motors act on (actuators of a MJCF), or all drives where
             there are more than freedoms; empty where `drives` are the active joints.
@@ -113,6 +115,7 @@ class Machine:
     tasks: Mapping[str, Task]
     control: Mapping[str, PIGains]
     hydraulics: Hydraulics | None
+    sensors: Mapping[str, Sensor]
     free: tuple[str, ...]
     motors: tuple[Drive, ...]
     changes: Mapping[str, float]
@@ -265,8 +268,9 @@ class Machine:
         ropes: tuple[Rope, ...] | None = None,
         end_stops: tuple[EndStop, ...] | None = None,
         hydraulics: Hydraulics | None = None,
+        sensors: Mapping[str, Sensor] | None = None,
     ) -> "Machine":
-        """The same machine with other friction, springs, ropes, end stops or hydraulics.
+        """The same machine with other friction, springs, ropes, stops, hydraulics or sensors.
 
         Raises:
             InputError: A joint is unknown, has two gas springs, an end stop or a cylinder but no
@@ -310,6 +314,7 @@ class Machine:
             ropes=self.ropes if ropes is None else tuple(ropes),
             end_stops=self.end_stops if end_stops is None else tuple(end_stops),
             hydraulics=self.hydraulics if hydraulics is None else hydraulics,
+            sensors=self.sensors if sensors is None else MappingProxyType(dict(sensors)),
         )
 
     def driven_by(self, names: Sequence[str]) -> "Machine":

@@ -10,15 +10,12 @@ import numpy as np
 from crane.common.errors import CraneWarning, InputError, RecordingError, at, known
 from crane.common.samples import Array, Brief, as_number
 from crane.control import Signals, ValveDrive
+from crane.description.sensors import SIGNAL, SUPPLY, TANK
 from crane.machine import Machine
-from crane.recordings import timeseries
-from crane.recordings.measured import (
-    check_pressures,
-    column,
-    joint_motion,
-    moved_locks,
-    tell_disagreement,
-)
+from crane.recordings.disagreement import tell_disagreement
+from crane.recordings.measured import check_pressures, moved_locks
+from crane.recordings.postures import joint_motion
+from crane.recordings.reading import ALWAYS, Span, read
 from crane.recordings.recording import (
     FORCE,
     FORCE_UNITS,
@@ -27,10 +24,9 @@ from crane.recordings.recording import (
     Recording,
     derivative,
 )
-from crane.recordings.timeseries import TIME, Table, check_unit, spellings
+from crane.recordings.timeseries import TIME, Table, check_unit, column, spellings
 from crane.simulation.run import Progress, simulate
 
-_SIGNAL, _SUPPLY, _TANK = "voltage_", "pressure_supply", "pressure_tank"
 _FIRST, _LONGEST = 0.1, 1.0  # over which the start is fitted, and a rest looked for [s]
 _FEWEST = 5  # samples of that fit
 _BEYOND = 0.01  # of a range, beyond a limit, that noise does not explain
@@ -100,7 +96,12 @@ class Comparison:
 
 
 def replay(
-    machine: Machine, path: str | Path, step: float = 1e-3, progress: Progress | None = None
+    machine: Machine,
+    path: str | Path,
+    step: float = 1e-3,
+    progress: Progress | None = None,
+    columns: str | Path | None = None,
+    span: Span = ALWAYS,
 ) -> tuple[Recording, Comparison]:
     """Simulate a hydraulic machine with measured valve signals.
 
@@ -116,6 +117,9 @@ def replay(
         path: A CSV or npz file.
         step: Of the simulation [s].
         progress: Called with the finished share, 0 to 1.
+        columns: Which columns of a log are which, if not as the machine's sensors say, see
+            `crane.recordings.logs`.
+        span: From when to when [s], by the file's own clock; the simulation counts from zero.
 
     Returns:
         The simulated recording, and its comparison with the file.
@@ -125,7 +129,7 @@ def replay(
         InputError: The machine has no valves.
     """
     step = as_number(step, "the step", "s", above=0)
-    table = timeseries.read(path)
+    table = read(path, machine, columns, span)
     try:
         inputs = inputs_of(machine, table)
         drive = inputs.drive(machine)
@@ -173,7 +177,7 @@ def compare(table: Table, recording: Recording) -> Comparison:
             np.interp(time[inside], recording.time, columns[name]),
         )
         for name in table.units
-        if name in columns and name not in (TIME, _SUPPLY, _TANK) and not name.startswith(_SIGNAL)
+        if name in columns and name not in (TIME, SUPPLY, TANK) and not name.startswith(SIGNAL)
     ]
     return Comparison(time[inside], tuple(found))
 
@@ -224,7 +228,7 @@ def inputs_of(machine: Machine, table: Table) -> Inputs:
     signals = _signals(machine, joints, table)
     check_pressures(machine, table)
     supply, tank = (
-        column(table, name, "Pa") if name in table.units else None for name in (_SUPPLY, _TANK)
+        column(table, name, "Pa") if name in table.units else None for name in (SUPPLY, TANK)
     )
     moved = list(signals.values())
     pressures = _pressures(joints, table, time)
@@ -236,15 +240,15 @@ def inputs_of(machine: Machine, table: Table) -> Inputs:
 def _signals(machine: Machine, joints: Sequence[str], table: Table) -> dict[str, Array]:
     """Of the valves that were moved, by joint [V]."""
     signals = {}
-    for name in (name for name in table.units if name.startswith(_SIGNAL)):
-        joint = name.removeprefix(_SIGNAL)
+    for name in (name for name in table.units if name.startswith(SIGNAL)):
+        joint = name.removeprefix(SIGNAL)
         if joint in machine.locks:
             continue  # the valve of a joint that is held moves nothing
         if joint not in joints:
             raise RecordingError(f"column '{name}' is of no valve, {known(joints, joint)}")
         signals[joint] = column(table, name, "V")
     if not signals:
-        names = ", ".join(f"'{_SIGNAL}{joint} [V]'" for joint in joints)
+        names = ", ".join(f"'{SIGNAL}{joint} [V]'" for joint in joints)
         raise RecordingError(f"no signal of a valve, give at least one of {names}")
     return signals
 

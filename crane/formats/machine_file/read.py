@@ -35,6 +35,7 @@ from crane.formats.machine_file.forces import (
 from crane.formats.machine_file.open_loops import warn_of_open_loops
 from crane.formats.machine_file.posture import read_home
 from crane.formats.machine_file.section import Section
+from crane.formats.machine_file.sensors import read_sensors
 from crane.formats.machine_file.tasks import read_tasks
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.opening import is_robot
@@ -46,7 +47,7 @@ Part = TypeVar("Part")
 _KEYS = (
     "name", "source", "chains", "loops", "active", "free", "drives", "home", "friction", "forces",
     "gas_springs", "ropes", "end_stops", "rotor_inertia", "couplings",
-    "tip", "payload", "tasks", "control", "hydraulics",
+    "tip", "payload", "tasks", "control", "hydraulics", "sensors",
 )  # fmt: skip
 
 
@@ -144,6 +145,7 @@ def _read_machine(path: Path) -> MachineSpec:
         name, source, path, chains, with_rotors(tree.tree, rotors), loops, active, home, friction,
         forces, gas_springs, end_stops, tip, tasks, control, hydraulics, couplings, where, payload,
         free, _part(_drives, (), top, tree), _part(read_ropes, (), top, tree),
+        _part(read_sensors, {}, top, tree),
     )  # fmt: skip
 
 

@@ -1,22 +1,32 @@
 """A machine's numbers from recordings, through the simulation of what drove it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from crane.common.errors import CraneError, InputError, RecordingError, at
 from crane.common.samples import Array
+from crane.description.sensors import (
+    SENSOR,
+    SIGNAL,
+    Sensor,
+    named_numbers,
+    unit_of,
+    with_numbers,
+)
 from crane.formats import load
 from crane.formats.loading import Variants
 from crane.identification.calibration.problem import Case, Problem, case_of, noise_of
 from crane.identification.calibration.readings import sensors_of
-from crane.identification.calibration.result import Calibration, Fitted, Sensor
-from crane.identification.calibration.unknowns import SIGNAL, Unknown, unknowns_of
+from crane.identification.calibration.result import Calibration, Channel, Fitted
+from crane.identification.calibration.unknowns import Unknown, unknowns_of
 from crane.machine import Machine
-from crane.recordings import timeseries
-from crane.recordings.logs import read_log
-from crane.recordings.timeseries import Table
+from crane.recordings.logs import lines_of
+from crane.recordings.reading import ALWAYS, Span, known_sensors, readings, within
+from crane.recordings.recording import IDEAL, SENSORS
+from crane.recordings.timeseries import Table, heading_of
 
 Progress = Callable[[float], None]
 
@@ -36,9 +46,10 @@ def calibrate(
     recordings: Sequence[str | Path] | str | Path,
     fit: Mapping[str, object] | Sequence[str],
     *,
-    train: tuple[float, float] = (0.0, np.inf),
+    train: Span = ALWAYS,
     validation: Sequence[str | Path] = (),
     columns: str | Path | None = None,
+    span: Span = ALWAYS,
     sensors: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
@@ -62,10 +73,12 @@ def calibrate(
         fit: Numbers by name: None, a start, or (start, low, high). Names are those of
             `crane.description.parameters`; with `*` a common factor of all that match;
             `sensor.COLUMN.zero`, `.scale` and `.delay` of what was measured.
-        train: From when to when [s] recordings are fitted; the rest is held out.
+        train: From when to when [s], by the files' own clocks, recordings are fitted; the rest
+            is held out.
         validation: Recordings that are held out whole.
-        columns: A file that says which columns of raw logs are which, see
-            `crane.recordings.logs`.
+        columns: A file that says which columns of raw logs are which, if not as the machine's
+            sensors say, see `crane.recordings.logs`.
+        span: From when to when [s], by the files' own clocks, recordings count at all.
         sensors: Columns to compare; all that can be if not given.
         progress: Called with the finished share, 0 to 1.
 
@@ -81,29 +94,64 @@ def calibrate(
         raise InputError("no recording is given, name at least one")
     if not train[0] < train[1]:
         raise InputError(f"the window from {train[0]:g} to {train[1]:g} s is empty")
-    tables = [_table(path, columns) for path in (*paths, *validation)]
+    if train[0] < span[0] and train[0] > -np.inf or train[1] > span[1] and train[1] < np.inf:
+        raise InputError(
+            f"what is fitted, {train[0]:g} to {train[1]:g} s, is not within {span[0]:g} to "
+            f"{span[1]:g} s, which is read"
+        )
+    tables = [
+        within(readings(path, machine, columns), span, path) for path in (*paths, *validation)
+    ]
     cases = [
         _case(machine, path, table, sensors, train if i < len(paths) else (np.inf, np.inf))
         for i, (path, table) in enumerate(zip((*paths, *validation), tables, strict=True))
     ]
     if not any(case.train.any() for case in cases):
         raise InputError(f"no instant lies within {train[0]:g} to {train[1]:g} s")
+    for path, table in zip((*paths, *validation), tables, strict=True):
+        _check_readings(path, table, fit)
     variants = Variants(machine)
+    numbers = variants.values | named_numbers(cases[0].known)
     units = {
         name: table.units[name]
         for case, table in zip(cases, tables, strict=True)
         for name in (*case.sensors, *(SIGNAL + joint for joint in case.inputs.signals))
     }
-    unknowns = unknowns_of(fit, variants.spec, variants.values, units)
+    unknowns = unknowns_of(fit, variants.spec, numbers, units)
     problem = Problem(machine, unknowns, cases)
     search = _Search(problem, progress)
     before = [problem.residuals(case, np.zeros(problem.size)) for case in problem.cases]
     z = search.run(before)
-    return _result(problem, search, z, before, units)
+    found = _result(problem, search, z, before, units)
+    known = dict(machine.sensors) | dict(cases[0].known)
+    return replace(found, machine=_sensing(found.machine, known, columns, found.changes))
 
 
-def _table(path: str | Path, columns: str | Path | None) -> Table:
-    return timeseries.read(path) if columns is None else read_log(path, columns)
+def _check_readings(path: str | Path, table: Table, fit: Iterable[str]) -> None:
+    """See that numbers of sensors are fitted to what they read."""
+    for name in fit:
+        if name.startswith(SENSOR) and table.notes.get(SENSORS) == IDEAL:
+            raise InputError(
+                f"{path}: '{name}' cannot be fitted to quantities, which its note '{SENSORS}: "
+                f"{IDEAL}' says they are: give the readings, or remove the note if they are"
+            )
+
+
+def _sensing(
+    fitted: Machine,
+    known: Mapping[str, Sensor],
+    columns: str | Path | None,
+    changes: Mapping[str, float],
+) -> Machine:
+    """The fitted machine with all that is known of its sensors, and of their columns in logs."""
+    sensors = dict(known)
+    for line in lines_of(Path(columns))[1] if columns is not None else ():
+        name, unit = heading_of(line.heading)
+        if unit_of(fitted.tree, name) is not None:
+            known_as = sensors.get(name, Sensor())
+            sensors[name] = replace(known_as, column=line.expression, unit=unit)
+    own = {name: value for name, value in changes.items() if name.startswith(SENSOR)}
+    return fitted.replace(sensors=with_numbers(sensors, own))
 
 
 def _case(
@@ -119,7 +167,8 @@ def _case(
             if name not in found:
                 raise InputError(f"'{name}' cannot be compared, choose among {', '.join(found)}")
         found = found if sensors is None else list(sensors)
-        return case_of(machine, Path(path).name, table, found, window)
+        known = known_sensors(table, machine)
+        return case_of(machine, Path(path).name, table, known, found, window)
     except RecordingError as error:
         raise RecordingError(at(str(path), error)) from None
 
@@ -186,7 +235,8 @@ class _Search:
         largest: dict[str, float] = {}
         for case in self._trained:
             for name, x in zip(case.sensors, case.measured.T, strict=True):
-                found.setdefault(name, []).append(noise_of(x) ** 2)
+                said = case.known[name].noise if name in case.known else 0.0
+                found.setdefault(name, []).append((said or noise_of(x)) ** 2)
                 largest[name] = max(largest.get(name, 0.0), float(np.abs(x).max()))
         return {
             name: max(float(np.sqrt(np.mean(x))), _EXACT * largest[name], _NOTHING)
@@ -366,14 +416,13 @@ def _result(
         ))  # fmt: skip
     after = [problem.residuals(case, z) for case in problem.cases]
     seen = [
-        Sensor(case.name, name, units[name], case.inputs.time, case.train, case.measured[:, k],
+        Channel(case.name, name, units[name], case.clock, case.train, case.measured[:, k],
                old[:, k] + case.measured[:, k], new[:, k] + case.measured[:, k])
         for case, old, new in zip(problem.cases, before, after, strict=True)
         for k, name in enumerate(case.sensors)
     ]  # fmt: skip
-    machine = problem.variant(z)
     return Calibration(
-        machine, tuple(fitted), tuple(seen), problem.changes(z),
+        problem.fitted(z), tuple(fitted), tuple(seen), problem.changes(z),
         tuple(_coupled(unknowns, covariance)), problem.runs,
     )  # fmt: skip
 

@@ -1,7 +1,7 @@
 """What is left between recordings and the simulation of their inputs, and its derivatives."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,12 +10,13 @@ from scipy.interpolate import CubicSpline
 
 from crane.common.errors import CraneError, InputError, SimulationError
 from crane.common.samples import Array
+from crane.description.sensors import SENSOR, SIGNAL, Sensor, with_numbers
 from crane.formats.loading import Variants
 from crane.identification.calibration.readings import read
-from crane.identification.calibration.unknowns import SIGNAL, Unknown
+from crane.identification.calibration.unknowns import FITTED, Unknown
 from crane.machine import Machine
-from crane.recordings.measured import column
-from crane.recordings.timeseries import Table
+from crane.recordings.reading import Span, corrected
+from crane.recordings.timeseries import TIME, Table, column
 from crane.simulation.replays import Inputs, inputs_of
 from crane.simulation.run import simulate
 
@@ -39,8 +40,10 @@ class Case:
     Attributes:
         name: Of its file.
         inputs: What drove the machine.
+        clock: (N,) instants as the file has them [s].
         sensors: Columns that are compared.
-        measured: (N, k) their values.
+        measured: (N, k) their readings.
+        known: What was known of the recording's sensors.
         train: (N,) which instants are fitted, true or false.
         first: Where its start is among all unknowns.
         starts: (s,) standard deviations of the start's deviations: q_A, v_A, pressures A and B.
@@ -48,26 +51,44 @@ class Case:
 
     name: str
     inputs: Inputs
+    clock: Array
     sensors: list[str]
     measured: Array
+    known: Mapping[str, Sensor]
     train: NDArray[np.bool_]
     first: int = 0
     starts: Array = field(default_factory=lambda: np.zeros(0))
 
 
 def case_of(
-    machine: Machine, name: str, table: Table, sensors: list[str], window: tuple[float, float]
+    machine: Machine,
+    name: str,
+    table: Table,
+    known: Mapping[str, Sensor],
+    sensors: list[str],
+    window: Span,
 ) -> Case:
     """A recording of a machine, of which the instants within a window [s] are fitted.
+
+    Args:
+        machine: The machine.
+        name: Of the file.
+        table: Its readings.
+        known: What is known of its sensors.
+        sensors: Columns to compare.
+        window: By the file's clock.
 
     Raises:
         RecordingError: See `inputs_of`.
         InputError: Too few instants, or nothing to compare.
     """
-    inputs = inputs_of(machine, table)
+    # what starts is read off without delays, signals stay as they were logged
+    at_once = {x: replace(s, delay=0.0) for x, s in known.items() if not x.startswith(SIGNAL)}
+    inputs = inputs_of(machine, corrected(table, at_once))
     if not sensors:
         raise InputError(f"{name}: nothing of it can be compared with the machine")
-    after, until = inputs.time >= window[0] - 1e-9, inputs.time <= window[1] + 1e-9
+    clock = column(table, TIME)
+    after, until = clock >= window[0] - 1e-9, clock <= window[1] + 1e-9
     train = np.logical_and(after, until)
     if len(train) < _FEWEST:
         raise InputError(f"{name}: {len(train)} instants, give at least {_FEWEST}")
@@ -89,7 +110,7 @@ def case_of(
         ]
     for joint in inputs.pressures:
         starts += [near(f"pressure_{joint}_{side}", "Pa", 0.0) for side in "ab"]
-    return Case(name, inputs, sensors, measured, train, starts=np.array(starts))
+    return Case(name, inputs, clock, sensors, measured, known, train, starts=np.array(starts))
 
 
 def noise_of(x: Array) -> float:
@@ -133,15 +154,21 @@ class Problem:
         }
 
     def changes(self, z: Array) -> dict[str, float]:
-        """Numbers of the machine."""
+        """Numbers of the machine and its sensors."""
         found: dict[str, float] = {}
         for unknown, value in zip(self.unknowns, self.values(z).values(), strict=True):
             found |= unknown.changes(value)
         return found
 
+    def fitted(self, z: Array) -> Machine:
+        """The machine and its sensors with these numbers."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return self._variants.machine(self.changes(z))
+
     def variant(self, z: Array) -> Machine:
-        """The machine with these numbers."""
-        changes = self.changes(z)
+        """The machine with these numbers, to be simulated."""
+        changes = {x: value for x, value in self.changes(z).items() if not x.startswith(SENSOR)}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             made = self._variants.machine(changes) if changes else self.machine
@@ -179,34 +206,36 @@ class Problem:
         if initial is not None:
             low, high = self.machine.lower, self.machine.upper
             places = [
-                self._true(joint, float(x), values)
+                self._true(case, joint, float(x), values)
                 for joint, x in zip(self.machine.active, initial[0], strict=True)
             ]
             place = np.clip(np.array(places) + moved[:n], low, high)
             initial = place, initial[1] + moved[n : 2 * n]
             moved = moved[2 * n :]
         for joint, x in inputs.signals.items():
-            late = values.get(f"sensor.{SIGNAL}{joint}.delay", 0.0)
-            if late:
-                signals[joint] = np.interp(inputs.time - late, inputs.time, x)
-            scale = values.get(f"sensor.{SIGNAL}{joint}.scale", 1.0)
-            signals[joint] = scale * signals[joint] + values.get(
-                f"sensor.{SIGNAL}{joint}.zero", 0.0
-            )
+            name = SIGNAL + joint
+            signals[joint] = self._sensor(case, name, values).quantity(name, inputs.time, x)
         pairs = moved.reshape(-1, 2)
         pressures = {
             joint: (
-                max(self._true(f"pressure_{joint}_a", a, values) + float(da), 0.0),
-                max(self._true(f"pressure_{joint}_b", b, values) + float(db), 0.0),
+                max(self._true(case, f"pressure_{joint}_a", a, values) + float(da), 0.0),
+                max(self._true(case, f"pressure_{joint}_b", b, values) + float(db), 0.0),
             )
             for (joint, (a, b)), (da, db) in zip(inputs.pressures.items(), pairs, strict=True)
         }
         return replace(inputs, initial=initial, pressures=pressures, signals=signals)
 
-    def _true(self, name: str, reading: float, values: dict[str, float]) -> float:
-        """What a sensor stands for that reads so."""
-        zero = values.get(f"sensor.{name}.zero", 0.0)
-        return (reading - zero) / values.get(f"sensor.{name}.scale", 1.0)
+    def _sensor(self, case: Case, name: str, values: Mapping[str, float]) -> Sensor:
+        """With the numbers that are fitted."""
+        known = case.known.get(name, Sensor())
+        names = [f"{SENSOR}{name}.{what}" for what in FITTED]
+        fitted = {x: values[x] for x in names if x in values}
+        return with_numbers({name: known}, fitted)[name] if fitted else known
+
+    def _true(self, case: Case, name: str, x: float, values: Mapping[str, float]) -> float:
+        """What stands for a quantity x by what was known of its sensor, by what is known now."""
+        reading = case.known.get(name, Sensor()).out(x)
+        return self._sensor(case, name, values).into(reading)
 
     def _starts(self, name: str) -> bool:
         """Whether the start depends on a sensor."""
@@ -215,9 +244,8 @@ class Problem:
     def _sensed(self, case: Case, curve: CubicSpline, z: Array) -> tuple[Array, dict[int, Array]]:
         """Readings (N, k) as sensors give them, and their slopes (N, k) by sensors' unknowns."""
         time, values = case.inputs.time, self.values(z)
-        delays = np.array([values.get(f"sensor.{name}.delay", 0.0) for name in case.sensors])
-        scales = np.array([values.get(f"sensor.{name}.scale", 1.0) for name in case.sensors])
-        zeros = np.array([values.get(f"sensor.{name}.zero", 0.0) for name in case.sensors])
+        sensors = [self._sensor(case, name, values) for name in case.sensors]
+        delays, scales, zeros = np.array([(s.delay, s.scale, s.zero) for s in sensors]).T
         plain = curve(time) if not delays.any() else np.empty((len(time), len(delays)))
         if delays.any():
             for k, delay in enumerate(delays):

@@ -5,12 +5,22 @@ import pinocchio as pin
 
 from crane.common.errors import RecordingError, known
 from crane.common.samples import Array
+from crane.description.sensors import (
+    FORCE,
+    FORCE_UNITS,
+    INCLINATION,
+    SIGNAL,
+    SUPPLY,
+    TANK,
+    VELOCITY,
+    VELOCITY_UNITS,
+)
 from crane.machine import Machine
-from crane.recordings.recording import FORCE, FORCE_UNITS, VELOCITY, VELOCITY_UNITS, Recording
+from crane.recordings.recording import Recording
+from crane.recordings.sensed import sensed
 from crane.recordings.timeseries import TIME, Table, check_unit, spellings
 
-INCLINATION = "inclination_"
-_INPUTS = ("voltage_", "pressure_supply", "pressure_tank")
+_INPUTS = (SIGNAL, SUPPLY, TANK)
 
 
 def sensors_of(machine: Machine, table: Table) -> list[str]:
@@ -55,10 +65,7 @@ def _units(machine: Machine) -> dict[str, str]:
 
 
 def read(machine: Machine, recording: Recording, names: list[str]) -> Array:
-    """Readings (N, k) at the recorded instants, SI units.
-
-    The inclination of a link is that of its x axis above the horizon,
-    asin(x_z); its velocity (w x x)_z / sqrt(1 - x_z^2).
+    """What ideal sensors say (N, k) at the recorded instants, SI units.
 
     Args:
         machine: The machine that was simulated.
@@ -66,35 +73,14 @@ def read(machine: Machine, recording: Recording, names: list[str]) -> Array:
         names: See `sensors_of`.
     """
     columns = recording.columns()
-    links = [
-        name.removeprefix(INCLINATION).removesuffix(VELOCITY)
-        for name in names
-        if name.startswith(INCLINATION)
-    ]
-    inclined = _inclinations(machine, recording, sorted(set(links))) if links else {}
-    out: Array = np.column_stack(
-        [inclined[name] if name in inclined else columns[name] for name in names]
-    )
-    return out
+    own = [name for name in names if name.startswith(INCLINATION)]
+    found = columns | (_inclined(machine, recording, own) if own else {})
+    return np.column_stack([found[name] for name in names])
 
 
-def _inclinations(machine: Machine, recording: Recording, links: list[str]) -> dict[str, Array]:
-    """Of links, and their rates, by the name of their column."""
-    closure, model, data = machine.closure, machine.model, machine.model.createData()
+def _inclined(machine: Machine, recording: Recording, names: list[str]) -> dict[str, Array]:
     columns = recording.columns()
     q = np.column_stack([columns[joint] for joint in machine.joints])
     order = [recording.joints.index(joint) for joint in machine.active]
-    v = np.einsum("nij,nj->ni", closure.gamma(q), recording.v[:, order])
-    frames = [machine.frame(link) for link in links]
-    out = np.empty((2 * len(links), len(q)))
-    axes = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-    for i, (place, rate) in enumerate(zip(q, v, strict=True)):
-        pin.forwardKinematics(model, data, machine.coordinates.configuration(place), rate)
-        for k, frame in enumerate(frames):
-            x = pin.updateFramePlacement(model, data, frame).rotation[:, 0]
-            w = pin.getFrameVelocity(model, data, frame, axes).angular
-            flat = max(float(np.hypot(x[0], x[1])), 1e-12)
-            out[2 * k, i] = np.arctan2(x[2], flat)
-            out[2 * k + 1, i] = (w[0] * x[1] - w[1] * x[0]) / flat
-    names = [INCLINATION + link + end for link in links for end in ("", VELOCITY)]
-    return dict(zip(names, out, strict=True))
+    v = np.einsum("nij,nj->ni", machine.closure.gamma(q), recording.v[:, order])
+    return sensed(machine, q, v, names)

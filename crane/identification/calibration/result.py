@@ -33,7 +33,7 @@ class Fitted:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Sensor(Brief):
+class Channel(Brief):
     """A channel of a recording, SI units.
 
     Attributes:
@@ -78,7 +78,7 @@ class Calibration:
 
     machine: Machine
     fitted: tuple[Fitted, ...]
-    sensors: tuple[Sensor, ...]
+    sensors: tuple[Channel, ...]
     changes: Mapping[str, float]
     coupled: tuple[tuple[str, str, float], ...]
     runs: int

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 from crane.common.errors import InputError, known
 from crane.description.changes import unknown_parameter
+from crane.description.sensors import SENSOR
 from crane.description.spec import MachineSpec
 
-SENSOR, SIGNAL = "sensor.", "voltage_"
-_SENSORS = {"zero": 0.0, "scale": 1.0, "delay": 0.0}
+FITTED = {"zero": 0.0, "scale": 1.0, "delay": 0.0}
 _SIZES = {
     "rad": 0.02,
     "m": 5e-3,
@@ -73,7 +73,7 @@ def unknowns_of(
     Args:
         fit: By name None, a start, or (start, low, high); None of these where not known. Or names.
         spec: The machine's description.
-        numbers: Of the machine by name, see `parameters`.
+        numbers: Of the machine and its sensors by name, see `parameters`.
         sensors: Units by column.
 
     Raises:
@@ -98,14 +98,14 @@ def _unknown(
         column, _, what = name.removeprefix(SENSOR).rpartition(".")
         if column not in sensors:
             raise InputError(f"'{name}' is of no sensor, {known(sensors, column)}")
-        if what not in _SENSORS:
-            raise InputError(f"'{name}': a sensor has no '{what}', {known(_SENSORS, what)}")
-        usual = _SENSORS[what]
+        if what not in FITTED:
+            raise InputError(f"'{name}': a sensor has no '{what}', {known(FITTED, what)}")
+        usual = numbers.get(name, FITTED[what])
         size = _DELAY if what == "delay" else _SIZES.get(sensors[column], 1.0)
         size = 0.05 if what == "scale" else size
         begin = usual if start is None else start
         least = (0.0 if what == "delay" else -float("inf")) if low is None else low
-        return _made(name, begin, least, high, size, sensor=column)
+        return _made(name, begin, least, high, size, ((name, usual),), column)
     if "*" in name:
         found = {x: numbers[x] for x in fnmatch.filter(numbers, name) if numbers[x]}
         if not found:

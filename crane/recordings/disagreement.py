@@ -1,0 +1,306 @@
+"""Sensors that say more than is needed, compared through the machine's loops.
+
+Those that determine the posture put every other sensor where it should be; what it reads instead
+is explained by the simplest that leaves no more than noise, by least squares over the recording:
+a zero of the sensor or of one of those that determine it, then a zero with a delay or a scale.
+Rates are compared as what they add up to, so that their noise does not hide their zero.
+"""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from crane.common.errors import ClosureError, CraneWarning, MechanismError
+from crane.common.samples import Array
+from crane.description.sensors import INCLINATION, SENSOR, VELOCITY, Sensor, unit_of
+from crane.machine import Machine
+from crane.recordings.postures import drives_of
+from crane.recordings.reading import known_sensors
+from crane.recordings.sensed import sensed
+from crane.recordings.timeseries import TIME, Table, column
+
+# by which sensors of one quantity may differ [rad], [m]; of a machine of less than a metre a share
+# of its size
+_AGREE = {"rad": 5e-3, "m": 5e-4}
+_COMPARED = 2000  # samples at which they are compared
+_NOISE = 3.3, 2.0  # standard deviations that tell a difference, and that explain what is left
+_AS_GOOD = 2.0  # times what the best explanation leaves
+_BETTER = 0.5  # of what a zero leaves
+_STILL = 0.05  # of the motion that it should tell
+_MOVES = 4.0  # times what sensors may differ by, over which scale and delay show
+_FLAT = 1e-6  # slope of what does not depend on something
+_STEPS = 4  # of Gauss and Newton
+_SHOWN = {"rad": ("deg", 180 / np.pi), "m": ("mm", 1e3)}
+
+
+def allowed(most: Mapping[str, float], machine: Machine, unit: str) -> float:
+    """A deviation of a unit, smaller in a machine of less than a metre."""
+    return most[unit] * (min(machine.closure.size, 1.0) if unit == "m" else 1.0)
+
+
+def tell_disagreement(machine: Machine, table: Table) -> None:
+    """Warn where sensors of one quantity disagree through the machine's loops, a line each.
+
+    Joints and inclinations that are recorded beside the joints that determine the posture, and
+    rates, are compared with where these put them.
+    """
+    known = known_sensors(table, machine)
+    try:
+        postures = _Postures(machine, table)
+        pairs = [_Pair(postures, name) for name in _others(machine, table, postures.drives)]
+        told = [text for pair in pairs if (text := pair.told(known))]
+    except (ClosureError, MechanismError):  # whoever closes the loops tells it
+        return
+    for text in told:
+        warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def _others(machine: Machine, table: Table, drives: tuple[str, ...]) -> list[str]:
+    """Columns, in units of the machine, that the posture and its motion tell as well."""
+    found = []
+    for name, unit in table.units.items():
+        base = name.removesuffix(VELOCITY)
+        tells = base in machine.joints or base.startswith(INCLINATION)
+        if tells and name not in drives and unit == unit_of(machine.tree, name):
+            found.append(name)
+    return found
+
+
+class _Postures:
+    """Where the joints that are used put a machine, at some samples.
+
+    Attributes:
+        machine: Driven by them.
+        drives: Their names.
+        chosen: Which samples.
+        time: (N,) [s].
+    """
+
+    def __init__(self, machine: Machine, table: Table):
+        self.table, self.drives = table, drives_of(machine, list(table.units))
+        self.chosen = slice(None, None, max(1, len(table.values) // _COMPARED))
+        self.time = column(table, TIME)[self.chosen]
+        self._measured = machine
+        self._size = machine.closure.size
+
+    @cached_property
+    def machine(self) -> Machine:
+        """Driven by what is used."""
+        same = set(self.drives) == set(self._measured.active)
+        return self._measured if same else self._measured.driven_by(self.drives)
+
+    @cached_property
+    def q_b(self) -> Array:
+        """(N, n) as measured."""
+        machine = self.machine
+        columns = [column(self.table, x, machine.unit(x))[self.chosen] for x in machine.active]
+        return np.column_stack(columns)
+
+    @cached_property
+    def q(self) -> Array:
+        """(N, nv) closed."""
+        return self.machine.closure.solve(self.q_b)
+
+    def said(self, name: str, q: Array | None = None) -> Array:
+        """(N,) of a joint or an inclination in these postures, or in others."""
+        q = self.q if q is None else q
+        return sensed(self.machine, q, np.zeros_like(q), [name])[name]
+
+    def slopes(self, name: str, q: Array) -> Array:
+        """(N, n) of the same by what is used."""
+        gamma = self.machine.closure.gamma(q)
+        rows = [sensed(self.machine, q, g, [name + VELOCITY]) for g in np.moveaxis(gamma, 2, 0)]
+        return np.column_stack([row[name + VELOCITY] for row in rows])
+
+
+@dataclass(frozen=True)
+class _Cause:
+    """What may explain a difference.
+
+    Attributes:
+        numbers: Of sensors, by sensor and by what: zero, scale and delay of what is compared now.
+        left: Root mean square of what it leaves.
+        words: What it is.
+    """
+
+    numbers: dict[str, dict[str, float]]
+    left: float
+    words: str
+
+    def text(self, known: Mapping[str, Sensor]) -> str:
+        """Numbers as machine files and options take them, on top of what is known already."""
+        found = []
+        for name, now in self.numbers.items():
+            was = known.get(name, Sensor())
+            scale = now.get("scale", 1.0)
+            values = {
+                "zero": was.zero + was.scale * now.get("zero", 0.0),
+                "scale": was.scale * scale,
+                "delay": was.delay + now.get("delay", 0.0),
+            }
+            found += [f"{SENSOR}{name}.{what} = {values[what]:.4g}" for what in now]
+        return ", ".join(found)
+
+
+class _Pair:
+    """One sensor beside what the others say of it.
+
+    Args:
+        postures: Of those that are used.
+        name: Its column.
+    """
+
+    def __init__(self, postures: _Postures, name: str):
+        self._postures, self.name = postures, name
+        self.time = postures.time
+        self.base = name.removesuffix(VELOCITY)
+        self.rate = self.base != name
+        self.unit = str(unit_of(postures.machine.tree, self.base))
+        reading = column(postures.table, name)
+        if self.rate:
+            reading = _added_up(column(postures.table, TIME), reading)
+        self.measured = reading[postures.chosen]
+        self.said = postures.said(self.base)
+        self.off = self.measured - self.said
+        if self.rate:
+            self.off = self.off - self.off.mean()
+        elif self.unit == "rad":
+            self.off = self.off - 2 * np.pi * np.round(np.median(self.off) / (2 * np.pi))
+        few = len(self.off) < 3
+        self.noise = 0.0 if few else float(np.median(np.abs(np.diff(self.off, 2)))) / 1.65
+        self.allowed = allowed(_AGREE, postures.machine, self.unit)
+
+    def told(self, known: Mapping[str, Sensor]) -> str:
+        """How they disagree, and why; "" where they do not."""
+        mean, spread = float(self.off.mean()), float(self.off.std())
+        if abs(mean) <= self.allowed and spread <= max(self.allowed, _NOISE[0] * self.noise):
+            return ""
+        cause = self._why(known)
+        if self.rate and not cause:
+            return ""  # what it adds up to drifts for many reasons
+        unit, factor = _SHOWN[self.unit]
+        used = ", ".join(self._used)
+        if self.rate:
+            slope = factor * float(self._fitted([self.time])[0][0])
+            return (
+                f"sensors disagree: '{self.name}' is {slope:+.3g} {unit}/s off on the mean "
+                f"against {used}: {cause}"
+            )
+        low, high = factor * self.off.min(), factor * self.off.max()
+        return (
+            f"sensors disagree: '{self.name}' is {factor * mean:+.3g} {unit} off on the mean "
+            f"({low:+.3g} to {high:+.3g} over the motion) against {used}: {cause}"
+        )
+
+    @property
+    def _used(self) -> list[str]:
+        """Joints that tell it."""
+        few = slice(None, None, max(1, len(self.time) // 10))
+        slopes = self._postures.slopes(self.base, self._postures.q[few])
+        joints = self._postures.machine.active
+        tells = np.abs(slopes).max(axis=0) > _FLAT
+        return [x for x, one in zip(joints, tells, strict=True) if one]
+
+    def _why(self, known: Mapping[str, Sensor]) -> str:
+        """In words; of a rate "" where nothing explains it."""
+        zeros = sorted([self._zero(), *self._zeros_of_others()], key=lambda x: x.left)
+        limit, best = max(self.allowed, _NOISE[1] * self.noise), zeros[0]
+        unit, factor = _SHOWN[self.unit]
+        if best.left <= limit:
+            most = max(_AS_GOOD * best.left, 0.2 * self.allowed)
+            named = " or ".join(x.text(known) for x in zeros if x.left <= most)
+            return f"a constant offset explains it, {named}"
+        absolute = self._absolute(best)
+        if absolute:
+            return absolute
+        if np.ptp(self.measured) < _STILL * np.ptp(self.said) and not self.rate:
+            return "it does not move"
+        more = min(self._with_zero(), key=lambda x: x.left, default=best)
+        if more.left <= limit or (more.left < _BETTER * best.left and not self.rate):
+            left = f"{factor * more.left:.2g} {unit}"
+            return f"{more.words} explain it but for {left}, {more.text(known)}"
+        if self.rate:
+            return ""
+        return (
+            f"no constant offset explains it ({best.text(known)} leaves {factor * best.left:.3g} "
+            f"{unit}), a pin may not be where the file has it"
+        )
+
+    def _fitted(self, columns: list[Array]) -> tuple[Array, float]:
+        """Least squares of the difference over columns (N,), and what they leave."""
+        more = [np.ones_like(self.time)] if self.rate else []
+        A = np.column_stack([*columns, *more])
+        values: Array = np.asarray(np.linalg.lstsq(A, self.off, rcond=None)[0])
+        return values, float(np.sqrt(np.mean((self.off - A @ values) ** 2)))
+
+    @property
+    def _one(self) -> Array:
+        """(N,) what a zero adds."""
+        return self.time - self.time[0] if self.rate else np.ones_like(self.time)
+
+    def _zero(self) -> _Cause:
+        values, left = self._fitted([self._one])
+        return _Cause({self.name: {"zero": float(values[0])}}, left, "an offset")
+
+    def _with_zero(self) -> list[_Cause]:
+        """A zero with a delay, and with a scale."""
+        if np.ptp(self.said) < _MOVES * self.allowed:
+            return []
+        found = []
+        for what, slope in (("delay", -np.gradient(self.said, self.time)), ("scale", self.said)):
+            (zero, more, *_), left = self._fitted([self._one, slope])
+            value = float(more) + (what == "scale")
+            if what == "delay" and value < 0:
+                continue  # a sensor does not know what comes
+            numbers = {"zero": float(zero), what: value}
+            found.append(_Cause({self.name: numbers}, left, f"an offset and a {what}"))
+        return found
+
+    def _zeros_of_others(self) -> list[_Cause]:
+        """Zeros of what is used, one at a time, by Gauss and Newton's method."""
+        found = []
+        drives = self._postures.machine.active
+        for i in range(len(drives) if not self.rate else 0):
+            zero, left = 0.0, np.inf
+            try:
+                for _ in range(_STEPS):
+                    moved = self._postures.q_b.copy()
+                    moved[:, i] -= zero
+                    q = self._postures.machine.closure.solve(moved)
+                    off = self.off + self.said - self._postures.said(self.name, q)
+                    left = float(np.sqrt(np.mean(off**2)))
+                    slope = -self._postures.slopes(self.name, q)[:, i]
+                    if np.abs(slope).max() < _FLAT:
+                        break
+                    zero += float(slope @ off / (slope @ slope))
+            except ClosureError:
+                continue
+            found.append(_Cause({drives[i]: {"zero": zero}}, left, "an offset"))
+        return found
+
+    def _absolute(self, best: _Cause) -> str:
+        """That an angle of a joint follows the inclination of its link, where it does."""
+        machine = self._postures.machine
+        if self.rate or self.unit != "rad" or self.base.startswith(INCLINATION):
+            return ""
+        link = machine.tree.joints[self.base].child
+        inclined = self._postures.said(INCLINATION + link)
+        for sign in (1.0, -1.0):
+            off = self.measured - sign * inclined
+            if off.std() <= max(self.allowed, _NOISE[1] * self.noise, 0.0) < best.left:
+                turned = "" if sign > 0 else " with its sign turned"
+                return (
+                    f"it follows the inclination of '{link}' against the horizon within "
+                    f"{np.rad2deg(off.std()):.2g} deg, an absolute angle is called "
+                    f"'{INCLINATION}{link}'{turned}"
+                )
+        return ""
+
+
+def _added_up(time: Array, rate: Array) -> Array:
+    """Integral (N,) of a rate (N,), by trapezia."""
+    steps = 0.5 * (rate[1:] + rate[:-1]) * np.diff(time)
+    return np.concatenate([[0.0], np.cumsum(steps)])

@@ -1,0 +1,159 @@
+"""Where a machine was, and how fast, by whichever of its joints were measured.
+
+Coordinates of active joints are taken where they are measured. The others follow from other joints
+by closing the machine's loops, velocities by v_A = gamma_A v_B with q_B what was measured.
+"""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from crane.closure import Closure
+from crane.common.errors import ClosureError, MechanismError, RecordingError
+from crane.common.samples import Array
+from crane.machine import Machine
+from crane.recordings.recording import VELOCITY, VELOCITY_UNITS, derivative
+from crane.recordings.timeseries import TIME, Table, column
+
+_TELLS = 1e-6  # least share of a joint's motion that others do not tell
+_SAME = 1e-6  # [rad], [machine's size]
+_AT_ONCE = 1 << 16  # samples whose postures are held
+_SAMPLE = re.compile(r"\(sample (\d+)\)")  # of an error of the closure
+_SLACK = 0.1  # of a range, by which sensors may be off
+
+
+def drives_of(machine: Machine, names: Sequence[str]) -> tuple[str, ...]:
+    """Measured joints that determine all others: active ones, then such as tell something new.
+
+    The rows of gamma = dq/dq_A at home that belong to them have to span all of v_A. A joint tells
+    what its row has in the directions that the rows before it leave open.
+    """
+    gamma = machine.closure.gamma(machine.home) * _span(machine)
+    told = np.zeros((0, len(machine.active)))
+
+    def new(joint: str) -> Array | None:
+        """Unit direction that a joint adds, None where it adds none."""
+        row = gamma[machine.column(joint)]
+        rest = row - told.T @ (told @ row)
+        rest -= told.T @ (told @ rest)  # once more for rounding
+        size = np.linalg.norm(rest)
+        return rest / size if size > _TELLS * np.linalg.norm(row) else None
+
+    drives = []
+    measured = [x for x in names if x in machine.joints]
+    for joint in sorted(measured, key=lambda x: x not in machine.active):
+        if (direction := new(joint)) is not None:
+            told = np.vstack([told, direction])
+            drives.append(joint)
+    if len(drives) < len(machine.active):
+        telling = [x for x in machine.joints if new(x) is not None]
+        missing = []
+        for joint in machine.active:  # those that suffice
+            if (direction := new(joint)) is not None:
+                told = np.vstack([told, direction])
+                missing.append(joint)
+        others = ", ".join(x for x in telling if x not in machine.active)
+        one = len(missing) == 1
+        raise RecordingError(
+            f"nothing tells where {', '.join(repr(x) for x in missing)} {'is' if one else 'are'}, "
+            f"give {', '.join(repr(f'{x} [{machine.unit(x)}]') for x in missing)}"
+            + (f", or a joint that moves with {'it' if one else 'them'} ({others})" * bool(others))
+            + f", or lock what was held (lock {', '.join(f'{x}=VALUE' for x in missing)})"
+        )
+    return tuple(drives)
+
+
+def _span(machine: Machine) -> Array:
+    """Ranges (n,) of the active coordinates, 1 where they are endless."""
+    span = machine.upper - machine.lower
+    return np.where(np.isfinite(span), span, 1.0)
+
+
+def joint_motion(machine: Machine, table: Table) -> tuple[Array, Array]:
+    """Active coordinates and velocities (N, n) of what a table tells of the machine's joints.
+
+    Raises:
+        RecordingError: It does not tell all of them, or what the machine cannot do.
+    """
+    return motion_by(machine, drives_of(machine, list(table.units)), table)
+
+
+def motion_by(machine: Machine, drives: tuple[str, ...], table: Table) -> tuple[Array, Array]:
+    """Active coordinates and velocities (N, n) from those of the joints that were measured."""
+    time = column(table, TIME)
+    q_b = np.column_stack([column(table, x, machine.unit(x)) for x in drives])
+    v_b = np.empty_like(q_b)
+    for x, v, joint in zip(q_b.T, v_b.T, drives, strict=True):
+        v[:] = (
+            derivative(x, time) if (told := velocity_of(machine, joint, table)) is None else told
+        )
+    if set(drives) == set(machine.active):
+        order = [drives.index(x) for x in machine.active]
+        return q_b[:, order], v_b[:, order]
+    angles = ", ".join(x for x in drives if x not in machine.active)
+    hint = f"see that zero and sign of {angles} are the machine's"
+    q_a, v_a = np.empty_like(q_b), np.empty_like(v_b)
+    try:
+        closure = machine.driven_by(drives).closure
+    except MechanismError as error:
+        raise RecordingError(f"{error}; {hint}") from None
+    for start in range(0, len(time), _AT_ONCE):
+        some = slice(start, start + _AT_ONCE)
+        try:
+            q_a[some], v_a[some], off = _driven(machine, closure, q_b[some], v_b[some])
+        except ClosureError as error:
+            raise RecordingError(f"{_counted_from(start, error)}; {hint}") from None
+        if (off > _SAME).any():
+            raise RecordingError(
+                f"sample {start + int(np.argmax(off > _SAME))} is beyond a dead centre, where "
+                f"{', '.join(machine.active)} do not tell the posture: {hint}, or cut the "
+                "recording"
+            )
+    low, high = q_a.min(axis=0), q_a.max(axis=0)
+    slack = _SLACK * _span(machine)
+    computed = np.array([x not in drives for x in machine.active])
+    outside = (low < machine.lower - slack) | (high > machine.upper + slack)
+    for i in np.flatnonzero(computed & outside):
+        raise RecordingError(
+            f"by {angles} '{machine.active[i]}' goes from {low[i]:.4g} to {high[i]:.4g} "
+            f"{machine.unit(machine.active[i])}, its limits are {machine.lower[i]:.4g} and "
+            f"{machine.upper[i]:.4g}: {hint}"
+        )
+    for v, joint in zip(v_a.T, machine.active, strict=True):
+        if (told := velocity_of(machine, joint, table)) is not None:
+            v[:] = told
+    return q_a, v_a
+
+
+def _driven(
+    machine: Machine, closure: Closure, q_b: Array, v_b: Array
+) -> tuple[Array, Array, Array]:
+    """q_A and v_A = gamma_A v_B, and how far from the posture q_A leads (N,).
+
+    Args:
+        machine: Driven by q_A.
+        closure: Of the same machine driven by q_B.
+        q_b: (N, n).
+        v_b: (N, n).
+
+    Raises:
+        ClosureError: No posture has these coordinates.
+    """
+    q = closure.solve(q_b)
+    gamma = closure.gamma(q)[:, machine.closure.active]
+    q_a = q[:, machine.closure.active]
+    off = np.abs(machine.closure.solve(q_a) - q).max(axis=1)
+    return q_a, np.einsum("nij,nj->ni", gamma, v_b), off
+
+
+def _counted_from(start: int, error: ClosureError) -> str:
+    """What an error says of a block of samples, its samples counted from the first of all."""
+    return _SAMPLE.sub(lambda found: f"(sample {start + int(found[1])})", str(error))
+
+
+def velocity_of(machine: Machine, joint: str, table: Table) -> Array | None:
+    """A joint's velocity (N,) where it is recorded."""
+    if joint + VELOCITY not in table.units:
+        return None
+    return column(table, joint + VELOCITY, VELOCITY_UNITS[machine.unit(joint)])
