@@ -1,12 +1,26 @@
 """The command that fits a machine to recordings of it: calibrate."""
 
 import os
+from math import inf
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from crane.cli.shared import Change, Force, Lock, MachineName, app, load, names, progress_bar
+from crane.cli.shared import (
+    Change,
+    Columns,
+    Force,
+    From,
+    Lock,
+    MachineName,
+    Until,
+    app,
+    load,
+    names,
+    progress_bar,
+    span_of,
+)
 from crane.common.errors import InputError
 
 _FORM = "NAME, NAME=START, or NAME=START,LOW~HIGH"
@@ -36,10 +50,9 @@ def calibrate(
         list[Path] | None,
         typer.Option(metavar="FILE", help="A recording that is held out; may be repeated."),
     ] = None,
-    columns: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Which columns of raw logs are which, as for import."),
-    ] = None,
+    columns: Columns = None,
+    since: From = None,
+    until: Until = None,
     sensors: Annotated[
         str | None,
         typer.Option(metavar="COLUMNS", help="What is compared, as X_lift,pressure_X_lift_a."),
@@ -61,12 +74,12 @@ def calibrate(
     if out is not None:
         check_folder(out, force)
     wanted = fits(fit)
-    span = _window(train)
+    window, span = _window(train), span_of(since, until)
     loaded = load(machine, lock, change)
     with progress_bar("simulating") as progress:
         found = run(
-            loaded, recording, wanted, train=span, validation=validation or (), columns=columns,
-            sensors=names(sensors), progress=progress,
+            loaded, recording, wanted, train=window, validation=validation or (), columns=columns,
+            span=span, sensors=names(sensors), progress=progress,
         )  # fmt: skip
     text = found.to_text()
     if out is not None:
@@ -107,11 +120,11 @@ def fits(words: list[str]) -> dict[str, object]:
 
 def _window(text: str | None) -> tuple[float, float]:
     if text is None:
-        return 0.0, float("inf")
+        return -inf, inf
     first, colon, last = text.partition(":")
     try:
         if not colon:
             raise ValueError
-        return float(first or 0.0), float(last or "inf")
+        return float(first or -inf), float(last or inf)
     except ValueError:
         raise InputError(f"--train is '{text}', write FROM:TO in seconds, as 0:13.5") from None

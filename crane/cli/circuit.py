@@ -6,7 +6,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crane.cli.shared import Change, Force, Lock, MachineName, app, load, status
+from crane.cli.shared import (
+    Change,
+    Columns,
+    Force,
+    From,
+    Lock,
+    MachineName,
+    Until,
+    app,
+    load,
+    span_of,
+    status,
+)
 from crane.common.errors import InputError, known
 
 if TYPE_CHECKING:
@@ -47,6 +59,9 @@ def circuit(
     ] = None,
     change: Change = None,
     lock: Lock = None,
+    columns: Columns = None,
+    since: From = None,
+    until: Until = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="FOLDER", help="Folder for the table and its figure."),
@@ -69,11 +84,12 @@ def circuit(
         raise InputError(f"--model {model} takes one recording, {len(recording)} are given")
     if out is not None:
         check_folder(out, force)
+    span = span_of(since, until)
     loaded = load(machine, lock, change)
     if joint not in loaded.active:
         raise InputError(f"'{joint}' is not an active joint, {known(loaded.active, joint)}")
-    runs = [read_run(path, loaded) for path in recording]
-    judge = None if validation is None else read_run(validation, loaded)
+    runs = [read_run(path, loaded, columns, span) for path in recording]
+    judge = None if validation is None else read_run(validation, loaded, columns)
     with status("identifying"):
         if model == "orifices":
             text, figure = _orifices(loaded, runs, joint, method or "weak", period, judge)

@@ -7,17 +7,21 @@ from typing import Annotated
 import typer
 
 from crane.cli.shared import (
+    Columns,
     Force,
+    From,
     Lock,
     MachineName,
     Method,
     Out,
     RecordingFile,
     Trust,
+    Until,
     app,
     by_joint,
     load,
     progress_bar,
+    span_of,
     status,
 )
 
@@ -139,6 +143,9 @@ def identify(
         ),
     ] = None,
     lock: Lock = None,
+    columns: Columns = None,
+    since: From = None,
+    until: Until = None,
     trust: Trust = False,
     force: Force = False,
 ) -> None:
@@ -149,18 +156,19 @@ def identify(
     from crane.identification.mechanics.write import check_rewritable
 
     check_folder(out, force)
+    span = span_of(since, until)
     loaded = load(machine, lock)
     if feasible:
         check_rewritable(loaded)
     with status(f"reading {recording.name}"):
-        learned = read_run(recording, loaded)
+        learned = read_run(recording, loaded, columns, span)
     if bandwidth is not None:
-        span = max(float(learned.time[-1] - learned.time[0]), 1e-3)
-        as_number(bandwidth, "the bandwidth", "Hz", above=5 / span)
+        longest = max(float(learned.time[-1] - learned.time[0]), 1e-3)
+        as_number(bandwidth, "the bandwidth", "Hz", above=5 / longest)
     judge = None
     if validation is not None:
         with status(f"reading {validation.name}"):
-            judge = read_run(validation, loaded)
+            judge = read_run(validation, loaded, columns)
     with progress_bar("identifying") as progress:
         result = run(
             loaded,
@@ -189,15 +197,19 @@ def payload(
     ] = None,
     method: Method = "wls",
     lock: Lock = None,
+    columns: Columns = None,
+    since: From = None,
+    until: Until = None,
     trust: Trust = False,
 ) -> None:
     """Estimate mass and centre of mass of what a machine carries from a recording."""
     from crane.cli.runs import read_run
     from crane.identification.mechanics.payload import identify_payload
 
+    span = span_of(since, until)
     loaded = load(machine, lock)
     with status(f"reading {recording.name}"):
-        carried = read_run(recording, loaded)
+        carried = read_run(recording, loaded, columns, span)
     with progress_bar("estimating") as progress:
         estimate = identify_payload(loaded, carried, frame, method, trust=trust, progress=progress)
     print(estimate.to_text(), end="")

@@ -53,7 +53,11 @@ def read(
         RecordingError: A file is missing or malformed, or has no samples in that time.
         InputError: The span is none.
     """
-    table = readings(path, machine, columns)
+    return quantities(readings(path, machine, columns), path, machine, span)
+
+
+def quantities(table: Table, path: str | Path, machine: Machine | None, span: Span) -> Table:
+    """The same from readings of a path."""
     try:
         table = corrected(table, known_sensors(table, machine))
     except RecordingError as error:

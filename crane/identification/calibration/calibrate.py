@@ -78,7 +78,8 @@ def calibrate(
         validation: Recordings that are held out whole.
         columns: A file that says which columns of raw logs are which, if not as the machine's
             sensors say, see `crane.recordings.logs`.
-        span: From when to when [s], by the files' own clocks, recordings count at all.
+        span: From when to when [s], by the files' own clocks, recordings count at all; those of
+            `validation` count whole.
         sensors: Columns to compare; all that can be if not given.
         progress: Called with the finished share, 0 to 1.
 
@@ -99,9 +100,8 @@ def calibrate(
             f"what is fitted, {train[0]:g} to {train[1]:g} s, is not within {span[0]:g} to "
             f"{span[1]:g} s, which is read"
         )
-    tables = [
-        within(readings(path, machine, columns), span, path) for path in (*paths, *validation)
-    ]
+    tables = [within(readings(path, machine, columns), span, path) for path in paths]
+    tables += [readings(path, machine, columns) for path in validation]
     cases = [
         _case(machine, path, table, sensors, train if i < len(paths) else (np.inf, np.inf))
         for i, (path, table) in enumerate(zip((*paths, *validation), tables, strict=True))
