@@ -285,12 +285,11 @@ BROKEN = {
     "no pressures": (
         without("pressure_X2_a [bar]", "pressure_X2_b [bar]"),
         "column 'X2_force' is missing, give it in [N], or 'pressure_X2_a [Pa]' and "
-        "'pressure_X2_b [Pa]', or lock the joint if it was held (lock X2=VALUE)",
+        "'pressure_X2_b [Pa]'; or lock what was held, where it was: --lock X2=0.0108 (home)",
     ),
     "no torque of the slewing motor": (
         without("q1_force [N m]"),
-        "column 'q1_force' is missing, give it in [N m], or lock the joint if it was held "
-        "(lock q1=VALUE)",
+        ": column 'q1_force' is missing, give it in [N m]",
     ),
     "pressures without a cylinder": (
         lambda columns, truth: columns.update(
@@ -305,12 +304,13 @@ BROKEN = {
     ),
     "no slewing angle": (
         without("q1 [deg]"),
-        "nothing tells where 'q1' is, give 'q1 [rad]', or lock what was held (lock q1=VALUE)",
+        "nothing tells where 'q1' is, give 'q1 [rad]'; or lock what was held, where it was: "
+        "--lock q1=0 (home)",
     ),
     "one angle too few": (
         without("q2 [deg]"),
         "nothing tells where 'X1' is, give 'X1 [m]', or a joint that moves with it "
-        "(q4, q9, q2), or lock what was held (lock X1=VALUE)",
+        "(q4, q9, q2); or lock what was held, where it was: --lock X1=0.0221 (home)",
     ),
     "angle without a unit": (
         renamed("q3 [deg]", "q3"),
@@ -353,10 +353,12 @@ def test_everything_that_is_missing_is_told_at_once(machine, columns, tmp_path):
         read_measured(machine, write(tmp_path, columns))
     line = str(caught.value)
     assert "nothing tells where 'q1', 'X1' are, give 'q1 [rad]', 'X1 [m]', or a joint" in line
-    assert "(lock q1=VALUE, X1=VALUE); column 'q1_force' is missing, give it in" in line
-    assert line.endswith(
-        "'pressure_X2_a' is missing beside 'pressure_X2_b', give it, or 'X2_force [N]'"
+    assert "); column 'q1_force' is missing, give it in [N m]; column" in line
+    assert (
+        "'pressure_X2_a' is missing beside 'pressure_X2_b', give it, or 'X2_force [N]'; or lock"
+        in line
     )
+    assert line.endswith("where it was: --lock q1=0 (home) --lock X1=0.0221 (home)")
 
 
 @pytest.mark.parametrize("full", [True, False])
@@ -458,7 +460,7 @@ def test_command_line(path, columns, tmp_path):
     identify = ("identify", path, file, "--out", "found")
     result = typed(*identify, cwd=tmp_path)
     assert result.returncode == 2 and not (tmp_path / "found").exists()
-    assert f"error: {file}: nothing tells where 'q1' is, give 'q1 [rad]', or lock" in result.stderr
+    assert f"error: {file}: nothing tells where 'q1' is, give 'q1 [rad]'; or lock" in result.stderr
     result = typed(*identify, "--lock", "q1=0", cwd=tmp_path)
     assert "nothing tells" not in result.stderr
     columns["q1 [rad]"] = columns["time [ms]"] * 1e-4

@@ -21,10 +21,8 @@ from crane.recordings.postures import drives_of
 from crane.recordings.reading import known_sensors
 from crane.recordings.sensed import sensed
 from crane.recordings.timeseries import TIME, Table, column
+from crane.recordings.tolerances import AGREE, allowed
 
-# by which sensors of one quantity may differ [rad], [m]; of a machine of less than a metre a share
-# of its size
-_AGREE = {"rad": 5e-3, "m": 5e-4}
 _COMPARED = 2000  # samples at which they are compared
 _NOISE = 3.3, 2.0  # standard deviations that tell a difference, and that explain what is left
 _AS_GOOD = 2.0  # times what the best explanation leaves
@@ -34,11 +32,6 @@ _MOVES = 4.0  # times what sensors may differ by, over which scale and delay sho
 _FLAT = 1e-6  # slope of what does not depend on something
 _STEPS = 4  # of Gauss and Newton
 _SHOWN = {"rad": ("deg", 180 / np.pi), "m": ("mm", 1e3)}
-
-
-def allowed(most: Mapping[str, float], machine: Machine, unit: str) -> float:
-    """A deviation of a unit, smaller in a machine of less than a metre."""
-    return most[unit] * (min(machine.closure.size, 1.0) if unit == "m" else 1.0)
 
 
 def tell_disagreement(machine: Machine, table: Table) -> None:
@@ -171,7 +164,7 @@ class _Pair:
             self.off = self.off - 2 * np.pi * np.round(np.median(self.off) / (2 * np.pi))
         few = len(self.off) < 3
         self.noise = 0.0 if few else float(np.median(np.abs(np.diff(self.off, 2)))) / 1.65
-        self.allowed = allowed(_AGREE, postures.machine, self.unit)
+        self.allowed = allowed(AGREE, postures.machine, self.unit)
 
     def told(self, known: Mapping[str, Sensor]) -> str:
         """How they disagree, and why; "" where they do not."""

@@ -21,7 +21,8 @@ from crane.common.errors import RecordingError, at
 from crane.common.samples import Array
 from crane.description.sensors import PRESSURE
 from crane.machine import Machine
-from crane.recordings.disagreement import allowed, tell_disagreement
+from crane.recordings.disagreement import tell_disagreement
+from crane.recordings.missing import Missing, MissingError
 from crane.recordings.postures import drives_of, motion_by
 from crane.recordings.reading import ALWAYS, Span, read
 from crane.recordings.recording import (
@@ -34,12 +35,11 @@ from crane.recordings.recording import (
     Recording,
     check_finite,
 )
+from crane.recordings.strokes import check_strokes
 from crane.recordings.timeseries import TIME, Table, column
+from crane.recordings.tolerances import HELD, allowed
 
 _CHAMBER = re.compile("pressure_.+_[ab]")
-# by which a joint that is held may be off [rad], [m]; of a machine of less than a metre a share of
-# its size
-_HELD = {"rad": 0.02, "m": 2e-3}
 
 
 def read_measured(
@@ -76,6 +76,7 @@ def completed(machine: Machine, table: Table, path: str | Path) -> Recording:
     """
     full = all(x in table.units and x + FORCE in table.units for x in machine.active)
     try:
+        check_strokes(machine, table)
         if not full:
             table = _completed(machine, table)
         tell_disagreement(machine, table)
@@ -97,18 +98,15 @@ def _completed(machine: Machine, table: Table) -> Table:
     # before anything is computed from them, to name the column as it is in the file
     check_finite(dict(zip(table.units, table.values.T, strict=True)))
     check_pressures(machine, table)
-    forces, missing = [], []
-    for joint in machine.active:
-        try:
-            forces.append(_force(machine, joint, table))
-        except RecordingError as error:
-            missing.append(str(error))
-    try:
+    missing = Missing(machine, table)
+    forces: list[Array] = []
+    drives: tuple[str, ...] = ()
+    with missing.noted():
         drives = drives_of(machine, list(table.units))
-    except RecordingError as error:
-        missing.insert(0, str(error))
-    if missing:
-        raise RecordingError("; ".join(missing))
+    for joint in machine.active:
+        with missing.noted():
+            forces.append(_force(machine, joint, table))
+    missing.refuse()
     q, v = motion_by(machine, drives, table)
     columns = {TIME: column(table, TIME)} | dict(zip(machine.active, q.T, strict=True))
     columns |= {x + VELOCITY: v[:, i] for i, x in enumerate(machine.active)}
@@ -155,12 +153,12 @@ def moved_locks(
     told = []
     for joint, place in machine.locks.items():
         unit = units.get(joint, "")
-        if joint not in columns or unit not in _HELD:
+        if joint not in columns or unit not in HELD:
             continue
         x = columns[joint]
         noise = float(np.median(np.abs(np.diff(x)))) if len(x) > 1 else 0.0
         low, high = np.quantile(x, [0.005, 0.995])
-        if max(high - place, place - low) > allowed(_HELD, machine, unit) + 8 * noise:
+        if max(high - place, place - low) > allowed(HELD, machine, unit) + 8 * noise:
             told.append(
                 f"'{joint}' is locked at {place:.4g} {unit}, but goes from {low:.4g} to "
                 f"{high:.4g} {unit} in the recording"
@@ -183,9 +181,8 @@ def _force(machine: Machine, joint: str, table: Table) -> Array:
         )
     if cylinder is None or not there:
         pressures = "" if cylinder is None else f", or '{a} [Pa]' and '{b} [Pa]'"
-        raise RecordingError(
-            f"column '{joint}{FORCE}' is missing, give it in [{unit}]{pressures}, or lock the "
-            f"joint if it was held (lock {joint}=VALUE)"
+        raise MissingError(
+            f"column '{joint}{FORCE}' is missing, give it in [{unit}]{pressures}", [joint]
         )
     if len(there) < 2:
         missing = b if a in there else a

@@ -13,6 +13,7 @@ from crane.closure import Closure
 from crane.common.errors import ClosureError, MechanismError, RecordingError
 from crane.common.samples import Array
 from crane.machine import Machine
+from crane.recordings.missing import MissingError
 from crane.recordings.recording import VELOCITY, VELOCITY_UNITS, derivative
 from crane.recordings.timeseries import TIME, Table, column
 
@@ -54,13 +55,11 @@ def drives_of(machine: Machine, names: Sequence[str]) -> tuple[str, ...]:
                 told = np.vstack([told, direction])
                 missing.append(joint)
         others = ", ".join(x for x in telling if x not in machine.active)
-        one = len(missing) == 1
-        raise RecordingError(
-            f"nothing tells where {', '.join(repr(x) for x in missing)} {'is' if one else 'are'}, "
-            f"give {', '.join(repr(f'{x} [{machine.unit(x)}]') for x in missing)}"
-            + (f", or a joint that moves with {'it' if one else 'them'} ({others})" * bool(others))
-            + f", or lock what was held (lock {', '.join(f'{x}=VALUE' for x in missing)})"
-        )
+        it, are = ("it", "is") if len(missing) == 1 else ("them", "are")
+        given = ", ".join(repr(f"{x} [{machine.unit(x)}]") for x in missing)
+        also = f", or a joint that moves with {it} ({others})" if others else ""
+        text = f"nothing tells where {', '.join(map(repr, missing))} {are}, give {given}{also}"
+        raise MissingError(text, missing)
     return tuple(drives)
 
 

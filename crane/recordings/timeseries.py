@@ -323,7 +323,10 @@ def _units(heading: str) -> dict[str, str]:
         check_column(name, unit)
         units[name] = unit
     if TIME not in units:
-        raise RecordingError(f"no column '{TIME}' in the header, add '{TIME} [s]'")
+        raise RecordingError(
+            f"no column '{TIME}' in the header, add '{TIME} [s]', or say by a file of columns "
+            "(--columns) which column of a log is which"
+        )
     check_unit(TIME, units[TIME], spellings("s"))
     return units
 

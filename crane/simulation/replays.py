@@ -14,7 +14,8 @@ from crane.description.sensors import SIGNAL, SUPPLY, TANK
 from crane.machine import Machine
 from crane.recordings.disagreement import tell_disagreement
 from crane.recordings.measured import check_pressures, moved_locks
-from crane.recordings.postures import joint_motion
+from crane.recordings.missing import Missing
+from crane.recordings.postures import drives_of, joint_motion
 from crane.recordings.reading import ALWAYS, Span, read
 from crane.recordings.recording import (
     FORCE,
@@ -24,6 +25,7 @@ from crane.recordings.recording import (
     Recording,
     derivative,
 )
+from crane.recordings.strokes import check_strokes
 from crane.recordings.timeseries import TIME, Table, check_unit, column, spellings
 from crane.simulation.run import Progress, simulate
 
@@ -225,15 +227,21 @@ def inputs_of(machine: Machine, table: Table) -> Inputs:
     time = time - time[0]
     if len(time) < 2:
         raise RecordingError("has one sample, give at least two")
-    signals = _signals(machine, joints, table)
+    signals, pressures, missing = {}, {}, Missing(machine, table)
+    with missing.noted():
+        signals = _signals(machine, joints, table)
     check_pressures(machine, table)
     supply, tank = (
         column(table, name, "Pa") if name in table.units else None for name in (SUPPLY, TANK)
     )
-    moved = list(signals.values())
-    pressures = _pressures(joints, table, time)
+    with missing.noted():
+        pressures = _pressures(joints, table, time)
     there = any(joint in table.units for joint in machine.joints)
-    initial = _initial(machine, table, time, moved) if there else None
+    if there:
+        with missing.noted():
+            drives_of(machine, list(table.units))
+    missing.refuse()
+    initial = _initial(machine, table, time, list(signals.values())) if there else None
     return Inputs(time, signals, supply, tank, pressures, initial)
 
 
@@ -274,6 +282,7 @@ def _initial(
     """Active coordinates and velocities at the start."""
     for text in moved_locks(machine, _columns(table), table.units):
         raise RecordingError(f"{text}, do not lock it, or lock it where it is")
+    check_strokes(machine, table)
     tell_disagreement(machine, table)
     q_a, v_a = joint_motion(machine, table)
     _warn_of_limits(machine, time, q_a)

@@ -137,17 +137,21 @@ def cylinder_signals(
             f"limits are {lower:.4g} and {upper:.4g}, check its zero and unit"
         )
     step = sampling(recording.time)
-    pressures = [
-        channel(recording, name, "Pa")
-        for name in (
-            f"pressure_{joint}_a", f"pressure_{joint}_b", "pressure_supply", "pressure_tank",
+    names = [f"pressure_{joint}_a", f"pressure_{joint}_b", "pressure_supply", "pressure_tank"]
+    spool, signal = f"spool_{joint}", f"voltage_{joint}"
+    missing = [f"'{name} [Pa]'" for name in names if name not in recording.channels]
+    if spool not in recording.channels and signal not in recording.channels:
+        missing.append(f"'{signal} [V]' (or '{spool}')")
+    if missing:
+        raise RecordingError(
+            f"columns are missing: {', '.join(missing)}; there are "
+            f"{', '.join(recording.channels) or 'no channels'}"
         )
-    ]  # fmt: skip
-    spool = f"spool_{joint}"
+    pressures = [channel(recording, name, "Pa") for name in names]
     if spool in recording.channels:
         y = opening(valve, recording.channels[spool])
     else:
-        voltage = channel(recording, f"voltage_{joint}", "V")
+        voltage = channel(recording, signal, "V")
         y = opening(valve, spool_position(valve, voltage, step))
     time, columns = recording.time, np.column_stack([q - lower, y, *pressures])
     if period is not None:
