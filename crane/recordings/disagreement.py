@@ -218,8 +218,8 @@ class _Pair:
         if self.rate:
             return ""
         return (
-            f"no constant offset explains it ({best.text(known)} leaves {factor * best.left:.3g} "
-            f"{unit}), a pin may not be where the file has it"
+            f"a constant offset leaves {factor * best.left:.3g} {unit} of it ({best.text(known)}): "
+            "a pin may not be where the file has it"
         )
 
     def _fitted(self, columns: list[Array]) -> tuple[Array, float]:

@@ -18,15 +18,13 @@ from crane.recordings.missing import Missing
 from crane.recordings.postures import drives_of, joint_motion
 from crane.recordings.reading import ALWAYS, Span, read
 from crane.recordings.recording import (
-    FORCE,
-    FORCE_UNITS,
     VELOCITY,
-    VELOCITY_UNITS,
     Recording,
     derivative,
 )
 from crane.recordings.strokes import check_strokes
-from crane.recordings.timeseries import TIME, Table, check_unit, column, spellings
+from crane.recordings.timeseries import TIME, Table, column
+from crane.simulation.readings import read_off, recorded_of
 from crane.simulation.run import Progress, simulate
 
 _FIRST, _LONGEST = 0.1, 1.0  # over which the start is fitted, and a rest looked for [s]
@@ -146,15 +144,16 @@ def replay(
         machine, drive, initial, steps * step, step, label=label, progress=progress
     )
     try:
-        return recording, compare(table, recording)
+        return recording, compare(machine, table, recording)
     except RecordingError as error:
         raise RecordingError(at(str(path), error)) from None
 
 
-def compare(table: Table, recording: Recording) -> Comparison:
-    """Channels that a file and a simulation both hold, but for the inputs.
+def compare(machine: Machine, table: Table, recording: Recording) -> Comparison:
+    """Channels that a file and a simulation both tell, but for the inputs.
 
     Args:
+        machine: What was simulated.
         table: What was measured.
         recording: What was simulated from the same instant on.
 
@@ -164,22 +163,15 @@ def compare(table: Table, recording: Recording) -> Comparison:
     time = column(table, TIME)
     time = time - time[0]
     inside = time <= recording.time[-1] * (1 + 1e-12)
-    columns = recording.columns()
-    units = recording.units | recording.channel_units
-    units |= {x + VELOCITY: VELOCITY_UNITS[unit] for x, unit in recording.units.items()}
-    units |= {x + FORCE: FORCE_UNITS[unit] for x, unit in recording.units.items()}
-    for name, unit in table.units.items():
-        if name in units:
-            check_unit(name, unit, spellings(units[name]))
+    names = recorded_of(machine, table, recording)
     found = [
         Channel(
             name,
             table.units[name],
             column(table, name)[inside],
-            np.interp(time[inside], recording.time, columns[name]),
+            np.interp(time[inside], recording.time, simulated),
         )
-        for name in table.units
-        if name in columns and name not in (TIME, SUPPLY, TANK) and not name.startswith(SIGNAL)
+        for name, simulated in zip(names, read_off(machine, recording, names).T, strict=True)
     ]
     return Comparison(time[inside], tuple(found))
 

@@ -19,7 +19,6 @@ from crane.description.sensors import (
 from crane.formats import load
 from crane.formats.loading import Variants
 from crane.identification.calibration.problem import Case, Problem, case_of, noise_of
-from crane.identification.calibration.readings import sensors_of
 from crane.identification.calibration.result import Calibration, Channel, Fitted
 from crane.identification.calibration.unknowns import Unknown, unknowns_of
 from crane.machine import Machine
@@ -27,6 +26,7 @@ from crane.recordings.logs import lines_of
 from crane.recordings.reading import ALWAYS, Span, known_sensors, readings, within
 from crane.recordings.recording import IDEAL, SENSORS
 from crane.recordings.timeseries import Table, heading_of
+from crane.simulation.readings import sensors_of
 
 Progress = Callable[[float], None]
 

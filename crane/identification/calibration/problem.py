@@ -12,11 +12,11 @@ from crane.common.errors import CraneError, InputError, SimulationError
 from crane.common.samples import Array
 from crane.description.sensors import SENSOR, SIGNAL, Sensor, with_numbers
 from crane.formats.loading import Variants
-from crane.identification.calibration.readings import read
 from crane.identification.calibration.unknowns import FITTED, Unknown
 from crane.machine import Machine
 from crane.recordings.reading import Span, corrected
 from crane.recordings.timeseries import TIME, Table, column
+from crane.simulation.readings import read_off
 from crane.simulation.replays import Inputs, inputs_of
 from crane.simulation.run import simulate
 
@@ -195,7 +195,7 @@ class Problem:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             run = simulate(machine, inputs.drive(machine), inputs.initial, steps * step, step)
-        return CubicSpline(run.time, read(machine, run, case.sensors))
+        return CubicSpline(run.time, read_off(machine, run, case.sensors))
 
     def _started(self, case: Case, z: Array) -> Inputs:
         """Inputs with another start."""

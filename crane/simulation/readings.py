@@ -1,7 +1,8 @@
-"""What a machine's sensors say while it is simulated."""
+"""What ideal sensors say of a simulation, beside what was measured."""
+
+from collections.abc import Mapping
 
 import numpy as np
-import pinocchio as pin
 
 from crane.common.errors import RecordingError, known
 from crane.common.samples import Array
@@ -14,6 +15,7 @@ from crane.description.sensors import (
     TANK,
     VELOCITY,
     VELOCITY_UNITS,
+    unit_of,
 )
 from crane.machine import Machine
 from crane.recordings.recording import Recording
@@ -32,22 +34,38 @@ def sensors_of(machine: Machine, table: Table) -> list[str]:
     Raises:
         RecordingError: A column is in a unit of something else, or of no link.
     """
-    units = _units(machine)
+    return _checked(machine, table, _units(machine))
+
+
+def recorded_of(machine: Machine, table: Table, recording: Recording) -> list[str]:
+    """Columns of a measured table that a recording of a simulation says something of.
+
+    Raises:
+        RecordingError: As for `sensors_of`.
+    """
+    units = recording.units | recording.channel_units
+    units |= {x + VELOCITY: VELOCITY_UNITS[unit] for x, unit in recording.units.items()}
+    units |= {x + FORCE: FORCE_UNITS[unit] for x, unit in recording.units.items()}
+    return _checked(machine, table, units)
+
+
+def _checked(machine: Machine, table: Table, units: Mapping[str, str]) -> list[str]:
+    """Columns, but for the inputs, that have one of these units by name, or are inclinations."""
     found = []
     for name, unit in table.units.items():
-        if name == TIME or name.startswith(_INPUTS):
+        if name == TIME:
             continue
+        wanted = units.get(name)
         if name.startswith(INCLINATION):
-            link = name.removeprefix(INCLINATION).removesuffix(VELOCITY)
-            links = [f.name for f in machine.model.frames if f.type == pin.FrameType.BODY]
-            if link not in links:
+            wanted = unit_of(machine.tree, name)
+            if wanted is None:
+                link = name.removeprefix(INCLINATION).removesuffix(VELOCITY)
+                links = machine.tree.links
                 raise RecordingError(f"column '{name}' is of no link, {known(links, link)}")
-            check_unit(name, unit, spellings("rad/s" if name.endswith(VELOCITY) else "rad"))
-        elif name in units:
-            check_unit(name, unit, spellings(units[name]))
-        else:
-            continue
-        found.append(name)
+        if wanted is not None:
+            check_unit(name, unit, spellings(wanted))
+            if not name.startswith(_INPUTS):
+                found.append(name)
     return found
 
 
@@ -64,7 +82,7 @@ def _units(machine: Machine) -> dict[str, str]:
     return units
 
 
-def read(machine: Machine, recording: Recording, names: list[str]) -> Array:
+def read_off(machine: Machine, recording: Recording, names: list[str]) -> Array:
     """What ideal sensors say (N, k) at the recorded instants, SI units.
 
     Args:
@@ -75,7 +93,8 @@ def read(machine: Machine, recording: Recording, names: list[str]) -> Array:
     columns = recording.columns()
     own = [name for name in names if name.startswith(INCLINATION)]
     found = columns | (_inclined(machine, recording, own) if own else {})
-    return np.column_stack([found[name] for name in names])
+    values = [found[name] for name in names]
+    return np.column_stack(values) if values else np.empty((len(recording.time), 0))
 
 
 def _inclined(machine: Machine, recording: Recording, names: list[str]) -> dict[str, Array]:
