@@ -218,8 +218,8 @@ class _Pair:
         if self.rate:
             return ""
         return (
-            f"a constant offset leaves {factor * best.left:.3g} {unit} of it ({best.text(known)}): "
-            "a pin may not be where the file has it"
+            f"a constant offset leaves {factor * best.left:.3g} {unit} of it "
+            f"({best.text(known)}): a pin may not be where the file has it"
         )
 
     def _fitted(self, columns: list[Array]) -> tuple[Array, float]:

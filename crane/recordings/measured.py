@@ -24,7 +24,7 @@ from crane.machine import Machine
 from crane.recordings.disagreement import tell_disagreement
 from crane.recordings.missing import Missing, MissingError
 from crane.recordings.postures import drives_of, motion_by
-from crane.recordings.reading import ALWAYS, Span, read
+from crane.recordings.reading import ALWAYS, Span, known_sensors, read
 from crane.recordings.recording import (
     FORCE,
     FORCE_UNITS,
@@ -82,8 +82,8 @@ def completed(machine: Machine, table: Table, path: str | Path) -> Recording:
         tell_disagreement(machine, table)
     except RecordingError as error:
         raise RecordingError(at(str(path), error)) from None
-    ideal = Table(table.units, table.values, table.notes | {SENSORS: IDEAL})
-    return Recording.from_table(ideal, path)
+    notes = table.notes | ({SENSORS: IDEAL} if known_sensors(table, machine) else {})
+    return Recording.from_table(Table(table.units, table.values, notes), path)
 
 
 def is_measured(table: Table) -> bool:

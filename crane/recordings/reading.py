@@ -59,7 +59,10 @@ def read(
 def quantities(table: Table, path: str | Path, machine: Machine | None, span: Span) -> Table:
     """The same from readings of a path."""
     try:
-        table = corrected(table, known_sensors(table, machine))
+        known = known_sensors(table, machine)
+        if known and machine is not None:
+            _tell_both(table, machine)
+        table = corrected(table, known)
     except RecordingError as error:
         raise RecordingError(at(str(path), error)) from None
     return within(table, span, path)
@@ -115,6 +118,14 @@ def known_sensors(table: Table, machine: Machine | None = None) -> dict[str, Sen
     if table.notes.get(SENSORS) == IDEAL:
         return {}
     found = {} if machine is None else dict(machine.sensors)
+    try:
+        return with_numbers(found, _noted(table))
+    except InputError as error:
+        raise RecordingError(f"the note {error}") from None
+
+
+def _noted(table: Table) -> dict[str, float]:
+    """Numbers of sensors in the notes."""
     numbers = {}
     for name, text in table.notes.items():
         if not name.startswith(SENSOR):
@@ -126,19 +137,15 @@ def known_sensors(table: Table, machine: Machine | None = None) -> dict[str, Sen
             raise RecordingError(f"the note {error}") from None
         except ValueError:
             raise RecordingError(f"the note '{name}' is '{text}', give a number") from None
-    _tell_both(found, numbers)
-    try:
-        return with_numbers(found, numbers)
-    except InputError as error:
-        raise RecordingError(f"the note {error}") from None
+    return numbers
 
 
-def _tell_both(sensors: Mapping[str, Sensor], notes: Mapping[str, float]) -> None:
+def _tell_both(table: Table, machine: Machine) -> None:
     """Warn of numbers that the machine and a recording say differently."""
-    here = named_numbers(sensors)
+    here = named_numbers(machine.sensors)
     told = [
         f"{name} ({value:g}, not {here[name]:g})"
-        for name, value in notes.items()
+        for name, value in _noted(table).items()
         if name in here and here[name] not in (value, getattr(Sensor(), parsed(name)[1]))
     ]
     if told:
