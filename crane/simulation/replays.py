@@ -340,11 +340,12 @@ def _first(time: Array, x: Array, order: int) -> float:
     deviations of both (Lepski 1990).
     """
     lowest, highest, found = -np.inf, np.inf, 0.0
+    last = max(int(np.searchsorted(time, time[0] + _FIRST, side="right")), _FEWEST)
     if order == 0 and len(x) > _FEWEST:  # the sample itself, its noise by third differences
-        std = float(np.sqrt(np.mean(np.diff(x[time <= time[0] + _FIRST], 3) ** 2) / 20))
+        std = float(np.sqrt(np.mean(np.diff(x[:last], 3) ** 2) / 20))
         found, lowest, highest = float(x[0]), x[0] - 2 * std, x[0] + 2 * std
-    count, last = _FEWEST, np.searchsorted(time, time[0] + _FIRST, side="right")
-    while count <= max(last, _FEWEST):
+    count = _FEWEST
+    while count <= last:
         value, std = _parabola(time[:count], x[:count], order)
         if value + 2 * std < lowest or value - 2 * std > highest:
             break
