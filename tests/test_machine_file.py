@@ -142,8 +142,8 @@ TEXT = [
         "control characters in a key",
         "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, known: "
         "active, chains, control, couplings, drives, end_stops, forces, free, friction, "
-        "gas_springs, home, hydraulics, loops, name, payload, ropes, rotor_inertia, source, "
-        "tasks, tip",
+        "gas_springs, home, hydraulics, loops, name, payload, ropes, rotor_inertia, sensors, "
+        "source, tasks, tip",
         swap("tip: coupler_pin", '"tip\\n\\e[31m": coupler_pin'),
     ),
     case(
@@ -164,8 +164,8 @@ KEYS = [
         "unknown key far from all",
         "four_bar.yaml:29: unknown key 'gravity' in the machine file, known: "
         "active, chains, control, couplings, drives, end_stops, forces, free, friction, "
-        "gas_springs, home, hydraulics, loops, name, payload, ropes, rotor_inertia, source, "
-        "tasks, tip",
+        "gas_springs, home, hydraulics, loops, name, payload, ropes, rotor_inertia, sensors, "
+        "source, tasks, tip",
         swap("tip: coupler_pin", "gravity: 9.81"),
     ),
     case(
