@@ -12,7 +12,9 @@ from typed import typed
 import crane
 from crane.common.errors import CraneError, CraneWarning, InputError, RecordingError
 from crane.description.sensors import Sensor
+from crane.formats.loading import Variants
 from crane.recordings import timeseries
+from crane.recordings.pins import pin_slopes
 from crane.recordings.reading import corrected, read, within
 from crane.recordings.recording import Recording
 from crane.recordings.sensed import sensed
@@ -271,32 +273,56 @@ def test_how_far_apart_is_told(machine, motion, tmp_path):
     )
     wanted = np.rad2deg([0.04 + bend.mean(), 0.04 + bend.min(), 0.04 + bend.max()])
     np.testing.assert_allclose([float(x) for x in found.groups()], wanted, rtol=5e-3)
-    assert "a constant offset leaves 0.8" in line and "a pin may not be where" in line
+    assert "a constant offset leaves 0.81 deg of it (sensor.q2.zero = 0.04" in line
 
 
 def test_delays_and_scales_are_told_apart(machine, motion, tmp_path):
     columns, _ = motion
     late = lambda x: np.interp(columns["time"] - 0.3, columns["time"], x)  # noqa: E731
     (line,) = told(machine, written(tmp_path, motion, ["q3"], q3=late))
-    assert "an offset and a delay explain it" in line
+    assert "a delay besides" in line
     assert number(line, "sensor.q3.delay") == pytest.approx(0.3, abs=0.02)
     (line,) = told(machine, written(tmp_path, motion, ["q2"], q2=lambda x: 1.1 * x + 0.02))
-    assert "an offset and a scale explain it" in line
+    assert "a scale besides" in line
+    line = line.split("a scale besides")[1]
     assert number(line, "sensor.q2.scale") == pytest.approx(1.1, abs=1e-3)
     assert number(line, "sensor.q2.zero") == pytest.approx(0.02, abs=1e-3)
     (line,) = told(machine, written(tmp_path, motion, ["q2"], q2=lambda x: 0 * x))
     assert line.endswith("it does not move")
 
 
-def test_a_pin_elsewhere_is_no_zero(machine, motion, tmp_path):
-    """The recording of a crane whose lift cylinder stands 60 mm from where the file has it."""
-    other = crane.load("patu655", changes={"lift_boom_rod.x": 0.36}, lock=LOCKED)
+@pytest.mark.parametrize(
+    ("name", "at"), [("lift_boom_rod.x", 0.3225), ("lift_boom_rod.y", -0.145)]
+)
+def test_a_pin_elsewhere_is_named(machine, motion, tmp_path, name, at):
+    """The recording of a crane that differs from its drawing by 20 or 40 mm in one pin."""
+    other = crane.load("patu655", changes={name: at}, lock=LOCKED)
     columns, units = motion
     q = other.closure.solve(np.column_stack([columns["X_lift"], columns["X_tilt"]]))
-    moved = columns | {"q2": q[:, other.column("q2")]}
-    (line,) = told(machine, written(tmp_path, (moved, units), ["q2"]))
-    assert "a constant offset explains it" not in line
+    moved = columns | {x: q[:, other.column(x)] for x in ("q2", "q3")}
+    (line,) = told(machine, written(tmp_path, (moved, units), ["q2", "q3"]))
     assert told(other, tmp_path / "run.csv") == []
+    assert "'q2'" in line and "a constant offset leaves" in line
+    assert "a pin elsewhere alone" in line
+    drawn = Variants(machine).values[name]  # found to first order of how far it is off
+    assert number(line, name) == pytest.approx(at, abs=0.06 * abs(at - drawn))
+
+
+def test_postures_change_with_pins_as_other_machines_have_them(machine):
+    """Central differences over machines that are loaded with pins elsewhere."""
+    random = np.random.default_rng(3)
+    q_a = random.uniform(0.2, 0.8, (4, 2)) * (machine.upper - machine.lower)
+    slopes = pin_slopes(machine, machine.closure.solve(q_a))
+    variants = Variants(machine)
+    assert {name.rpartition(".")[0] for name in slopes} == {
+        "lift_boom_rod", "lift_eye", "tilt_eye", "tilt_boom_bracket", "bracket2_eye"
+    }  # fmt: skip
+    for name in ("lift_boom_rod.y", "lift_eye.x", "tilt_boom_bracket.x", "bracket2_eye.z"):
+        place = variants.values[name]
+        one, two = (
+            variants.machine({name: place + step}).closure.solve(q_a) for step in (1e-5, -1e-5)
+        )
+        np.testing.assert_allclose(slopes[name], (one - two) / 2e-5, atol=1e-7)
 
 
 def test_an_absolute_angle_in_the_place_of_a_joint_s_is_suspected(machine, motion, tmp_path):
@@ -428,6 +454,8 @@ def test_a_raw_log_s_disagreement_is_told(machine, tmp_path):
     assert "'inclination_lift_boom' is -1.37 deg off on the mean (-2.69 to +0.201" in lift
     assert "'inclination_tilt_boom' is -4.87 deg off on the mean" in tilt
     assert "against X_lift, X_tilt" in tilt
+    places = [number(line, "lift_boom_rod.x") for line in (lift, tilt)]  # both say the same pin
+    np.testing.assert_allclose(places, 0.316, atol=1e-3)
     columns.write_text(COLUMNS.replace(" - 820", "").replace(" - 1050", ""))
     done = typed("simulate", "patu655", *LOCKS, "--inputs", LIFTING, "--columns", columns,
                  "--out", tmp_path / "out")  # fmt: skip

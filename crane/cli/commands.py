@@ -188,10 +188,11 @@ def is_run(what: str) -> bool:
 
 def _describe(machine: "Machine") -> Iterator[str]:
     from crane.common.units import quantity
+    from crane.description.sensors import Sensor
     from crane.dynamics import Dynamics
     from crane.dynamics.lengths import Lengths
 
-    closure = machine.closure
+    closure, ideal = machine.closure, Sensor().numbers()
     structure = closure.structure
     mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
     yield f"{machine.name}"
@@ -262,6 +263,10 @@ def _describe(machine: "Machine") -> Iterator[str]:
                 f"    {joint:<{width}}{kind}, {size * cylinder.area_a:.4g} and "
                 f"{size * cylinder.area_b:.4g} {unit}"
             )
+    for name, sensor in machine.sensors.items():
+        known = [f"{what} {x:g}" for what, x in sensor.numbers().items() if x != ideal[what]]
+        where = [f"{sensor.column} [{sensor.unit}]" if sensor.unit else sensor.column]
+        yield f"  sensor      {name}: {', '.join([x for x in where if x] + known) or 'ideal'}"
     for task in machine.tasks.values():
         yield f"  task        {task.name}, {task.duration:g} s: {task.description}"
 

@@ -1,14 +1,15 @@
 """Sensors that say more than is needed, compared through the machine's loops.
 
-Those that determine the posture put every other sensor where it should be; what it reads instead
+Those that determine the posture put every other sensor where it should be. What it reads instead
 is explained by the simplest that leaves no more than noise, by least squares over the recording:
-a zero of the sensor or of one of those that determine it, then a zero with a delay or a scale.
-Rates are compared as what they add up to, so that their noise does not hide their zero.
+a zero of the sensor or of one of those that determine it, then a delay, a scale, or a pin that is
+not where the file has it. Rates are compared as what they add up to, so that noise does not hide
+their zero.
 """
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +18,7 @@ from crane.common.errors import ClosureError, CraneWarning, MechanismError
 from crane.common.samples import Array
 from crane.description.sensors import INCLINATION, SENSOR, VELOCITY, Sensor, unit_of
 from crane.machine import Machine
+from crane.recordings.pins import pin_slopes
 from crane.recordings.postures import drives_of
 from crane.recordings.reading import known_sensors
 from crane.recordings.sensed import sensed
@@ -26,7 +28,9 @@ from crane.recordings.tolerances import AGREE, allowed
 _COMPARED = 2000  # samples at which they are compared
 _NOISE = 3.3, 2.0  # standard deviations that tell a difference, and that explain what is left
 _AS_GOOD = 2.0  # times what the best explanation leaves
-_BETTER = 0.5  # of what a zero leaves
+_BETTER = 0.8  # of what a zero leaves, below which more is told
+_NEAR, _LISTED = 1.3, 2  # times the best of those, and how many
+_SMOOTH = 200  # samples of slopes
 _STILL = 0.05  # of the motion that it should tell
 _MOVES = 4.0  # times what sensors may differ by, over which scale and delay show
 _FLAT = 1e-6  # slope of what does not depend on something
@@ -102,11 +106,24 @@ class _Postures:
         q = self.q if q is None else q
         return sensed(self.machine, q, np.zeros_like(q), [name])[name]
 
-    def slopes(self, name: str, q: Array) -> Array:
-        """(N, n) of the same by what is used."""
-        gamma = self.machine.closure.gamma(q)
-        rows = [sensed(self.machine, q, g, [name + VELOCITY]) for g in np.moveaxis(gamma, 2, 0)]
-        return np.column_stack([row[name + VELOCITY] for row in rows])
+    def slope(self, name: str, q: Array, dq: Array) -> Array:
+        """(N,) of the same along changes (N, nv) of postures."""
+        return sensed(self.machine, q, dq, [name + VELOCITY])[name + VELOCITY]
+
+    @cached_property
+    def few(self) -> slice:
+        """Samples enough for slopes, which are smooth."""
+        return slice(None, None, max(1, len(self.time) // _SMOOTH))
+
+    @cached_property
+    def places(self) -> dict[str, tuple[float, float, float]]:
+        """Of links on those that carry them [m]."""
+        return {joint.child: joint.xyz for joint in self.machine.tree.joints.values()}
+
+    @cached_property
+    def pins(self) -> dict[str, Array]:
+        """Derivatives of a few postures by the places of pins, see `pin_slopes`."""
+        return pin_slopes(self.machine, self.q[self.few])
 
 
 @dataclass(frozen=True)
@@ -114,28 +131,29 @@ class _Cause:
     """What may explain a difference.
 
     Attributes:
-        numbers: Of sensors, by sensor and by what: zero, scale and delay of what is compared now.
+        sensors: By sensor its zero, scale and delay, on top of what is known of it.
         left: Root mean square of what it leaves.
         words: What it is.
+        pins: By name where a pin would have to be [m].
     """
 
-    numbers: dict[str, dict[str, float]]
+    sensors: dict[str, dict[str, float]]
     left: float
     words: str
+    pins: dict[str, float] = field(default_factory=dict)
 
-    def text(self, known: Mapping[str, Sensor]) -> str:
-        """Numbers as machine files and options take them, on top of what is known already."""
+    def numbers(self, known: Mapping[str, Sensor]) -> str:
+        """As machine files, notes and options take them."""
         found = []
-        for name, now in self.numbers.items():
+        for name, now in self.sensors.items():
             was = known.get(name, Sensor())
-            scale = now.get("scale", 1.0)
             values = {
                 "zero": was.zero + was.scale * now.get("zero", 0.0),
-                "scale": was.scale * scale,
+                "scale": was.scale * now.get("scale", 1.0),
                 "delay": was.delay + now.get("delay", 0.0),
             }
             found += [f"{SENSOR}{name}.{what} = {values[what]:.4g}" for what in now]
-        return ", ".join(found)
+        return ", ".join(found + [f"{name} = {value:.4g}" for name, value in self.pins.items()])
 
 
 class _Pair:
@@ -165,6 +183,7 @@ class _Pair:
         few = len(self.off) < 3
         self.noise = 0.0 if few else float(np.median(np.abs(np.diff(self.off, 2)))) / 1.65
         self.allowed = allowed(AGREE, postures.machine, self.unit)
+        self.limit = max(self.allowed, _NOISE[1] * self.noise)  # of what a cause may leave
 
     def told(self, known: Mapping[str, Sensor]) -> str:
         """How they disagree, and why; "" where they do not."""
@@ -191,36 +210,42 @@ class _Pair:
     @property
     def _used(self) -> list[str]:
         """Joints that tell it."""
-        few = slice(None, None, max(1, len(self.time) // 10))
-        slopes = self._postures.slopes(self.base, self._postures.q[few])
-        joints = self._postures.machine.active
-        tells = np.abs(slopes).max(axis=0) > _FLAT
-        return [x for x, one in zip(joints, tells, strict=True) if one]
+        postures = self._postures
+        q = postures.q[postures.few]
+        gamma = postures.machine.closure.gamma(q)
+        slopes = [postures.slope(self.base, q, g) for g in np.moveaxis(gamma, 2, 0)]
+        pairs = zip(postures.machine.active, slopes, strict=True)
+        return [joint for joint, slope in pairs if np.abs(slope).max() > _FLAT]
 
     def _why(self, known: Mapping[str, Sensor]) -> str:
         """In words; of a rate "" where nothing explains it."""
-        zeros = sorted([self._zero(), *self._zeros_of_others()], key=lambda x: x.left)
-        limit, best = max(self.allowed, _NOISE[1] * self.noise), zeros[0]
-        unit, factor = _SHOWN[self.unit]
-        if best.left <= limit:
-            most = max(_AS_GOOD * best.left, 0.2 * self.allowed)
-            named = " or ".join(x.text(known) for x in zeros if x.left <= most)
-            return f"a constant offset explains it, {named}"
-        absolute = self._absolute(best)
-        if absolute:
-            return absolute
-        if np.ptp(self.measured) < _STILL * np.ptp(self.said) and not self.rate:
-            return "it does not move"
-        more = min(self._with_zero(), key=lambda x: x.left, default=best)
-        if more.left <= limit or (more.left < _BETTER * best.left and not self.rate):
-            left = f"{factor * more.left:.2g} {unit}"
-            return f"{more.words} explain it but for {left}, {more.text(known)}"
+        own, limit = self._zero(), self.limit
+        zeros = sorted([own, *self._zeros_of_others()], key=lambda x: x.left)
+        zero = zeros[0] if zeros[0].left < _BETTER * own.left else own
+        if zeros[0].left <= limit:
+            most = max(_AS_GOOD * zeros[0].left, 0.2 * self.allowed)
+            named = " or ".join(x.numbers(known) for x in zeros if x.left <= most)
+            return f"a constant offset explains it but for {self._shown(zeros[0].left)}, {named}"
+        if np.ptp(self.measured) < _STILL * np.ptp(self.said):
+            return "" if self.rate else "it does not move"
+        more = sorted([*self._with_zero(), *self._with_pins()], key=lambda x: x.left)
         if self.rate:
-            return ""
-        return (
-            f"a constant offset leaves {factor * best.left:.3g} {unit} of it "
-            f"({best.text(known)}): a pin may not be where the file has it"
-        )
+            more = [x for x in more if x.left <= limit]
+            return self._told([zero, more[0]], known) if more else ""
+        if absolute := self._absolute(zero):
+            return absolute
+        most = min(_BETTER * zero.left, max(limit, _NEAR * more[0].left)) if more else 0.0
+        best = sorted((x for x in more if x.left <= most), key=lambda x: len(x.sensors))
+        return self._told([zero, *best[:_LISTED]], known)
+
+    def _told(self, causes: list[_Cause], known: Mapping[str, Sensor]) -> str:
+        first, *more = ((x.words, self._shown(x.left), x.numbers(known)) for x in causes)
+        told = [f"{first[0]} leaves {first[1]} of it ({first[2]})"]
+        return ", ".join(told + [f"{words} {left} ({numbers})" for words, left, numbers in more])
+
+    def _shown(self, left: float) -> str:
+        unit, factor = _SHOWN[self.unit]
+        return f"{factor * left:.2g} {unit}"
 
     def _fitted(self, columns: list[Array]) -> tuple[Array, float]:
         """Least squares of the difference over columns (N,), and what they leave."""
@@ -236,7 +261,7 @@ class _Pair:
 
     def _zero(self) -> _Cause:
         values, left = self._fitted([self._one])
-        return _Cause({self.name: {"zero": float(values[0])}}, left, "an offset")
+        return _Cause({self.name: {"zero": float(values[0])}}, left, "a constant offset")
 
     def _with_zero(self) -> list[_Cause]:
         """A zero with a delay, and with a scale."""
@@ -249,7 +274,7 @@ class _Pair:
             if what == "delay" and value < 0:
                 continue  # a sensor does not know what comes
             numbers = {"zero": float(zero), what: value}
-            found.append(_Cause({self.name: numbers}, left, f"an offset and a {what}"))
+            found.append(_Cause({self.name: numbers}, left, f"a {what} besides"))
         return found
 
     def _zeros_of_others(self) -> list[_Cause]:
@@ -265,14 +290,37 @@ class _Pair:
                     q = self._postures.machine.closure.solve(moved)
                     off = self.off + self.said - self._postures.said(self.name, q)
                     left = float(np.sqrt(np.mean(off**2)))
-                    slope = -self._postures.slopes(self.name, q)[:, i]
+                    gamma = self._postures.machine.closure.gamma(q)
+                    slope = -self._postures.slope(self.name, q, gamma[:, :, i])
                     if np.abs(slope).max() < _FLAT:
                         break
                     zero += float(slope @ off / (slope @ slope))
             except ClosureError:
                 continue
-            found.append(_Cause({drives[i]: {"zero": zero}}, left, "an offset"))
+            found.append(_Cause({drives[i]: {"zero": zero}}, left, "a constant offset"))
         return found
+
+    def _with_pins(self) -> list[_Cause]:
+        """The place of a pin, alone or with a zero, to first order: of each the least move."""
+        postures = self._postures
+        q, time = postures.q[postures.few], self.time[postures.few]
+        found: dict[str, list[tuple[float, _Cause]]] = {}
+        for name, dq in postures.pins.items() if not self.rate else ():
+            few = postures.slope(self.name, q, dq)
+            if np.abs(few).max() < _FLAT:
+                continue
+            link, _, axis = name.rpartition(".")
+            place = postures.places[link]["xyz".index(axis)]
+            slope = np.interp(self.time, time, few)
+            (move, zero), left = self._fitted([slope, self._one])
+            (alone,), rest = self._fitted([slope])
+            if rest <= max(_NEAR * left, self.limit):
+                move, own, left, words = alone, {}, rest, "a pin elsewhere alone"
+            else:
+                own, words = {self.name: {"zero": float(zero)}}, "a pin elsewhere besides"
+            cause = _Cause(own, left, words, {name: float(place + move)})
+            found.setdefault(link, []).append((abs(float(move)), cause))
+        return [_least(causes, self.limit) for causes in found.values()]
 
     def _absolute(self, best: _Cause) -> str:
         """That an angle of a joint follows the inclination of its link, where it does."""
@@ -283,7 +331,7 @@ class _Pair:
         inclined = self._postures.said(INCLINATION + link)
         for sign in (1.0, -1.0):
             off = self.measured - sign * inclined
-            if off.std() <= max(self.allowed, _NOISE[1] * self.noise, 0.0) < best.left:
+            if off.std() <= self.limit < best.left:
                 turned = "" if sign > 0 else " with its sign turned"
                 return (
                     f"it follows the inclination of '{link}' against the horizon within "
@@ -291,6 +339,13 @@ class _Pair:
                     f"'{INCLINATION}{link}'{turned}"
                 )
         return ""
+
+
+def _least(causes: list[tuple[float, _Cause]], limit: float) -> _Cause:
+    """Of moves of one pin that explain about as much, the smallest."""
+    most = max(limit, _NEAR * min(cause.left for _, cause in causes))
+    near = [(move, cause) for move, cause in causes if cause.left <= most]
+    return min(near, key=lambda pair: (len(pair[1].sensors), pair[0]))[1]
 
 
 def _added_up(time: Array, rate: Array) -> Array:
