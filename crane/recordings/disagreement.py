@@ -10,7 +10,6 @@ their zero.
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 
@@ -18,19 +17,15 @@ from crane.common.errors import ClosureError, CraneWarning, MechanismError
 from crane.common.samples import Array
 from crane.description.sensors import INCLINATION, SENSOR, VELOCITY, Sensor, unit_of
 from crane.machine import Machine
-from crane.recordings.pins import pin_slopes
-from crane.recordings.postures import drives_of
+from crane.recordings.postures import Postures
 from crane.recordings.reading import known_sensors
-from crane.recordings.sensed import sensed
 from crane.recordings.timeseries import TIME, Table, column
 from crane.recordings.tolerances import AGREE, allowed
 
-_COMPARED = 2000  # samples at which they are compared
 _NOISE = 3.3, 2.0  # standard deviations that tell a difference, and that explain what is left
 _AS_GOOD = 2.0  # times what the best explanation leaves
 _BETTER = 0.8  # of what a zero leaves, below which more is told
 _NEAR, _LISTED = 1.3, 2  # times the best of those, and how many
-_SMOOTH = 200  # samples of slopes
 _STILL = 0.05  # of the motion that it should tell
 _MOVES = 4.0  # times what sensors may differ by, over which scale and delay show
 _FLAT = 1e-6  # slope of what does not depend on something
@@ -46,7 +41,7 @@ def tell_disagreement(machine: Machine, table: Table) -> None:
     """
     known = known_sensors(table, machine)
     try:
-        postures = _Postures(machine, table)
+        postures = Postures(machine, table)
         pairs = [_Pair(postures, name) for name in _others(machine, table, postures.drives)]
         told = [text for pair in pairs if (text := pair.told(known))]
     except (ClosureError, MechanismError):  # whoever closes the loops tells it
@@ -64,66 +59,6 @@ def _others(machine: Machine, table: Table, drives: tuple[str, ...]) -> list[str
         if tells and name not in drives and unit == unit_of(machine.tree, name):
             found.append(name)
     return found
-
-
-class _Postures:
-    """Where the joints that are used put a machine, at some samples.
-
-    Attributes:
-        machine: Driven by them.
-        drives: Their names.
-        chosen: Which samples.
-        time: (N,) [s].
-    """
-
-    def __init__(self, machine: Machine, table: Table):
-        self.table, self.drives = table, drives_of(machine, list(table.units))
-        self.chosen = slice(None, None, max(1, len(table.values) // _COMPARED))
-        self.time = column(table, TIME)[self.chosen]
-        self._measured = machine
-        self._size = machine.closure.size
-
-    @cached_property
-    def machine(self) -> Machine:
-        """Driven by what is used."""
-        same = set(self.drives) == set(self._measured.active)
-        return self._measured if same else self._measured.driven_by(self.drives)
-
-    @cached_property
-    def q_b(self) -> Array:
-        """(N, n) as measured."""
-        machine = self.machine
-        columns = [column(self.table, x, machine.unit(x))[self.chosen] for x in machine.active]
-        return np.column_stack(columns)
-
-    @cached_property
-    def q(self) -> Array:
-        """(N, nv) closed."""
-        return self.machine.closure.solve(self.q_b)
-
-    def said(self, name: str, q: Array | None = None) -> Array:
-        """(N,) of a joint or an inclination in these postures, or in others."""
-        q = self.q if q is None else q
-        return sensed(self.machine, q, np.zeros_like(q), [name])[name]
-
-    def slope(self, name: str, q: Array, dq: Array) -> Array:
-        """(N,) of the same along changes (N, nv) of postures."""
-        return sensed(self.machine, q, dq, [name + VELOCITY])[name + VELOCITY]
-
-    @cached_property
-    def few(self) -> slice:
-        """Samples enough for slopes, which are smooth."""
-        return slice(None, None, max(1, len(self.time) // _SMOOTH))
-
-    @cached_property
-    def places(self) -> dict[str, tuple[float, float, float]]:
-        """Of links on those that carry them [m]."""
-        return {joint.child: joint.xyz for joint in self.machine.tree.joints.values()}
-
-    @cached_property
-    def pins(self) -> dict[str, Array]:
-        """Derivatives of a few postures by the places of pins, see `pin_slopes`."""
-        return pin_slopes(self.machine, self.q[self.few])
 
 
 @dataclass(frozen=True)
@@ -164,7 +99,7 @@ class _Pair:
         name: Its column.
     """
 
-    def __init__(self, postures: _Postures, name: str):
+    def __init__(self, postures: Postures, name: str):
         self._postures, self.name = postures, name
         self.time = postures.time
         self.base = name.removesuffix(VELOCITY)
@@ -247,12 +182,13 @@ class _Pair:
         unit, factor = _SHOWN[self.unit]
         return f"{factor * left:.2g} {unit}"
 
-    def _fitted(self, columns: list[Array]) -> tuple[Array, float]:
-        """Least squares of the difference over columns (N,), and what they leave."""
+    def _fitted(self, columns: list[Array], off: Array | None = None) -> tuple[Array, float]:
+        """Least squares of the difference (N,) over columns (N,), and what they leave."""
+        off = self.off if off is None else off
         more = [np.ones_like(self.time)] if self.rate else []
         A = np.column_stack([*columns, *more])
-        values: Array = np.asarray(np.linalg.lstsq(A, self.off, rcond=None)[0])
-        return values, float(np.sqrt(np.mean((self.off - A @ values) ** 2)))
+        values: Array = np.asarray(np.linalg.lstsq(A, off, rcond=None)[0])
+        return values, float(np.sqrt(np.mean((off - A @ values) ** 2)))
 
     @property
     def _one(self) -> Array:
@@ -267,14 +203,19 @@ class _Pair:
         """A zero with a delay, and with a scale."""
         if np.ptp(self.said) < _MOVES * self.allowed:
             return []
-        found = []
-        for what, slope in (("delay", -np.gradient(self.said, self.time)), ("scale", self.said)):
-            (zero, more, *_), left = self._fitted([self._one, slope])
-            value = float(more) + (what == "scale")
-            if what == "delay" and value < 0:
-                continue  # a sensor does not know what comes
-            numbers = {"zero": float(zero), what: value}
-            found.append(_Cause({self.name: numbers}, left, f"a {what} besides"))
+        (zero, more, *_), left = self._fitted([self._one, self.said])
+        numbers = {"zero": float(zero), "scale": 1.0 + float(more)}
+        found = [_Cause({self.name: numbers}, left, "a scale besides")]
+        delay = 0.0
+        for _ in range(_STEPS):
+            late = np.interp(self.time - delay, self.time, self.said)
+            off = self.off + self.said - late
+            slope = -np.gradient(late, self.time)
+            (zero, more, *_), left = self._fitted([self._one, slope], off)
+            delay += float(more)
+        if delay > 0:  # a sensor does not know what comes
+            numbers = {"zero": float(zero), "delay": delay}
+            found.append(_Cause({self.name: numbers}, left, "a delay besides"))
         return found
 
     def _zeros_of_others(self) -> list[_Cause]:

@@ -6,19 +6,24 @@ by closing the machine's loops, velocities by v_A = gamma_A v_B with q_B what wa
 
 import re
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
 from crane.closure import Closure
 from crane.common.errors import ClosureError, MechanismError, RecordingError
 from crane.common.samples import Array
+from crane.description.sensors import VELOCITY, VELOCITY_UNITS
 from crane.machine import Machine
 from crane.recordings.missing import MissingError
-from crane.recordings.recording import VELOCITY, VELOCITY_UNITS, derivative
+from crane.recordings.pins import pin_slopes
+from crane.recordings.recording import derivative
+from crane.recordings.sensed import sensed
 from crane.recordings.timeseries import TIME, Table, column
 
 _TELLS = 1e-6  # least share of a joint's motion that others do not tell
 _SAME = 1e-6  # [rad], [machine's size]
+_COMPARED, _SMOOTH = 2000, 200  # samples that are compared, and enough for slopes
 _AT_ONCE = 1 << 16  # samples whose postures are held
 _SAMPLE = re.compile(r"\(sample (\d+)\)")  # of an error of the closure
 _SLACK = 0.1  # of a range, by which sensors may be off
@@ -67,6 +72,69 @@ def _span(machine: Machine) -> Array:
     """Ranges (n,) of the active coordinates, 1 where they are endless."""
     span = machine.upper - machine.lower
     return np.where(np.isfinite(span), span, 1.0)
+
+
+class Postures:
+    """Where the joints that are used put a machine, at some samples.
+
+    Args:
+        machine: What was recorded.
+        table: Its quantities.
+
+    Attributes:
+        machine: Driven by them.
+        drives: Their names.
+        chosen: Which samples.
+        time: (N,) [s].
+    """
+
+    def __init__(self, machine: Machine, table: Table):
+        self.table, self.drives = table, drives_of(machine, list(table.units))
+        self.chosen = slice(None, None, max(1, len(table.values) // _COMPARED))
+        self.time = column(table, TIME)[self.chosen]
+        self._measured = machine
+
+    @cached_property
+    def machine(self) -> Machine:
+        """Driven by what is used."""
+        same = set(self.drives) == set(self._measured.active)
+        return self._measured if same else self._measured.driven_by(self.drives)
+
+    @cached_property
+    def q_b(self) -> Array:
+        """(N, n) as measured."""
+        machine = self.machine
+        columns = [column(self.table, x, machine.unit(x))[self.chosen] for x in machine.active]
+        return np.column_stack(columns)
+
+    @cached_property
+    def q(self) -> Array:
+        """(N, nv) closed."""
+        return self.machine.closure.solve(self.q_b)
+
+    def said(self, name: str, q: Array | None = None) -> Array:
+        """(N,) of a joint or an inclination in these postures, or in others."""
+        q = self.q if q is None else q
+        return sensed(self.machine, q, np.zeros_like(q), [name])[name]
+
+    def slope(self, name: str, q: Array, dq: Array) -> Array:
+        """(N,) of the same along changes (N, nv) of postures."""
+        return sensed(self.machine, q, dq, [name + VELOCITY])[name + VELOCITY]
+
+    @cached_property
+    def few(self) -> slice:
+        """Samples enough for slopes, which are smooth."""
+        return slice(None, None, max(1, len(self.time) // _SMOOTH))
+
+    @cached_property
+    def places(self) -> dict[str, tuple[float, float, float]]:
+        """Of links on those that carry them [m]."""
+        return {joint.child: joint.xyz for joint in self.machine.tree.joints.values()}
+
+    @cached_property
+    def pins(self) -> dict[str, Array]:
+        """Derivatives of a few postures by the places of pins, see `pin_slopes`."""
+        return pin_slopes(self.machine, self.q[self.few])
 
 
 def joint_motion(machine: Machine, table: Table) -> tuple[Array, Array]:
