@@ -327,11 +327,15 @@ BROKEN = {
     ),
     "wrong zero": (
         lambda columns, truth: columns["q2 [deg]"].__iadd__(60.0),
-        " m, its limits are 0 and 0.03: see that zero and sign of q2, q3 are the machine's",
+        " m, its limits are 0 and 0.03: see that zero and sign of q2, q3 are the machine's"
+        ", and that none of them counts from "
+        "the horizon (inclination_LINK)",
     ),
     "angles that no posture has": (
         lambda columns, truth: columns.update({"q4 [rad]": columns.pop("q2 [deg]") / 57 - 1.0}),
-        "; see that zero and sign of q3, q4 are the machine's",
+        "; see that zero and sign of q3, q4 are the machine's"
+        ", and that none of them counts from "
+        "the horizon (inclination_LINK)",
     ),
 }  # fmt: skip
 
@@ -433,7 +437,8 @@ def test_beyond_a_dead_centre(machine, columns, truth, tmp_path):
         first = int(np.argmax(q9 < in_line))
         assert str(caught.value) == (
             f"{file}: sample {first} is beyond a dead centre, where q1, X1, X2 do not tell the "
-            "posture: see that zero and sign of q9 are the machine's, or cut the recording"
+            "posture: see that zero and sign of q9 are the machine's, and that none of them "
+            "counts from the horizon (inclination_LINK), or cut the recording"
         )
 
 

@@ -343,6 +343,46 @@ def test_numbers_add_to_what_is_known(machine, motion, tmp_path):
     assert told(whole, path) == []
 
 
+# --- Postures ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ["inclination_lift_boom", "inclination_tilt_boom"],
+        ["X_lift", "inclination_tilt_boom"],
+        ["inclination_lift_boom", "q3"],
+        ["inclination_tilt_boom", "X_tilt"],
+    ],
+)
+def test_inclinometers_tell_the_posture(machine, motion, tmp_path, given):
+    """Alone and beside lengths and angles, over all of the motion."""
+    columns, units = motion
+    names = ["time", *given, "X_lift_force", "X_tilt_force"]
+    table = Table({x: units[x] for x in names}, np.column_stack([columns[x] for x in names]), {})
+    timeseries.write(tmp_path / "run.csv", table)
+    found = crane.read_measured(machine, tmp_path / "run.csv")
+    for i, joint in enumerate(("X_lift", "X_tilt")):
+        np.testing.assert_allclose(found.q[:, i], columns[joint], atol=1e-9)
+    assert told(machine, tmp_path / "run.csv") == []
+
+
+def test_inclinations_that_do_not_tell(machine, motion, tmp_path):
+    """One for two freedoms, and one that no posture has."""
+    columns, units = motion
+    for name, off, said in (
+        ("inclination_lift_boom", 0.0, "nothing tells where 'X_lift', 'X_tilt' are"),
+        ("inclination_tilt_boom", 1.6, "see that zero and sign of inclination_tilt_boom are"),
+    ):
+        names = ["time", name, "X_lift_force", "X_tilt_force"] + ["X_lift"] * bool(off)
+        values = [columns[x] + off * (x == name) for x in names]
+        table = Table({x: units[x] for x in names}, np.column_stack(values), {})
+        timeseries.write(tmp_path / "run.csv", table)
+        with pytest.raises(RecordingError) as error:
+            crane.read_measured(machine, tmp_path / "run.csv")
+        assert said in str(error.value)
+
+
 # --- Logs and windows ----------------------------------------------------------------------------
 
 

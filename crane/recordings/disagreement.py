@@ -23,6 +23,7 @@ from crane.recordings.timeseries import TIME, Table, column
 from crane.recordings.tolerances import AGREE, allowed
 
 _NOISE = 3.3, 2.0  # standard deviations that tell a difference, and that explain what is left
+_WALKS = 1.5  # of what white noise adds up to, which it hardly spreads over
 _AS_GOOD = 2.0  # times what the best explanation leaves
 _BETTER = 0.8  # of what a zero leaves, below which more is told
 _NEAR, _LISTED = 1.3, 2  # times the best of those, and how many
@@ -105,9 +106,11 @@ class _Pair:
         self.base = name.removesuffix(VELOCITY)
         self.rate = self.base != name
         self.unit = str(unit_of(postures.machine.tree, self.base))
-        reading = column(postures.table, name)
+        reading, walk = column(postures.table, name), 0.0
         if self.rate:
-            reading = _added_up(column(postures.table, TIME), reading)
+            time = column(postures.table, TIME)
+            walk = _noise(reading) * float(np.sqrt((time[-1] - time[0]) * np.mean(np.diff(time))))
+            reading = _added_up(time, reading)
         self.measured = reading[postures.chosen]
         self.said = postures.said(self.base)
         self.off = self.measured - self.said
@@ -115,15 +118,16 @@ class _Pair:
             self.off = self.off - self.off.mean()
         elif self.unit == "rad":
             self.off = self.off - 2 * np.pi * np.round(np.median(self.off) / (2 * np.pi))
-        few = len(self.off) < 3
-        self.noise = 0.0 if few else float(np.median(np.abs(np.diff(self.off, 2)))) / 1.65
+        noise = _noise(self.off)
         self.allowed = allowed(AGREE, postures.machine, self.unit)
-        self.limit = max(self.allowed, _NOISE[1] * self.noise)  # of what a cause may leave
+        # of what differs, and of what a cause may leave; noise that is added up walks at random
+        self.most = max(self.allowed, _NOISE[0] * noise, _WALKS * walk)
+        self.limit = max(self.allowed, _NOISE[1] * noise, walk)
 
     def told(self, known: Mapping[str, Sensor]) -> str:
         """How they disagree, and why; "" where they do not."""
         mean, spread = float(self.off.mean()), float(self.off.std())
-        if abs(mean) <= self.allowed and spread <= max(self.allowed, _NOISE[0] * self.noise):
+        if abs(mean) <= self.allowed and spread <= self.most:
             return ""
         cause = self._why(known)
         if self.rate and not cause:
@@ -287,6 +291,11 @@ def _least(causes: list[tuple[float, _Cause]], limit: float) -> _Cause:
     most = max(limit, _NEAR * min(cause.left for _, cause in causes))
     near = [(move, cause) for move, cause in causes if cause.left <= most]
     return min(near, key=lambda pair: (len(pair[1].sensors), pair[0]))[1]
+
+
+def _noise(x: Array) -> float:
+    """Standard deviation of white noise on a smooth signal (N,), by its second differences."""
+    return float(np.median(np.abs(np.diff(x, 2)))) / 1.65 if len(x) > 2 else 0.0
 
 
 def _added_up(time: Array, rate: Array) -> Array:

@@ -22,6 +22,7 @@ from crane.common.samples import Array
 from crane.description.sensors import PRESSURE
 from crane.machine import Machine
 from crane.recordings.disagreement import tell_disagreement
+from crane.recordings.inclined import with_angles
 from crane.recordings.missing import Missing, MissingError
 from crane.recordings.postures import drives_of, motion_by
 from crane.recordings.reading import ALWAYS, Span, known_sensors, read
@@ -77,6 +78,7 @@ def completed(machine: Machine, table: Table, path: str | Path) -> Recording:
     full = all(x in table.units and x + FORCE in table.units for x in machine.active)
     try:
         check_strokes(machine, table)
+        table = with_angles(machine, table)
         if not full:
             table = _completed(machine, table)
         tell_disagreement(machine, table)

@@ -32,40 +32,41 @@ _SLACK = 0.1  # of a range, by which sensors may be off
 def drives_of(machine: Machine, names: Sequence[str]) -> tuple[str, ...]:
     """Measured joints that determine all others: active ones, then such as tell something new.
 
-    The rows of gamma = dq/dq_A at home that belong to them have to span all of v_A. A joint tells
-    what its row has in the directions that the rows before it leave open.
+    Raises:
+        MissingError: They do not determine all.
+    """
+    drives = telling(machine, names)
+    if len(drives) == len(machine.active):
+        return drives
+    missing = telling(machine, [*drives, *machine.active], first=drives)[len(drives) :]
+    others = [x for x in machine.joints if x not in machine.active]
+    others = [x for x in others if len(telling(machine, [x], first=drives)) > len(drives)]
+    it, are = ("it", "is") if len(missing) == 1 else ("them", "are")
+    given = ", ".join(repr(f"{x} [{machine.unit(x)}]") for x in missing)
+    also = f", or a joint that moves with {it} ({', '.join(others)})" if others else ""
+    text = f"nothing tells where {', '.join(map(repr, missing))} {are}, give {given}{also}"
+    raise MissingError(text, missing)
+
+
+def telling(machine: Machine, names: Sequence[str], first: Sequence[str] = ()) -> tuple[str, ...]:
+    """Joints that each tell something that those before do not: the first, active ones, others.
+
+    A joint tells what its row of gamma = dq/dq_A at home has in the directions that the rows
+    before it leave open.
     """
     gamma = machine.closure.gamma(machine.home) * _span(machine)
     told = np.zeros((0, len(machine.active)))
-
-    def new(joint: str) -> Array | None:
-        """Unit direction that a joint adds, None where it adds none."""
+    found = []
+    measured = [x for x in names if x in machine.joints and x not in first]
+    for joint in (*first, *sorted(measured, key=lambda x: x not in machine.active)):
         row = gamma[machine.column(joint)]
         rest = row - told.T @ (told @ row)
         rest -= told.T @ (told @ rest)  # once more for rounding
         size = np.linalg.norm(rest)
-        return rest / size if size > _TELLS * np.linalg.norm(row) else None
-
-    drives = []
-    measured = [x for x in names if x in machine.joints]
-    for joint in sorted(measured, key=lambda x: x not in machine.active):
-        if (direction := new(joint)) is not None:
-            told = np.vstack([told, direction])
-            drives.append(joint)
-    if len(drives) < len(machine.active):
-        telling = [x for x in machine.joints if new(x) is not None]
-        missing = []
-        for joint in machine.active:  # those that suffice
-            if (direction := new(joint)) is not None:
-                told = np.vstack([told, direction])
-                missing.append(joint)
-        others = ", ".join(x for x in telling if x not in machine.active)
-        it, are = ("it", "is") if len(missing) == 1 else ("them", "are")
-        given = ", ".join(repr(f"{x} [{machine.unit(x)}]") for x in missing)
-        also = f", or a joint that moves with {it} ({others})" if others else ""
-        text = f"nothing tells where {', '.join(map(repr, missing))} {are}, give {given}{also}"
-        raise MissingError(text, missing)
-    return tuple(drives)
+        if size > _TELLS * np.linalg.norm(row):
+            told = np.vstack([told, rest / size])
+            found.append(joint)
+    return tuple(found)
 
 
 def _span(machine: Machine) -> Array:
@@ -159,7 +160,10 @@ def motion_by(machine: Machine, drives: tuple[str, ...], table: Table) -> tuple[
         order = [drives.index(x) for x in machine.active]
         return q_b[:, order], v_b[:, order]
     angles = ", ".join(x for x in drives if x not in machine.active)
-    hint = f"see that zero and sign of {angles} are the machine's"
+    hint = (
+        f"see that zero and sign of {angles} are the machine's, and that none of them counts from "
+        "the horizon (inclination_LINK)"
+    )
     q_a, v_a = np.empty_like(q_b), np.empty_like(v_b)
     try:
         closure = machine.driven_by(drives).closure

@@ -13,6 +13,7 @@ from crane.control import Signals, ValveDrive
 from crane.description.sensors import SIGNAL, SUPPLY, TANK
 from crane.machine import Machine
 from crane.recordings.disagreement import tell_disagreement
+from crane.recordings.inclined import with_angles
 from crane.recordings.measured import check_pressures, moved_locks
 from crane.recordings.missing import Missing
 from crane.recordings.postures import drives_of, joint_motion
@@ -228,6 +229,7 @@ def inputs_of(machine: Machine, table: Table) -> Inputs:
     )
     with missing.noted():
         pressures = _pressures(joints, table, time)
+    table = with_angles(machine, table)
     there = any(joint in table.units for joint in machine.joints)
     if there:
         with missing.noted():
