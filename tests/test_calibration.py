@@ -335,3 +335,15 @@ def test_windows_and_quantities_that_cannot_be(fitted, tmp_path):
     with pytest.raises(CraneError) as error:
         quiet(crane.calibrate, machine, ideal, ["sensor.x.zero"])
     assert "'sensor.x.zero' cannot be fitted to quantities, which its note" in str(error.value)
+
+
+def test_a_sensor_that_is_said_to_be_noisy_hardly_counts(fitted):
+    """Without its pressures the recording hardly tells what the rig lifts."""
+    machine, path, _ = fitted
+    numbers = TRUTH | {f"sensor.pressure_x_{side}.noise": 1e8 for side in "ab"}
+    wide, narrow = (
+        quiet(crane.calibrate, crane.load(machine.path, changes=x), path, ["load_x.mass"],
+              train=(0.0, 2.0)).fitted[0].interval
+        for x in (numbers, TRUTH)
+    )  # fmt: skip
+    assert wide > 5 * narrow

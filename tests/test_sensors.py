@@ -274,6 +274,7 @@ def test_how_far_apart_is_told(machine, motion, tmp_path):
     wanted = np.rad2deg([0.04 + bend.mean(), 0.04 + bend.min(), 0.04 + bend.max()])
     np.testing.assert_allclose([float(x) for x in found.groups()], wanted, rtol=5e-3)
     assert "a constant offset leaves 0.81 deg of it (sensor.q2.zero = 0.04" in line
+    assert line.endswith(", and no delay, scale or pin explains the rest")
 
 
 def test_delays_and_scales_are_told_apart(machine, motion, tmp_path):
@@ -428,6 +429,7 @@ def test_commands_take_windows(tmp_path, motion, machine):
         (("plot", path, "--from", "4", "--until", "2"), "nothing lies from 4 to 2 s"),
         (("view", "patu655", "--from", "1"), "--from is for runs, and 'patu655' is none"),
         (("plot", path, "--lock", "slew=0"), "--lock is for a machine, name it by --machine"),
+        (("live", "patu655", "--from", "1"), "--from is for runs, name one by --run"),
         (
             ("simulate", "patu655", "--until", "1", "--out", tmp_path / "x"),
             "--until is for --inputs",

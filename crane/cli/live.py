@@ -76,6 +76,9 @@ def live(
         raise InputError(f"--machine is for runs, and '{what}' is none, leave it out")
     else:
         loaded = load(what, lock, change, active, free, floating, packages, argument)
+        of_runs = {"--columns": columns, "--from": since, "--until": until}
+        for option in [x for x, given in of_runs.items() if given is not None and run is None]:
+            raise InputError(f"{option} is for runs, name one by --run")
         if run is not None:
             recording = read_run(run, loaded, columns, span_of(since, until))
     playback = None if recording is None else Playback(loaded, recording)

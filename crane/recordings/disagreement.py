@@ -175,7 +175,8 @@ class _Pair:
             return absolute
         most = min(_BETTER * zero.left, max(limit, _NEAR * more[0].left)) if more else 0.0
         best = sorted((x for x in more if x.left <= most), key=lambda x: len(x.sensors))
-        return self._told([zero, *best[:_LISTED]], known)
+        rest = "" if best else ", and no delay, scale or pin explains the rest"
+        return self._told([zero, *best[:_LISTED]], known) + rest
 
     def _told(self, causes: list[_Cause], known: Mapping[str, Sensor]) -> str:
         first, *more = ((x.words, self._shown(x.left), x.numbers(known)) for x in causes)
