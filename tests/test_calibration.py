@@ -343,7 +343,7 @@ def test_a_sensor_that_is_said_to_be_noisy_hardly_counts(fitted):
     numbers = TRUTH | {f"sensor.pressure_x_{side}.noise": 1e8 for side in "ab"}
     wide, narrow = (
         quiet(crane.calibrate, crane.load(machine.path, changes=x), path, ["load_x.mass"],
-              train=(0.0, 2.0)).fitted[0].interval
+              train=(0.0, 2.0), span=(0.0, 2.0)).fitted[0].interval
         for x in (numbers, TRUTH)
     )  # fmt: skip
     assert wide > 5 * narrow

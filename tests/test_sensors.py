@@ -182,6 +182,10 @@ def test_machine_files_keep_sensors(machine, tmp_path):
     [
         ({"sensor.q2.zero": "much"}, "the note 'sensor.q2.zero' is 'much', give a number"),
         ({"sensor.q2.zer": "1"}, "the note 'sensor.q2.zer': a sensor has no 'zer', did you mean"),
+        (
+            {"sensor.q22.zero": "1"},
+            "the note 'sensor.q22.zero' is of no column, did you mean 'q2'",
+        ),
         ({"sensor.q2.scale": "0"}, "the note 'sensor.q2.scale': scale of a sensor is 0"),
         ({"sensor.q2.delay": "99"}, "is shorter than a sensor is late, 99 s, record more"),
     ],
@@ -330,8 +334,17 @@ def test_an_absolute_angle_in_the_place_of_a_joint_s_is_suspected(machine, motio
     columns, _ = motion
     absolute = columns["inclination_tilt_boom"]
     (line,) = told(machine, written(tmp_path, motion, ["q3"], q3=lambda x: absolute + 0.01))
-    assert "it follows the inclination of 'tilt_boom' against the horizon within" in line
+    suspected = "'q3' follows the inclination of 'tilt_boom' against the horizon within"
+    assert suspected in line
     assert line.endswith("an absolute angle is called 'inclination_tilt_boom'")
+    # and where it is what the posture is taken from, beside the inclinometer itself
+    units = motion[1]
+    names = ["time", "q2", "q3", "inclination_tilt_boom", "X_lift_force", "X_tilt_force"]
+    values = [absolute + 0.01 if x == "q3" else columns[x] for x in names]
+    table = Table({x: units[x] for x in names}, np.column_stack(values), {})
+    timeseries.write(tmp_path / "run.csv", table)
+    (line,) = told(machine, tmp_path / "run.csv")
+    assert "'inclination_tilt_boom' is" in line and suspected in line
 
 
 def test_numbers_add_to_what_is_known(machine, motion, tmp_path):

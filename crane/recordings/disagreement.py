@@ -269,21 +269,27 @@ class _Pair:
         return [_least(causes, self.limit) for causes in found.values()]
 
     def _absolute(self, best: _Cause) -> str:
-        """That an angle of a joint follows the inclination of its link, where it does."""
-        machine = self._postures.machine
-        if self.rate or self.unit != "rad" or self.base.startswith(INCLINATION):
+        """That an angle counts from the horizon and is taken for that of a joint, if it does."""
+        postures, joints = self._postures, self._postures.machine.tree.joints
+        if self.unit != "rad":
             return ""
-        link = machine.tree.joints[self.base].child
-        inclined = self._postures.said(INCLINATION + link)
-        for sign in (1.0, -1.0):
-            off = self.measured - sign * inclined
-            if off.std() <= self.limit < best.left:
-                turned = "" if sign > 0 else " with its sign turned"
-                return (
-                    f"it follows the inclination of '{link}' against the horizon within "
-                    f"{np.rad2deg(off.std()):.2g} deg, an absolute angle is called "
-                    f"'{INCLINATION}{link}'{turned}"
-                )
+        if self.base.startswith(INCLINATION):
+            link = self.base.removeprefix(INCLINATION)
+            pairs = [
+                (joint, column(postures.table, joint)[postures.chosen], self.measured)
+                for joint in postures.drives
+                if joints[joint].child == link and joints[joint].kind == "revolute"
+            ]
+        else:
+            link = joints[self.base].child
+            pairs = [(self.base, self.measured, postures.said(INCLINATION + link))]
+        for joint, angle, inclined in pairs:
+            for turned, sign in (("", 1.0), (" with its sign turned", -1.0)):
+                left = float(np.std(angle - sign * inclined))
+                if left <= self.limit < best.left:
+                    what = f"'{joint}' follows the inclination of '{link}' against the horizon"
+                    name = f"an absolute angle is called '{INCLINATION}{link}'{turned}"
+                    return f"{what} within {self._shown(left)}, {name}"
         return ""
 
 

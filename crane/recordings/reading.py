@@ -131,8 +131,12 @@ def _noted(table: Table) -> dict[str, float]:
         if not name.startswith(SENSOR):
             continue
         try:
-            parsed(name)
+            quantity, _ = parsed(name)
             numbers[name] = float(text)
+            if quantity not in table.units:
+                raise RecordingError(
+                    f"the note '{name}' is of no column, {known(table.units, quantity)}"
+                )
         except InputError as error:
             raise RecordingError(f"the note {error}") from None
         except ValueError:
