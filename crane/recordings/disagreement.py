@@ -8,7 +8,7 @@ their zero.
 """
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +17,7 @@ from crane.common.errors import ClosureError, CraneWarning, MechanismError
 from crane.common.samples import Array
 from crane.description.sensors import INCLINATION, SENSOR, VELOCITY, Sensor, unit_of
 from crane.machine import Machine
+from crane.recordings.inclined import with_angles
 from crane.recordings.postures import Postures
 from crane.recordings.reading import known_sensors
 from crane.recordings.timeseries import TIME, Table, column
@@ -42,9 +43,9 @@ def tell_disagreement(machine: Machine, table: Table) -> None:
     """
     known = known_sensors(table, machine)
     try:
-        postures = Postures(machine, table)
+        postures = Postures(machine, with_angles(machine, table))
         pairs = [_Pair(postures, name) for name in _others(machine, table, postures.drives)]
-        told = [text for pair in pairs if (text := pair.told(known))]
+        told = [text for pair in pairs if (text := pair.told(known, list(table.units)))]
     except (ClosureError, MechanismError):  # whoever closes the loops tells it
         return
     for text in told:
@@ -124,12 +125,17 @@ class _Pair:
         self.most = max(self.allowed, _NOISE[0] * noise, _WALKS * walk)
         self.limit = max(self.allowed, _NOISE[1] * noise, walk)
 
-    def told(self, known: Mapping[str, Sensor]) -> str:
-        """How they disagree, and why; "" where they do not."""
+    def told(self, known: Mapping[str, Sensor], measured: Sequence[str]) -> str:
+        """How they disagree, and why; "" where they do not.
+
+        Args:
+            known: What is known of the sensors.
+            measured: Columns that were measured, whose zeros may explain it.
+        """
         mean, spread = float(self.off.mean()), float(self.off.std())
         if abs(mean) <= self.allowed and spread <= self.most:
             return ""
-        cause = self._why(known)
+        cause = self._why(known, measured)
         if self.rate and not cause:
             return ""  # what it adds up to drifts for many reasons
         unit, factor = _SHOWN[self.unit]
@@ -156,10 +162,10 @@ class _Pair:
         pairs = zip(postures.machine.active, slopes, strict=True)
         return [joint for joint, slope in pairs if np.abs(slope).max() > _FLAT]
 
-    def _why(self, known: Mapping[str, Sensor]) -> str:
+    def _why(self, known: Mapping[str, Sensor], measured: Sequence[str]) -> str:
         """In words; of a rate "" where nothing explains it."""
         own, limit = self._zero(), self.limit
-        zeros = sorted([own, *self._zeros_of_others()], key=lambda x: x.left)
+        zeros = sorted([own, *self._zeros_of_others(measured)], key=lambda x: x.left)
         zero = zeros[0] if zeros[0].left < _BETTER * own.left else own
         if zeros[0].left <= limit:
             most = max(_AS_GOOD * zeros[0].left, 0.2 * self.allowed)
@@ -223,11 +229,13 @@ class _Pair:
             found.append(_Cause({self.name: numbers}, left, "a delay besides"))
         return found
 
-    def _zeros_of_others(self) -> list[_Cause]:
+    def _zeros_of_others(self, measured: Sequence[str]) -> list[_Cause]:
         """Zeros of what is used, one at a time, by Gauss and Newton's method."""
         found = []
         drives = self._postures.machine.active
-        for i in range(len(drives) if not self.rate else 0):
+        for i, joint in enumerate(drives if not self.rate else ()):
+            if joint not in measured:
+                continue
             zero, left = 0.0, np.inf
             try:
                 for _ in range(_STEPS):
@@ -243,7 +251,7 @@ class _Pair:
                     zero += float(slope @ off / (slope @ slope))
             except ClosureError:
                 continue
-            found.append(_Cause({drives[i]: {"zero": zero}}, left, "a constant offset"))
+            found.append(_Cause({joint: {"zero": zero}}, left, "a constant offset"))
         return found
 
     def _with_pins(self) -> list[_Cause]:

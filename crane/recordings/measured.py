@@ -78,14 +78,14 @@ def completed(machine: Machine, table: Table, path: str | Path) -> Recording:
     full = all(x in table.units and x + FORCE in table.units for x in machine.active)
     try:
         check_strokes(machine, table)
-        table = with_angles(machine, table)
+        told = with_angles(machine, table)
         if not full:
-            table = _completed(machine, table)
-        tell_disagreement(machine, table)
+            told = _completed(machine, told)
+        tell_disagreement(machine, table)  # of what was measured alone
     except RecordingError as error:
         raise RecordingError(at(str(path), error)) from None
-    notes = table.notes | ({SENSORS: IDEAL} if known_sensors(table, machine) else {})
-    return Recording.from_table(Table(table.units, table.values, notes), path)
+    notes = told.notes | ({SENSORS: IDEAL} if known_sensors(table, machine) else {})
+    return Recording.from_table(Table(told.units, told.values, notes), path)
 
 
 def is_measured(table: Table) -> bool:

@@ -229,13 +229,16 @@ def inputs_of(machine: Machine, table: Table) -> Inputs:
     )
     with missing.noted():
         pressures = _pressures(joints, table, time)
-    table = with_angles(machine, table)
-    there = any(joint in table.units for joint in machine.joints)
+    angled = with_angles(machine, table)
+    there = any(joint in angled.units for joint in machine.joints)
     if there:
         with missing.noted():
-            drives_of(machine, list(table.units))
+            drives_of(machine, list(angled.units))
     missing.refuse()
-    initial = _initial(machine, table, time, list(signals.values())) if there else None
+    if there:
+        check_strokes(machine, table)
+        tell_disagreement(machine, table)
+    initial = _initial(machine, angled, time, list(signals.values())) if there else None
     return Inputs(time, signals, supply, tank, pressures, initial)
 
 
@@ -276,8 +279,6 @@ def _initial(
     """Active coordinates and velocities at the start."""
     for text in moved_locks(machine, _columns(table), table.units):
         raise RecordingError(f"{text}, do not lock it, or lock it where it is")
-    check_strokes(machine, table)
-    tell_disagreement(machine, table)
     q_a, v_a = joint_motion(machine, table)
     _warn_of_limits(machine, time, q_a)
     steady = time <= _steady(time, signals)
