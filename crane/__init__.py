@@ -20,7 +20,15 @@ if TYPE_CHECKING:
         ValvePD,
         joystick,
     )
-    from crane.description import EndStop, ForceElement, Friction, GasSpring, PIGains, Rope
+    from crane.description import (
+        EndStop,
+        ForceElement,
+        Friction,
+        GasSpring,
+        PIGains,
+        Rope,
+        Sensor,
+    )
     from crane.dynamics import Dynamics
     from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
     from crane.formats.adding import add_cylinder, add_loops
@@ -70,7 +78,7 @@ _HOMES = {
     "crane.common.errors": "CraneError CraneWarning",
     "crane.control": "PI Command ComputedTorque Controller Law Sampled Signals TipVelocity "
     "ValveDrive ValvePD joystick",
-    "crane.description": "EndStop ForceElement Friction GasSpring PIGains Rope",
+    "crane.description": "EndStop ForceElement Friction GasSpring PIGains Rope Sensor",
     "crane.dynamics": "Dynamics",
     "crane.formats": "load write_machine write_mjcf write_urdf_plus",
     "crane.formats.adding": "add_cylinder add_loops",
@@ -103,7 +111,7 @@ __all__ = [
     "Controller", "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation",
     "ForceElement", "Friction", "GasSpring", "Identification", "InterruptedRun", "Kinematics",
     "Law", "LinearModel", "Machine", "PDGains", "PIGains", "Payload", "Recording", "Rope",
-    "Sampled", "Signals", "Study",
+    "Sampled", "Sensor", "Signals", "Study",
     "TipVelocity", "Trajectory", "ValveDrive", "ValvePD", "Workspace", "add_cylinder", "add_loops",
     "calibrate", "check", "excite",
     "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
