@@ -511,6 +511,10 @@ def test_a_raw_log_s_disagreement_is_told(machine, tmp_path):
     assert "against X_lift, X_tilt" in tilt
     places = [number(line, "lift_boom_rod.x") for line in (lift, tilt)]  # both say the same pin
     np.testing.assert_allclose(places, 0.316, atol=1e-3)
+    window = "--from", "2", "--until", "3"
+    done = typed("import", LIFTING, columns, "--out", tmp_path / "part.csv", *window)
+    assert done.stdout.startswith("101 samples of 13 columns")
+    assert len(told(machine, tmp_path / "part.csv")) == 2
     columns.write_text(COLUMNS.replace(" - 820", "").replace(" - 1050", ""))
     done = typed("simulate", "patu655", *LOCKS, "--inputs", LIFTING, "--columns", columns,
                  "--out", tmp_path / "out")  # fmt: skip
