@@ -536,3 +536,13 @@ def test_all_that_a_log_lacks_is_told_at_once(tmp_path):
     assert done.returncode == 2 and "no signal of a valve, give at least one of" in done.stderr
     assert "nothing tells where 'slew', 'X_ext' are, give 'slew [rad]', 'X_ext [m]'" in done.stderr
     assert "--lock slew=0 (home) --lock X_ext=0.1 (home)" in done.stderr
+    few = [
+        x for x in COLUMNS.splitlines() if not re.match("voltage|pressure_(supply|X_lift_b)", x)
+    ]
+    columns.write_text("\n".join(few))
+    done = typed("circuit", "patu655", LIFTING, "--columns", columns, "--joint", "X_lift")
+    for said in (
+        "columns are missing: 'pressure_X_lift_b', 'pressure_supply', 'voltage_X_lift' or 'spool_",
+        "nothing tells where 'slew', 'X_ext' are", "--lock slew=0 (home) --lock X_ext=0.1 (home)",
+    ):  # fmt: skip
+        assert done.returncode == 2 and said in done.stderr

@@ -73,6 +73,7 @@ def circuit(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from crane.cli.runs import check_folder, read_run
     from crane.common.output import staging
+    from crane.identification.hydraulics.cylinder_signals import needed
 
     if model not in MODELS:
         raise InputError(f"model '{model}' is unknown, {known(MODELS, model)}")
@@ -88,8 +89,10 @@ def circuit(
     loaded = load(machine, lock, change)
     if joint not in loaded.active:
         raise InputError(f"'{joint}' is not an active joint, {known(loaded.active, joint)}")
-    runs = [read_run(path, loaded, columns, span) for path in recording]
-    judge = None if validation is None else read_run(validation, loaded, columns)
+    of_models = {"orifices": needed(joint), "valve": [(f"voltage_{joint}",)], "friction": []}
+    needs: list[tuple[str, ...]] = of_models[model]
+    runs = [read_run(path, loaded, columns, span, needs) for path in recording]
+    judge = None if validation is None else read_run(validation, loaded, columns, needs=needs)
     with status("identifying"):
         if model == "orifices":
             text, figure = _orifices(loaded, runs, joint, method or "weak", period, judge)

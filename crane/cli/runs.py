@@ -17,8 +17,8 @@ from crane.common.output import staging
 from crane.description.sources import find, unchanged
 from crane.formats import recalled
 from crane.machine import Machine
-from crane.recordings.measured import completed, is_measured, read_measured
-from crane.recordings.reading import ALWAYS, Span, quantities, readings
+from crane.recordings.measured import completed, is_measured
+from crane.recordings.reading import ALWAYS, Span, quantities, read, readings
 from crane.recordings.recording import Recording
 from crane.recordings.summary import subject, summarize, title
 from crane.simulation.replays import Comparison
@@ -234,6 +234,7 @@ def read_run(
     machine: Machine | None = None,
     columns: Path | None = None,
     span: Span = ALWAYS,
+    needs: Sequence[Sequence[str]] = (),
 ) -> Recording:
     """The recording of a run's folder, of a CSV or npz file, or of a log of another program.
 
@@ -244,6 +245,7 @@ def read_run(
             one that the file names, if it has pressures or angles instead of forces.
         columns: Which columns of a log are which, see `crane.recordings.logs`.
         span: From when to when [s], by the recording's clock.
+        needs: Columns that have to be there besides, of each any one, where a machine is given.
 
     Raises:
         RecordingError: There is none, it is malformed, or it does not tell enough.
@@ -254,7 +256,7 @@ def read_run(
             raise RecordingError(f"{path}: no {RECORDING} in this folder, give a run's folder")
         path = path / RECORDING
     if machine is not None:
-        return read_measured(machine, path, columns, span)
+        return completed(machine, read(path, machine, columns, span), path, needs)
     table = readings(path, columns=columns)
     named = table.notes.get("machine", "")
     if named and is_measured(table):

@@ -12,7 +12,7 @@ What is there is taken as it is. Everything else is a channel.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -69,8 +69,16 @@ def read_measured(
     return completed(machine, read(path, machine, columns, span), path)
 
 
-def completed(machine: Machine, table: Table, path: str | Path) -> Recording:
+def completed(
+    machine: Machine, table: Table, path: str | Path, needs: Sequence[Sequence[str]] = ()
+) -> Recording:
     """The same of a table of quantities that was read from a path.
+
+    Args:
+        machine: What was recorded.
+        table: Its quantities.
+        path: For errors.
+        needs: Columns that have to be there besides, of each any one.
 
     Raises:
         RecordingError: As for `read_measured`.
@@ -79,8 +87,11 @@ def completed(machine: Machine, table: Table, path: str | Path) -> Recording:
     try:
         check_strokes(machine, table)
         told = with_angles(machine, table)
+        missing = Missing(machine, table)
+        missing.note_absent(needs)
         if not full:
-            told = _completed(machine, told)
+            told = _completed(machine, told, missing)
+        missing.refuse()
         tell_disagreement(machine, table)  # of what was measured alone
     except RecordingError as error:
         raise RecordingError(at(str(path), error)) from None
@@ -95,12 +106,11 @@ def is_measured(table: Table) -> bool:
     return not forces or not chambers <= forces
 
 
-def _completed(machine: Machine, table: Table) -> Table:
+def _completed(machine: Machine, table: Table, missing: Missing) -> Table:
     """The table with coordinates, velocities and forces of all active joints."""
     # before anything is computed from them, to name the column as it is in the file
     check_finite(dict(zip(table.units, table.values.T, strict=True)))
     check_pressures(machine, table)
-    missing = Missing(machine, table)
     forces: list[Array] = []
     drives: tuple[str, ...] = ()
     with missing.noted():

@@ -1,6 +1,6 @@
 """What a recording does not tell, said in one line with what to do about it."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -24,6 +24,17 @@ class MissingError(RecordingError):
         self.joints = tuple(joints)
 
 
+def check_there(needs: Iterable[Sequence[str]], there: Collection[str]) -> None:
+    """See that of each of these columns any one is there.
+
+    Raises:
+        RecordingError: The message has all that are not.
+    """
+    absent = [" or ".join(map(repr, names)) for names in needs if not set(names) & set(there)]
+    if absent:
+        raise RecordingError(f"columns are missing: {', '.join(absent)}")
+
+
 class Missing:
     """Collects what is missing, and refuses it at once.
 
@@ -43,6 +54,11 @@ class Missing:
             yield
         except RecordingError as error:
             self._errors.append(error)
+
+    def note_absent(self, needs: Iterable[Sequence[str]]) -> None:
+        """Note which columns are not there, of each of these any one."""
+        with self.noted():
+            check_there(needs, self._table.units)
 
     def refuse(self) -> None:
         """Tell all that was noted.
