@@ -89,8 +89,9 @@ def circuit(
     loaded = load(machine, lock, change)
     if joint not in loaded.active:
         raise InputError(f"'{joint}' is not an active joint, {known(loaded.active, joint)}")
-    of_models = {"orifices": needed(joint), "valve": [(f"voltage_{joint}",)], "friction": []}
-    needs: list[tuple[str, ...]] = of_models[model]
+    needs = needed(joint) if model == "orifices" else []
+    if model == "valve":
+        needs.append((f"voltage_{joint}",))
     runs = [read_run(path, loaded, columns, span, needs) for path in recording]
     judge = None if validation is None else read_run(validation, loaded, columns, needs=needs)
     with status("identifying"):
