@@ -60,9 +60,11 @@ if TYPE_CHECKING:
         Comparison,
         InterruptedRun,
         LinearModel,
+        Sensitivities,
         linear_models,
         linearize,
         replay,
+        sensitivities,
         simulate,
         simulate_batch,
     )
@@ -99,8 +101,8 @@ _HOMES = {
     "crane.motion.workspaces": "Workspace workspace",
     "crane.recordings": "Recording",
     "crane.recordings.measured": "read_measured",
-    "crane.simulation": "Batch Comparison InterruptedRun LinearModel linear_models linearize "
-    "replay simulate simulate_batch",
+    "crane.simulation": "Batch Comparison InterruptedRun LinearModel Sensitivities linear_models "
+    "linearize replay sensitivities simulate simulate_batch",
     "crane.studies": "Study study",
     "crane.view.page": "report",
     "crane.view.sketch": "sketch",
@@ -111,14 +113,14 @@ __all__ = [
     "Controller", "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation",
     "ForceElement", "Friction", "GasSpring", "Identification", "InterruptedRun", "Kinematics",
     "Law", "LinearModel", "Machine", "PDGains", "PIGains", "Payload", "Recording", "Rope",
-    "Sampled", "Sensor", "Signals", "Study",
+    "Sampled", "Sensitivities", "Sensor", "Signals", "Study",
     "TipVelocity", "Trajectory", "ValveDrive", "ValvePD", "Workspace", "add_cylinder", "add_loops",
     "calibrate", "check", "excite",
     "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
     "identify_valve", "joystick", "linear_models", "linearize", "load",
     "point_to_point", "polynomial", "read_measured", "replay", "report",
-    "simulate", "simulate_batch", "sketch", "study", "task_trajectory", "tip_trajectory",
-    "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
+    "sensitivities", "simulate", "simulate_batch", "sketch", "study", "task_trajectory",
+    "tip_trajectory", "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 
