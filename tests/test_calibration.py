@@ -347,3 +347,21 @@ def test_a_sensor_that_is_said_to_be_noisy_hardly_counts(fitted):
         for x in (numbers, TRUTH)
     )  # fmt: skip
     assert wide > 5 * narrow
+
+
+def test_what_a_model_lacks_is_named_with_how_much_of_it(tmp_path):
+    """Air in a chamber that nobody asked for; without it nothing is missed."""
+    machine, gas = simple(tmp_path), 2e-5
+    air = "cylinder.x.gas_a"
+    fit = ["valve.x.neutral", "load_x.mass", "friction.x.coulomb"]
+    known = {name: TRUTH[name] for name in TRUTH if name not in fit}
+    machine = crane.load(machine.path, changes=known)
+    path = recorded(machine, tmp_path / "air.csv", 0, TRUTH | {air: gas})
+    found = quiet(crane.calibrate, machine, path, fit, train=(0.0, 4.0))
+    missing = {one.name: one for one in found.lacking}
+    # so does a hose that is wider
+    assert found.lacking[0].share > 0.2 and missing[air].share > 0.8 * found.lacking[0].share
+    assert missing[air].value == pytest.approx(gas, rel=0.5)
+    assert f"{air} at about" in found.to_text()
+    path = recorded(machine, tmp_path / "none.csv", 0)
+    assert not quiet(crane.calibrate, machine, path, fit, train=(0.0, 4.0)).lacking

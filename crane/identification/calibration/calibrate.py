@@ -18,6 +18,8 @@ from crane.description.sensors import (
 )
 from crane.formats import load
 from crane.formats.loading import Variants
+from crane.identification.calibration.candidates import candidates
+from crane.identification.calibration.lacking import Lacking, lacking
 from crane.identification.calibration.problem import Case, Problem, case_of, noise_of
 from crane.identification.calibration.result import Calibration, Channel, Fitted
 from crane.identification.calibration.unknowns import Unknown, unknowns_of
@@ -31,6 +33,8 @@ from crane.simulation.readings import sensors_of
 Progress = Callable[[float], None]
 
 _ROUNDS = 3  # of weights
+# shares of the smoothing of friction that is gone on with, and of that of derivatives
+_SHARPER = ((0.3, 0.3), (0.1, 0.1), (0.0, 0.3), (0.0, 0.03), (0.0, 0.1))
 _STEPS = 40  # of Gauss-Newton between them
 _SETTLED = 1e-4  # change of the cost, as a share, that ends them
 _EXACT, _NOTHING = 1e-6, 1e-9  # of a channel's largest value, and of one that is zero [SI]
@@ -117,12 +121,22 @@ def calibrate(
         for case, table in zip(cases, tables, strict=True)
         for name in (*case.sensors, *(SIGNAL + joint for joint in case.inputs.signals))
     }
-    unknowns = unknowns_of(fit, variants.spec, numbers, units)
+
+    def asked(which: Mapping[str, object] | Sequence[str]) -> list[Unknown]:
+        return unknowns_of(which, variants.spec, numbers, units)
+
+    unknowns = asked(fit)
     problem = Problem(machine, unknowns, cases)
     search = _Search(problem, progress)
     before = [problem.residuals(case, np.zeros(problem.size)) for case in problem.cases]
     z = search.run(before)
     found = _result(problem, search, z, before, units)
+    taken = {name for x in unknowns for name in (x.name, *dict(x.members))}
+    others = [x for x in candidates(machine, cases, numbers) if x.name not in taken]
+    bounds = {x.name: (x.start, x.low, x.high) for x in others}
+    more = asked(bounds) if bounds else []
+    extras = [replace(x, scale=other.deviation) for x, other in zip(more, others, strict=True)]
+    found = replace(found, lacking=tuple(search.lacking(extras, z)))
     known = dict(machine.sensors) | dict(cases[0].known)
     return replace(found, machine=_sensing(found.machine, known, columns, found.changes))
 
@@ -190,6 +204,7 @@ class _Search:
         self.low = np.array([(x.low - x.start) / x.scale for x in unknowns] + [-np.inf] * rest)
         self.high = np.array([(x.high - x.start) / x.scale for x in unknowns] + [np.inf] * rest)
         self.prior = np.array([0.0] * len(unknowns) + [1.0] * rest)
+        self._stage = max((x.stage for x in unknowns), default=0)
         self.sizes: dict[str, float] = {}
         self.jacobian = self.residual = self.blocks = np.zeros(0)
         self._done = 0
@@ -203,7 +218,8 @@ class _Search:
         self.sizes = dict(most)
         z = np.zeros(problem.size)
         sticks = any(law.sticks for law in problem.machine.friction.values())
-        problem.smooth = sticks
+        problem.smooth = float(sticks)
+        z = self._begun(z)
         for i in range(_ROUNDS):
             z = self._minimum(z)
             left = self._left([problem.residuals(case, z) for case in self._trained])
@@ -212,18 +228,25 @@ class _Search:
             self.sizes = fresh
             if moved < 0.05 and (i or not sticks):
                 break
-        if sticks:
-            problem.smooth = False
+        for problem.smooth, problem.slopes in _SHARPER if sticks else ():
             z = self._minimum(z)
-        # slopes over about the intervals, of what does not jump, tell how well all is known
-        problem.smooth = sticks
         self._linearize(z)
-        problem.widen(np.sqrt(np.diag(self.covariance(z)[0])))
-        self._linearize(z)
-        problem.smooth = False
         if self._progress is not None:
             self._progress(1.0)
         return z
+
+    def _begun(self, z: Array) -> Array:
+        """The better one of two minima: of all numbers at once, and of stage after stage.
+
+        Where something rings, one phase more or less is a minimum, too.
+        """
+        stages = sorted({x.stage for x in self._problem.unknowns})
+        found = [self._minimum(z)]
+        if len(stages) > 1:
+            for self._stage in stages:
+                z = self._minimum(z)
+            found.append(z)
+        return min(found, key=self._cost)
 
     @property
     def _trained(self) -> list[Case]:
@@ -270,7 +293,7 @@ class _Search:
         total = float(np.sum((self.prior * z) ** 2))
         for case in self._trained:
             try:
-                left = self._problem.residuals(case, z) * self._weights(case)
+                left = self._problem.residuals(case, z, fitted=True) * self._weights(case)
             except CraneError:
                 return np.inf
             total += float(np.sum(left**2))
@@ -279,8 +302,8 @@ class _Search:
     def _linearize(self, z: Array) -> None:
         rows, left, blocks = [], [], []
         for number, case in enumerate(self._trained):
-            sizes = np.array([self.sizes[name] for name in case.sensors])
-            residual, slopes = self._problem.linearized(case, z, sizes)
+            fixed = {i for i, x in enumerate(self._problem.unknowns) if x.stage > self._stage}
+            residual, slopes = self._problem.linearized(case, z, fixed)
             weights = self._weights(case)
             some = case.train
             rows.append((slopes * weights[:, :, None])[some].reshape(-1, self._problem.size))
@@ -289,6 +312,22 @@ class _Search:
             blocks.append(time + 1e9 * number)
         self.jacobian, self.residual = np.vstack(rows), np.concatenate(left)
         self.blocks = np.concatenate(blocks)
+
+    def lacking(self, others: Sequence[Unknown], z: Array) -> list[Lacking]:
+        """Numbers that are not fitted and would help, see `Lacking`."""
+        problem = self._problem
+        if not others:
+            return []
+        whole = Problem(problem.machine, [*problem.unknowns, *others], problem.cases)
+        count, more = len(problem.unknowns), len(others)
+        there = np.concatenate([z[:count], np.zeros(more), z[count:]])
+        rows = []
+        for case in self._trained:
+            wider = next(x for x in whole.cases if x.name == case.name)
+            _, slopes = whole.linearized(wider, there, set(range(count)))
+            own = (slopes * self._weights(case)[:, :, None])[case.train]
+            rows.append(own.reshape(-1, whole.size)[:, count : count + more])
+        return lacking(others, self.jacobian, np.vstack(rows), self.residual, self.prior)
 
     def _minimum(self, z: Array) -> Array:
         """The nearest minimum for the present weights."""
