@@ -34,9 +34,10 @@ Progress = Callable[[float], None]
 
 _ROUNDS = 3  # of weights
 # shares of the smoothing of friction that is gone on with, and of that of derivatives
-_SHARPER = ((0.3, 0.3), (0.1, 0.1), (0.0, 0.3), (0.0, 0.03), (0.0, 0.1))
+_SHARPER = ((0.3, 0.3), (0.1, 0.1), (0.0, 0.3), (0.0, 0.03))
+_TOLD = 0.1  # of derivatives that tell how well all is known
 _STEPS = 40  # of Gauss-Newton between them
-_SETTLED = 1e-4  # change of the cost, as a share, that ends them
+_SETTLED, _BEGUN = 1e-4, 1e-2  # change of the cost, as a share, that ends them
 _EXACT, _NOTHING = 1e-6, 1e-9  # of a channel's largest value, and of one that is zero [SI]
 _FLOOR = 0.2  # of a channel's variation, that no channel may be off by for nothing
 _GROWN, _SHRUNK, _STIFFEST = 10.0, 0.2, 1e8  # of Levenberg's damping
@@ -230,6 +231,7 @@ class _Search:
                 break
         for problem.smooth, problem.slopes in _SHARPER if sticks else ():
             z = self._minimum(z)
+        problem.slopes = _TOLD
         self._linearize(z)
         if self._progress is not None:
             self._progress(1.0)
@@ -241,10 +243,10 @@ class _Search:
         Where something rings, one phase more or less is a minimum, too.
         """
         stages = sorted({x.stage for x in self._problem.unknowns})
-        found = [self._minimum(z)]
+        found = [self._minimum(z, _BEGUN)]
         if len(stages) > 1:
             for self._stage in stages:
-                z = self._minimum(z)
+                z = self._minimum(z, _BEGUN)
             found.append(z)
         return min(found, key=self._cost)
 
@@ -329,7 +331,7 @@ class _Search:
             rows.append(own.reshape(-1, whole.size)[:, count : count + more])
         return lacking(others, self.jacobian, np.vstack(rows), self.residual, self.prior)
 
-    def _minimum(self, z: Array) -> Array:
+    def _minimum(self, z: Array, settled: float = _SETTLED) -> Array:
         """The nearest minimum for the present weights."""
         damping, cost = 1e-3, self._cost(z)
         if not np.isfinite(cost):  # say why
@@ -350,7 +352,7 @@ class _Search:
                 damping *= _GROWN
                 if damping > _STIFFEST:
                     return z
-            if before - cost < _SETTLED * before:
+            if before - cost < settled * before:
                 break
         return z
 
