@@ -15,7 +15,7 @@ _SLOW, _FAST = 5.0, 200.0  # of spools [1/s]
 _LATE, _LATEST = 0.1, 0.6  # [s] of signals
 _TILTED = 0.05  # [rad] that inclinometers are mounted off
 _PRESSED = 2e5  # [Pa] that pressure sensors are off
-_GAS = 1e-3  # of a chamber's volume
+_GAS = 5e-3  # of a chamber's volume
 _LEAKED = 1e-2  # of a valve's full flow at the supply's pressure
 _BRAKED = 1e-2  # of a cylinder's force at the supply's pressure
 
