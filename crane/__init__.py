@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from crane.identification.calibration.calibrate import calibrate
     from crane.identification.calibration.result import Calibration
     from crane.identification.excitation.excite import Excitation, excite
+    from crane.identification.excitation.signals import SignalExcitation, excite_valves
     from crane.identification.hydraulics.cylinder_friction import identify_cylinder_friction
     from crane.identification.hydraulics.orifices import identify_orifices
     from crane.identification.hydraulics.valve import identify_valve
@@ -89,6 +90,7 @@ _HOMES = {
     "crane.identification.calibration.calibrate": "calibrate",
     "crane.identification.calibration.result": "Calibration",
     "crane.identification.excitation.excite": "Excitation excite",
+    "crane.identification.excitation.signals": "SignalExcitation excite_valves",
     "crane.identification.hydraulics.cylinder_friction": "identify_cylinder_friction",
     "crane.identification.hydraulics.orifices": "identify_orifices",
     "crane.identification.hydraulics.valve": "identify_valve",
@@ -113,9 +115,9 @@ __all__ = [
     "Controller", "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation",
     "ForceElement", "Friction", "GasSpring", "Identification", "InterruptedRun", "Kinematics",
     "Law", "LinearModel", "Machine", "PDGains", "PIGains", "Payload", "Recording", "Rope",
-    "Sampled", "Sensitivities", "Sensor", "Signals", "Study",
+    "Sampled", "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Study",
     "TipVelocity", "Trajectory", "ValveDrive", "ValvePD", "Workspace", "add_cylinder", "add_loops",
-    "calibrate", "check", "excite",
+    "calibrate", "check", "excite", "excite_valves",
     "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
     "identify_valve", "joystick", "linear_models", "linearize", "load",
     "point_to_point", "polynomial", "read_measured", "replay", "report",

@@ -34,7 +34,7 @@ def sensors_of(machine: Machine, table: Table) -> list[str]:
     Raises:
         RecordingError: A column is in a unit of something else, or of no link.
     """
-    return _checked(machine, table, _units(machine))
+    return _checked(machine, table, units_of(machine))
 
 
 def recorded_of(machine: Machine, table: Table, recording: Recording) -> list[str]:
@@ -69,8 +69,8 @@ def _checked(machine: Machine, table: Table, units: Mapping[str, str]) -> list[s
     return found
 
 
-def _units(machine: Machine) -> dict[str, str]:
-    """Of what a simulation on valves records."""
+def units_of(machine: Machine) -> dict[str, str]:
+    """By column, of what a simulation on valves records."""
     kinds = {joint: machine.unit(joint) for joint in machine.joints}
     units = dict(kinds)
     units |= {joint + VELOCITY: VELOCITY_UNITS[kinds[joint]] for joint in machine.active}
