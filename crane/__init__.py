@@ -69,6 +69,7 @@ if TYPE_CHECKING:
         simulate,
         simulate_batch,
     )
+    from crane.simulation.symbolic import casadi_function
     from crane.studies import Study, study
     from crane.view.page import report
     from crane.view.sketch import sketch
@@ -103,8 +104,7 @@ _HOMES = {
     "crane.motion.workspaces": "Workspace workspace",
     "crane.recordings": "Recording",
     "crane.recordings.measured": "read_measured",
-    "crane.simulation": "Batch Comparison InterruptedRun LinearModel Sensitivities linear_models "
-    "linearize replay sensitivities simulate simulate_batch",
+    "casadi_function",
     "crane.studies": "Study study",
     "crane.view.page": "report",
     "crane.view.sketch": "sketch",
@@ -117,7 +117,7 @@ __all__ = [
     "Law", "LinearModel", "Machine", "PDGains", "PIGains", "Payload", "Recording", "Rope",
     "Sampled", "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Study",
     "TipVelocity", "Trajectory", "ValveDrive", "ValvePD", "Workspace", "add_cylinder", "add_loops",
-    "calibrate", "check", "excite", "excite_valves",
+    "calibrate", "casadi_function", "check", "excite", "excite_valves",
     "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
     "identify_valve", "joystick", "linear_models", "linearize", "load",
     "point_to_point", "polynomial", "read_measured", "replay", "report",
