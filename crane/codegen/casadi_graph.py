@@ -14,7 +14,7 @@ _BINARY = {
 }
 _NAMES = {
     "sin": "sin", "cos": "cos", "exp": "exp", "log": "log", "tanh": "tanh", "sqrt": "sqrt",
-    "abs": "fabs", "maximum": "fmax",
+    "abs": "fabs", "maximum": "fmax", "copysign": "copysign",
 }  # fmt: skip
 
 
@@ -65,7 +65,4 @@ def _operation(ca: Any, kind: str) -> Callable[..., Any]:
         return lambda x: -x
     if kind == "positive":
         return lambda x, yes, no: ca.if_else(x > 0, yes, no)
-    if kind == "copysign":
-        # of |a|, since CasADi differentiates as if a were positive
-        return lambda a, b: ca.copysign(ca.fabs(a), b)
     return getattr(ca, _NAMES[kind])
