@@ -34,7 +34,8 @@ def machine(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(machine):
-    return crane.excite_valves(machine, [*FIT, "oil.gas_exponent"], trials=12, **QUICK)
+    fit = [*FIT, "oil.gas_exponent"]
+    return crane.excite_valves(machine, fit, duration=5.0, step=0.005, noise=NOISE, trials=8)
 
 
 def strokes(machine, signals, time):
@@ -137,6 +138,14 @@ def test_they_tell_more_than_plain_ones_and_what_is_not_told(found):
     text = found.to_text()
     assert "not told by these sensors in this time: oil.gas_exponent" in text
     assert "load_x.mass" in text and "std, designed" in text
+
+
+def test_a_start_that_is_given_is_what_the_machine_has(machine):
+    given = {"load_x.mass": 2100.0, "valve.x.neutral": (5.9, 5.8, 6.0)}
+    told = Told(machine, given, None, NOISE, 0)
+    assert told.machine.changes == {"load_x.mass": 2100.0, "valve.x.neutral": 5.9}
+    assert Told(machine, FIT, None, NOISE, 0).machine is machine
+    assert told.variant({"load_x.mass": 1900.0}).changes["load_x.mass"] == 1900.0
 
 
 @pytest.mark.slow

@@ -12,8 +12,9 @@ from crane.common.samples import Array, Brief, as_count, as_number, as_seed
 from crane.common.units import quantity
 from crane.control.valves import circuit_of
 from crane.identification.calibration.unknowns import SIGNAL, Unknown
-from crane.identification.excitation.exchange import Exchange, Limits
+from crane.identification.excitation.exchange import Exchange
 from crane.identification.excitation.information import CRITERIA, Quality
+from crane.identification.excitation.signal_limits import SignalLimits
 from crane.identification.excitation.text import columns
 from crane.identification.excitation.told import Told
 from crane.machine import Machine
@@ -137,7 +138,7 @@ def excite_valves(
     Pulses of all valves (see `Levers`) from rest at home to rest, the best of some at random and
     of what the exchange of single slots makes of them (Meyer and Nachtsheim, 1995), judged by
     the information of the simulated readings (see `Told`). Signals that leave the limits of
-    `crane.identification.excitation.exchange.Limits` are not taken.
+    `crane.identification.excitation.signal_limits.SignalLimits` are not taken.
 
     Args:
         machine: A machine with valves.
@@ -179,7 +180,7 @@ def excite_valves(
         raise InputError(f"the margin is {margin:g}, give a share from 0 to below 0.5")
     trials = as_count(trials, "the number of trials")
     told = Told(machine, fit, sensors, noise, as_seed(seed))
-    limits = Limits(told, margin)
+    limits = SignalLimits(told, margin)
     search = Exchange(told, limits, CRITERIA[criterion], duration, step, rate)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -191,7 +192,7 @@ def excite_valves(
 
 def _result(
     told: Told,
-    limits: Limits,
+    limits: SignalLimits,
     run: Recording,
     before: Quality,
     after: Quality,

@@ -43,6 +43,7 @@ class Told:
         seed: Of the noise on the virtual recordings, which only says how well starts are known.
 
     Attributes:
+        machine: With the numbers from which a fit starts.
         units: Of the sensors by column.
         noise: (k,) standard deviations.
         unknowns: See `crane.identification.calibration.unknowns.Unknown`.
@@ -83,6 +84,9 @@ class Told:
         sensors_of(machine, Table(self.units, np.zeros((0, len(self.units))), {}))
         variants = Variants(machine)
         self.unknowns = unknowns_of(fit, variants.spec, variants.values, self.units | signals)
+        begun = {x: y for one in self.unknowns for x, y in one.changes(one.start).items()}
+        if any(variants.values[name] != value for name, value in begun.items()):
+            self.machine = variants.machine(begun)
         # where and when something sticks depends on everything before
         self._sticks = any(law.sticks for law in machine.friction.values())
         self._problem = self._smoothed([])
@@ -125,10 +129,9 @@ class Told:
         problem, case = self._problem, replace(case, first=len(self.unknowns))
         if not starts:
             case = replace(case, starts=np.zeros_like(case.starts))
-        slopes = (
-            problem.linearized(case, np.zeros(problem.size), self.noise)[1] / self.noise[:, None]
-        )
-        count, J = len(self.unknowns), slopes.reshape(-1, problem.size)
+        _, slopes = problem.linearized(case, np.zeros(problem.size), self.noise)
+        J = (slopes / self.noise[:, None]).reshape(-1, problem.size)
+        count = len(self.unknowns)
         rest = problem.size - count
         prior = np.hstack([np.eye(rest), np.zeros((rest, count))])
         both = np.vstack([np.roll(J, rest, axis=1), prior])
