@@ -66,6 +66,16 @@ def test_values_and_derivatives_are_those_of_machine_code(name, quantity):
             assert np.abs(one - other).max() <= 1e-10 * max(np.abs(other).max(), 1.0)
 
 
+def test_a_machine_that_floats():
+    machine = crane.load("anymal", floating=True)
+    dynamics, rng = crane.Dynamics(machine), np.random.default_rng(0)
+    q, v, x = (0.3 * rng.normal(size=len(machine.active)) for _ in range(3))
+    for quantity in ("inverse", "forward"):
+        wanted = getattr(dynamics, quantity)(q, v, x)
+        found = np.array(crane.casadi_function(machine, quantity)(q, v, x)).ravel()
+        assert np.abs(found - wanted).max() <= 1e-12 * np.abs(wanted).max()
+
+
 def test_friction_is_in_when_asked_for(log_crane):
     dynamics = crane.Dynamics(log_crane)
     for quantity in ("inverse", "forward"):

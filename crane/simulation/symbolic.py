@@ -38,9 +38,10 @@ def casadi_function(
     iteration inside might end on another; and a function is one expression, of which CasADi has
     exact sparse derivatives of any order, and makes code. Along the closed machine
 
-        d f / d q_A = (df/dq) gamma,    q' = gamma v_A.
+        d f / d q_A = (df/dq) gamma,    q' = gamma v_A,
 
-    Where only q_A is wanted, `casadi.rootfinder` makes q_P from `loops`.
+    but for a base that floats, whose q holds a rotation vector. Where only q_A is wanted,
+    `casadi.rootfinder` makes q_P from `loops`.
 
     | quantity | arguments | result |
     |---|---|---|
