@@ -104,7 +104,9 @@ _HOMES = {
     "crane.motion.workspaces": "Workspace workspace",
     "crane.recordings": "Recording",
     "crane.recordings.measured": "read_measured",
-    "casadi_function",
+    "crane.simulation": "Batch Comparison InterruptedRun LinearModel Sensitivities linear_models "
+    "linearize replay sensitivities simulate simulate_batch",
+    "crane.simulation.symbolic": "casadi_function",
     "crane.studies": "Study study",
     "crane.view.page": "report",
     "crane.view.sketch": "sketch",

@@ -4,7 +4,8 @@ import numpy as np
 
 from crane.common.samples import Array
 from crane.control.valves import Signals, circuit_of
-from crane.identification.calibration.unknowns import SIGNAL, Unknown
+from crane.description.sensors import SIGNAL
+from crane.identification.calibration.unknowns import Unknown
 from crane.identification.excitation.told import Told
 from crane.machine import Machine
 from crane.recordings.recording import Recording

@@ -11,7 +11,8 @@ from crane.common.errors import InputError, known
 from crane.common.samples import Array, Brief, as_count, as_number, as_seed
 from crane.common.units import quantity
 from crane.control.valves import circuit_of
-from crane.identification.calibration.unknowns import SIGNAL, Unknown
+from crane.description.sensors import SIGNAL
+from crane.identification.calibration.unknowns import Unknown
 from crane.identification.excitation.exchange import Exchange
 from crane.identification.excitation.information import CRITERIA, Quality
 from crane.identification.excitation.signal_limits import SignalLimits
@@ -19,7 +20,7 @@ from crane.identification.excitation.text import columns
 from crane.identification.excitation.told import Told
 from crane.machine import Machine
 from crane.recordings import timeseries
-from crane.recordings.recording import Recording
+from crane.recordings.recording import IDEAL, SENSORS, Recording
 from crane.recordings.timeseries import Table
 
 _VAGUE = 0.5  # standard deviation, of a number's size, that says nothing
@@ -88,6 +89,7 @@ class SignalExcitation(Brief):
             OutputError: It cannot be written there.
         """
         notes = {"machine": self.machine.call, "task": "excitation through the valves"}
+        notes[SENSORS] = IDEAL
         timeseries.write(path, Table(self.table.units, self.table.values, notes))
 
     def to_text(self) -> str:

@@ -9,14 +9,15 @@ import numpy as np
 from crane.common.errors import InputError, known
 from crane.common.samples import Array, as_number
 from crane.control.valves import circuit_of
+from crane.description.sensors import INCLINATION, SIGNAL, VELOCITY
 from crane.formats.loading import Variants
 from crane.identification.calibration.problem import Case, Problem, case_of
-from crane.identification.calibration.readings import INCLINATION, read, sensors_of, units_of
-from crane.identification.calibration.unknowns import SIGNAL, unknowns_of
+from crane.identification.calibration.unknowns import unknowns_of
 from crane.identification.excitation.information import Quality, quality
 from crane.machine import Machine
-from crane.recordings.recording import VELOCITY, Recording
+from crane.recordings.recording import Recording
 from crane.recordings.timeseries import TIME, Table
+from crane.simulation.readings import read_off, sensors_of, units_of
 
 # Standard deviations of usual sensors, by unit.
 _NOISE = {"rad": 1e-3, "m": 5e-4, "rad/s": 5e-3, "m/s": 2e-3, "Pa": 3e4}
@@ -73,7 +74,8 @@ class Told:
         }
         if not self.units:
             raise InputError(f"no sensor is named, choose among {', '.join(every)}")
-        given = dict(noise or {})
+        given = {x: y.noise for x, y in machine.sensors.items() if y.noise and x in self.units}
+        given |= noise or {}
         for name in given:
             if name not in self.units:
                 raise InputError(
@@ -94,12 +96,12 @@ class Told:
     def variant(self, values: Mapping[str, float]) -> Machine:
         """The machine with some of the wanted numbers changed, of friction that is smooth."""
         z = [(values.get(one.name, one.start) - one.start) / one.scale for one in self.unknowns]
-        return self._problem.variant(np.array(z))
+        return self._problem.variant(np.array(z), self._problem.smooth)
 
     def table(self, run: Recording, noisy: bool = False) -> Table:
         """What a run's recording would hold: signals and readings, with noise or without."""
         names = list(self.units)
-        values = read(self.machine, run, names)
+        values = read_off(self.machine, run, names)
         if noisy:
             random = np.random.default_rng(self._seed)
             values = values + self.noise * random.normal(size=values.shape)
@@ -123,13 +125,13 @@ class Told:
         names, table = list(self.units), self.table(run, noisy=True)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            case = case_of(self.machine, "the design", table, names, (0.0, np.inf))
+            case = case_of(self.machine, "the design", table, {}, names, (0.0, np.inf))
         if not self._problem.cases:
             self._problem = self._smoothed([case])
         problem, case = self._problem, replace(case, first=len(self.unknowns))
         if not starts:
             case = replace(case, starts=np.zeros_like(case.starts))
-        _, slopes = problem.linearized(case, np.zeros(problem.size), self.noise)
+        _, slopes = problem.linearized(case, np.zeros(problem.size))
         J = (slopes / self.noise[:, None]).reshape(-1, problem.size)
         count = len(self.unknowns)
         rest = problem.size - count
@@ -139,10 +141,6 @@ class Told:
 
     def quality(self, run: Recording) -> Quality:
         """What a recording of a run will tell; deviations in the units of the numbers."""
-        first = self.deviations(self.rows(run))
-        width = np.ones(self._problem.size)  # differences over about the intervals
-        width[: len(first)] = first
-        self._problem.widen(width)
         rows = self.rows(run)
         told = quality(rows, np.eye(len(self.unknowns)), 0.0)
         scale = np.array([unknown.scale for unknown in self.unknowns])
