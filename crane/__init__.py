@@ -20,7 +20,15 @@ if TYPE_CHECKING:
         ValvePD,
         joystick,
     )
-    from crane.description import EndStop, ForceElement, Friction, GasSpring, PIGains, Rope
+    from crane.description import (
+        EndStop,
+        ForceElement,
+        Friction,
+        GasSpring,
+        PIGains,
+        Rope,
+        Sensor,
+    )
     from crane.dynamics import Dynamics
     from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
     from crane.formats.adding import add_cylinder, add_loops
@@ -29,6 +37,7 @@ if TYPE_CHECKING:
     from crane.identification.calibration.calibrate import calibrate
     from crane.identification.calibration.result import Calibration
     from crane.identification.excitation.excite import Excitation, excite
+    from crane.identification.excitation.signals import SignalExcitation, excite_valves
     from crane.identification.hydraulics.cylinder_friction import identify_cylinder_friction
     from crane.identification.hydraulics.orifices import identify_orifices
     from crane.identification.hydraulics.valve import identify_valve
@@ -53,12 +62,15 @@ if TYPE_CHECKING:
         Comparison,
         InterruptedRun,
         LinearModel,
+        Sensitivities,
         linear_models,
         linearize,
         replay,
+        sensitivities,
         simulate,
         simulate_batch,
     )
+    from crane.simulation.symbolic import casadi_function
     from crane.studies import Study, study
     from crane.view.page import report
     from crane.view.sketch import sketch
@@ -71,7 +83,7 @@ _HOMES = {
     "crane.common.errors": "CraneError CraneWarning",
     "crane.control": "PI Command ComputedTorque Controller Law Sampled Signals TipVelocity "
     "ValveDrive ValvePD joystick",
-    "crane.description": "EndStop ForceElement Friction GasSpring PIGains Rope",
+    "crane.description": "EndStop ForceElement Friction GasSpring PIGains Rope Sensor",
     "crane.dynamics": "Dynamics",
     "crane.formats": "load write_machine write_mjcf write_urdf_plus",
     "crane.formats.adding": "add_cylinder add_loops",
@@ -80,6 +92,7 @@ _HOMES = {
     "crane.identification.calibration.calibrate": "calibrate",
     "crane.identification.calibration.result": "Calibration",
     "crane.identification.excitation.excite": "Excitation excite",
+    "crane.identification.excitation.signals": "SignalExcitation excite_valves",
     "crane.identification.hydraulics.cylinder_friction": "identify_cylinder_friction",
     "crane.identification.hydraulics.orifices": "identify_orifices",
     "crane.identification.hydraulics.valve": "identify_valve",
@@ -93,8 +106,9 @@ _HOMES = {
     "crane.motion.workspaces": "Workspace workspace",
     "crane.recordings": "Recording",
     "crane.recordings.measured": "read_measured",
-    "crane.simulation": "Batch Comparison InterruptedRun LinearModel linear_models linearize "
-    "replay simulate simulate_batch",
+    "crane.simulation": "Batch Comparison InterruptedRun LinearModel Sensitivities linear_models "
+    "linearize replay sensitivities simulate simulate_batch",
+    "crane.simulation.symbolic": "casadi_function",
     "crane.studies": "Study study",
     "crane.view.page": "report",
     "crane.view.sketch": "sketch",
@@ -105,14 +119,14 @@ __all__ = [
     "Controller", "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation",
     "ForceElement", "Friction", "GasSpring", "Identification", "InterruptedRun", "Kinematics",
     "Law", "LinearModel", "Machine", "PDGains", "PIGains", "Payload", "Recording", "Rope",
-    "Sampled", "Signals", "Study",
+    "Sampled", "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Study",
     "TipVelocity", "Trajectory", "ValveDrive", "ValvePD", "Workspace", "add_cylinder", "add_loops",
-    "calibrate", "check", "cross_validate", "excite",
+    "calibrate", "casadi_function", "check", "cross_validate", "excite", "excite_valves",
     "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
     "identify_valve", "joystick", "linear_models", "linearize", "load",
     "point_to_point", "polynomial", "read_measured", "replay", "report",
-    "simulate", "simulate_batch", "sketch", "study", "task_trajectory", "tip_trajectory",
-    "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
+    "sensitivities", "simulate", "simulate_batch", "sketch", "study", "task_trajectory",
+    "tip_trajectory", "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 

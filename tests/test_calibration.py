@@ -11,6 +11,7 @@ from typed import typed
 import crane
 from crane.common.errors import CraneError, CraneWarning
 from crane.description.changes import parameters
+from crane.description.sensors import Sensor
 from crane.formats.loading import Variants
 from crane.identification.calibration.unknowns import unknowns_of
 from crane.recordings import timeseries
@@ -93,7 +94,7 @@ def test_the_rest_of_the_recording_is_predicted_to_its_noise(fitted):
 
 def test_what_is_fitted_can_be_loaded(fitted):
     machine, path, found = fitted
-    assert set(found.changes) == set(TRUTH)
+    assert set(found.changes) == {*TRUTH, "sensor.x.zero"}
     again = crane.load(machine.path, changes=found.changes)
     _, comparison = quiet(crane.replay, again, path, 0.01)
     by_name = {channel.name: channel for channel in comparison.channels}
@@ -286,3 +287,81 @@ def test_what_no_machine_file_says_is_left_out_with_a_warning(fitted, tmp_path):
     assert done.returncode == 0 and "the machine is not written, take the --set" in done.stderr
     assert {x.name for x in (tmp_path / "out").iterdir()} == {"calibration.md", "calibration.png"}
     assert "--set valve.x.c1=" in done.stdout
+
+
+def test_fitted_sensors_stand_in_the_machine(fitted, tmp_path):
+    """Of a raw log, with its columns; what is fitted is what was put on, a pressure of 3 bar."""
+    machine, path, _ = fitted
+    table, log, columns = timeseries.read(path), tmp_path / "log.csv", tmp_path / "columns.txt"
+    x = dict(zip(table.units, table.values.T, strict=True))
+    raw = {
+        "t_ms": 1e3 * x["time"], "U": x["voltage_x"], "s_mm": 1e3 * x["x"] + 3,
+        "pA": 1e-5 * x["pressure_x_a"] + 3, "pB": x["pressure_x_b"],
+    }  # fmt: skip
+    rows = np.column_stack(list(raw.values()))
+    np.savetxt(log, rows, "%.17g", ",", header=",".join(raw), comments="")
+    lines = ["time [ms] = t_ms", "voltage_x [V] = U", "x [mm] = s_mm - 7", "hold [V] = 5.8"]
+    lines += ["pressure_x_a [bar] = pA", "pressure_x_b [Pa] = pB"]
+    columns.write_text("\n".join(lines))
+    true = crane.load(machine.path, changes=TRUTH)
+    fit, name = {"sensor.pressure_x_a.zero": None}, "pressure_x_a"
+    found = quiet(
+        crane.calibrate, true, log, fit, columns=columns, train=(0.5, 3.0), span=(0.5, 4)
+    )
+    (zero,) = found.fitted
+    assert zero.start == 0.0 and abs(zero.value - 3e5) < 2 * zero.interval < 0.5e5
+    assert found.sensors[0].time[0] == 0.5 and found.sensors[0].time[-1] == pytest.approx(4.0)
+    assert found.sensors[0].train.sum() == 251
+    again = crane.load(crane.write_machine(found.machine, tmp_path / "machine"))
+    assert again.sensors["x"] == Sensor("s_mm - 7", "mm") and "hold" not in again.sensors
+    assert again.sensors[name] == Sensor("pA", "bar", zero.value)
+    _, comparison = quiet(crane.replay, again, log, 0.01, span=(0.5, 4.0))
+    by_name = {channel.name: channel for channel in comparison.channels}
+    wanted = x[name][50:401] + 3e5 - zero.value
+    np.testing.assert_allclose(by_name[name].measured, wanted, rtol=1e-12)
+    assert by_name[name].rms < 5e4  # its noise is 2e4
+    # from there on the search begins, and ends where it began
+    (second,) = quiet(crane.calibrate, again, log, fit, train=(0.5, 3.0), span=(0.5, 4.0)).fitted
+    assert second.start == zero.value and abs(second.value - zero.value) < 0.1 * zero.interval
+
+
+def test_windows_and_quantities_that_cannot_be(fitted, tmp_path):
+    machine, path, _ = fitted
+    with pytest.raises(CraneError) as error:
+        quiet(crane.calibrate, machine, path, ["load_x.mass"], train=(0.0, 4.0), span=(1.0, 5.0))
+    assert "what is fitted, 0 to 4 s, is not within 1 to 5 s, which is read" in str(error.value)
+    ideal = tmp_path / "ideal.csv"
+    ideal.write_text("# sensors: ideal\n" + path.read_text())
+    with pytest.raises(CraneError) as error:
+        quiet(crane.calibrate, machine, ideal, ["sensor.x.zero"])
+    assert "'sensor.x.zero' cannot be fitted to quantities, which its note" in str(error.value)
+
+
+def test_a_sensor_that_is_said_to_be_noisy_hardly_counts(fitted):
+    """Without its pressures the recording hardly tells what the rig lifts."""
+    machine, path, _ = fitted
+    numbers = TRUTH | {f"sensor.pressure_x_{side}.noise": 1e8 for side in "ab"}
+    wide, narrow = (
+        quiet(crane.calibrate, crane.load(machine.path, changes=x), path, ["load_x.mass"],
+              train=(0.0, 2.0), span=(0.0, 2.0)).fitted[0].interval
+        for x in (numbers, TRUTH)
+    )  # fmt: skip
+    assert wide > 5 * narrow
+
+
+def test_what_a_model_lacks_is_named_with_how_much_of_it(tmp_path):
+    """Air in a chamber that nobody asked for; without it nothing is missed."""
+    machine, gas = simple(tmp_path), 2e-5
+    air = "cylinder.x.gas_a"
+    fit = ["valve.x.neutral", "load_x.mass", "friction.x.coulomb"]
+    known = {name: TRUTH[name] for name in TRUTH if name not in fit}
+    machine = crane.load(machine.path, changes=known)
+    path = recorded(machine, tmp_path / "air.csv", 0, TRUTH | {air: gas})
+    found = quiet(crane.calibrate, machine, path, fit, train=(0.0, 4.0))
+    missing = {one.name: one for one in found.lacking}
+    # so does a hose that is wider
+    assert found.lacking[0].share > 0.2 and missing[air].share > 0.8 * found.lacking[0].share
+    assert missing[air].value == pytest.approx(gas, rel=0.5)
+    assert f"{air} at about" in found.to_text()
+    path = recorded(machine, tmp_path / "none.csv", 0)
+    assert not quiet(crane.calibrate, machine, path, fit, train=(0.0, 4.0)).lacking

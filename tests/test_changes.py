@@ -192,7 +192,8 @@ def documented():
     names = [name for row in section.splitlines() if row.startswith("| `")
              for name in re.findall("`([^`]+)`", row.split("|")[1])]  # fmt: skip
     return {name: name.replace(".", r"\.").replace("LINK", ".+").replace("JOINT", ".+")
-            .replace("KEY", "[a-z0-9_]+") for name in names}  # fmt: skip
+            .replace("KEY", "[a-z0-9_]+")
+            .replace("QUANTITY", ".+") for name in names}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", [*bundled(), str(DATA / "four_bar.yaml")])

@@ -143,7 +143,7 @@ TEXT = [
         "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, known: "
         "active, chains, control, couplings, drives, end_stops, forces, free, friction, "
         "gas_springs, home, hydraulics, identification, loops, name, payload, ropes, "
-        "rotor_inertia, source, tasks, tip",
+        "rotor_inertia, sensors, source, tasks, tip",
         swap("tip: coupler_pin", '"tip\\n\\e[31m": coupler_pin'),
     ),
     case(
@@ -165,7 +165,7 @@ KEYS = [
         "four_bar.yaml:29: unknown key 'gravity' in the machine file, known: "
         "active, chains, control, couplings, drives, end_stops, forces, free, friction, "
         "gas_springs, home, hydraulics, identification, loops, name, payload, ropes, "
-        "rotor_inertia, source, tasks, tip",
+        "rotor_inertia, sensors, source, tasks, tip",
         swap("tip: coupler_pin", "gravity: 9.81"),
     ),
     case(

@@ -1,5 +1,6 @@
 """Recordings of a real crane: strokes from angles, forces from pressures."""
 
+import re
 import warnings
 
 import numpy as np
@@ -11,7 +12,7 @@ from typed import typed
 import crane
 from crane.cli.runs import read_run
 from crane.common.errors import CraneError, CraneWarning, RecordingError
-from crane.recordings import measured
+from crane.recordings import postures
 from crane.recordings.measured import read_measured
 from crane.recordings.recording import Recording
 
@@ -285,12 +286,11 @@ BROKEN = {
     "no pressures": (
         without("pressure_X2_a [bar]", "pressure_X2_b [bar]"),
         "column 'X2_force' is missing, give it in [N], or 'pressure_X2_a [Pa]' and "
-        "'pressure_X2_b [Pa]', or lock the joint if it was held (lock X2=VALUE)",
+        "'pressure_X2_b [Pa]'; or lock what was held, where it was: --lock X2=0.0108 (home)",
     ),
     "no torque of the slewing motor": (
         without("q1_force [N m]"),
-        "column 'q1_force' is missing, give it in [N m], or lock the joint if it was held "
-        "(lock q1=VALUE)",
+        ": column 'q1_force' is missing, give it in [N m]",
     ),
     "pressures without a cylinder": (
         lambda columns, truth: columns.update(
@@ -305,12 +305,13 @@ BROKEN = {
     ),
     "no slewing angle": (
         without("q1 [deg]"),
-        "nothing tells where 'q1' is, give 'q1 [rad]', or lock what was held (lock q1=VALUE)",
+        "nothing tells where 'q1' is, give 'q1 [rad]'; or lock what was held, where it was: "
+        "--lock q1=0 (home)",
     ),
     "one angle too few": (
         without("q2 [deg]"),
         "nothing tells where 'X1' is, give 'X1 [m]', or a joint that moves with it "
-        "(q4, q9, q2), or lock what was held (lock X1=VALUE)",
+        "(q4, q9, q2); or lock what was held, where it was: --lock X1=0.0221 (home)",
     ),
     "angle without a unit": (
         renamed("q3 [deg]", "q3"),
@@ -326,11 +327,15 @@ BROKEN = {
     ),
     "wrong zero": (
         lambda columns, truth: columns["q2 [deg]"].__iadd__(60.0),
-        " m, its limits are 0 and 0.03: see that zero and sign of q2, q3 are the machine's",
+        " m, its limits are 0 and 0.03: see that zero and sign of q2, q3 are the machine's"
+        ", and that none of them counts from "
+        "the horizon (inclination_LINK)",
     ),
     "angles that no posture has": (
         lambda columns, truth: columns.update({"q4 [rad]": columns.pop("q2 [deg]") / 57 - 1.0}),
-        "; see that zero and sign of q3, q4 are the machine's",
+        "; see that zero and sign of q3, q4 are the machine's"
+        ", and that none of them counts from "
+        "the horizon (inclination_LINK)",
     ),
 }  # fmt: skip
 
@@ -353,10 +358,12 @@ def test_everything_that_is_missing_is_told_at_once(machine, columns, tmp_path):
         read_measured(machine, write(tmp_path, columns))
     line = str(caught.value)
     assert "nothing tells where 'q1', 'X1' are, give 'q1 [rad]', 'X1 [m]', or a joint" in line
-    assert "(lock q1=VALUE, X1=VALUE); column 'q1_force' is missing, give it in" in line
-    assert line.endswith(
-        "'pressure_X2_a' is missing beside 'pressure_X2_b', give it, or 'X2_force [N]'"
+    assert "); column 'q1_force' is missing, give it in [N m]; column" in line
+    assert (
+        "'pressure_X2_a' is missing beside 'pressure_X2_b', give it, or 'X2_force [N]'; or lock"
+        in line
     )
+    assert line.endswith("where it was: --lock q1=0 (home) --lock X1=0.0221 (home)")
 
 
 @pytest.mark.parametrize("full", [True, False])
@@ -368,14 +375,17 @@ def test_sensors_that_disagree_are_told(machine, columns, truth, tmp_path, full)
     if full:
         columns |= {f"X{i} _force [N]".replace(" ", "", 1): truth["tau"][:, i] for i in (1, 2)}
     off = np.rad2deg(late - truth["angles"]["q3"]) + 3.0
-    at = int(np.abs(off).argmax())
     with pytest.warns(CraneWarning) as caught:
         read_measured(machine, write(tmp_path, columns))
     (line,) = [str(one.message) for one in caught if "disagree" in str(one.message)]
-    assert line == (
-        f"sensors disagree: by q1, X1, X2, which are used, 'q3' is {off.mean():+.3g} deg off on "
-        f"the mean, {off[at]:+.3g} at most (at {truth['t'][at]:.4g} s)"
+    assert line.startswith(
+        f"sensors disagree: 'q3' is {off.mean():+.3g} deg off on the mean ({off.min():+.3g} to "
+        f"{off.max():+.3g} over the motion) against X2: a constant offset leaves "
     )
+    (numbers,) = re.findall(r"a delay besides .* deg \((.*?)\)", line)
+    told = dict(part.split(" = ") for part in numbers.split(", "))
+    assert float(told["sensor.q3.zero"]) == pytest.approx(np.deg2rad(3.0), abs=np.deg2rad(0.1))
+    assert float(told["sensor.q3.delay"]) == pytest.approx(0.1, abs=0.01)
 
 
 def test_sensors_that_agree_within_their_noise_are_not(machine, columns, truth, tmp_path):
@@ -391,7 +401,7 @@ def test_strokes_do_not_depend_on_the_blocks(machine, columns, truth, tmp_path, 
     """Nor does what an error calls a sample: it counts from the first of all."""
     file = write(tmp_path, columns)
     whole = read_measured(machine, file)
-    monkeypatch.setattr(measured, "_AT_ONCE", 50)
+    monkeypatch.setattr(postures, "_AT_ONCE", 50)
     blocks = read_measured(machine, file)
     for name in ("q", "v", "tau"):
         assert close(getattr(blocks, name), getattr(whole, name), 1e-12)
@@ -427,7 +437,8 @@ def test_beyond_a_dead_centre(machine, columns, truth, tmp_path):
         first = int(np.argmax(q9 < in_line))
         assert str(caught.value) == (
             f"{file}: sample {first} is beyond a dead centre, where q1, X1, X2 do not tell the "
-            "posture: see that zero and sign of q9 are the machine's, or cut the recording"
+            "posture: see that zero and sign of q9 are the machine's, and that none of them "
+            "counts from the horizon (inclination_LINK), or cut the recording"
         )
 
 
@@ -456,7 +467,7 @@ def test_command_line(path, columns, tmp_path):
     identify = ("identify", path, file, "--out", "found")
     result = typed(*identify, cwd=tmp_path)
     assert result.returncode == 2 and not (tmp_path / "found").exists()
-    assert f"error: {file}: nothing tells where 'q1' is, give 'q1 [rad]', or lock" in result.stderr
+    assert f"error: {file}: nothing tells where 'q1' is, give 'q1 [rad]'; or lock" in result.stderr
     result = typed(*identify, "--lock", "q1=0", cwd=tmp_path)
     assert "nothing tells" not in result.stderr
     columns["q1 [rad]"] = columns["time [ms]"] * 1e-4

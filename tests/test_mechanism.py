@@ -190,7 +190,7 @@ MINI_FORWARDER = [
     case(
         "chain on a wrong pin",
         "mini_forwarder.yaml:{line of active:}: the active joints q1, X1, X2 cannot"
-        " drive q4, q9, q2: choose others, such as [q1, q9, q3] (condition 1.76), or [q1, q4, q3] "
+        " drive q4, q9, q2: choose others, such as [q1, q4, q3] (condition 1.76), or [q1, q9, q3] "
         "(condition 1.76)",
         swap("chain_b1.urdf, parent: link1_B", "chain_b1.urdf, parent: link1_C", MINI),
         machine=MINI,

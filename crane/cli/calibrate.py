@@ -10,14 +10,17 @@ from crane.cli.shared import (
     Change,
     Columns,
     Force,
+    From,
     Lock,
     MachineName,
     Train,
+    Until,
     Validation,
     app,
     load,
     names,
     progress_bar,
+    span_of,
     window,
 )
 from crane.common.errors import InputError
@@ -44,6 +47,8 @@ def calibrate(
     train: Train = None,
     validation: Validation = None,
     columns: Columns = None,
+    since: From = None,
+    until: Until = None,
     sensors: Annotated[
         str | None,
         typer.Option(metavar="COLUMNS", help="What is compared, as X_lift,pressure_X_lift_a."),
@@ -65,12 +70,12 @@ def calibrate(
     if out is not None:
         check_folder(out, force)
     wanted = fits(fit)
-    span = window(train)
+    fitted, span = window(train), span_of(since, until)
     loaded = load(machine, lock, change)
     with progress_bar("simulating") as progress:
         found = run(
-            loaded, recording, wanted, train=span, validation=validation or (), columns=columns,
-            sensors=names(sensors), progress=progress,
+            loaded, recording, wanted, train=fitted, validation=validation or (), columns=columns,
+            span=span, sensors=names(sensors), progress=progress,
         )  # fmt: skip
     text = found.to_text()
     if out is not None:

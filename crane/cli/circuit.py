@@ -6,7 +6,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crane.cli.shared import Change, Force, Lock, MachineName, app, load, status
+from crane.cli.shared import (
+    Change,
+    Columns,
+    Force,
+    From,
+    Lock,
+    MachineName,
+    Until,
+    app,
+    load,
+    span_of,
+    status,
+)
 from crane.common.errors import InputError, known
 
 if TYPE_CHECKING:
@@ -47,6 +59,9 @@ def circuit(
     ] = None,
     change: Change = None,
     lock: Lock = None,
+    columns: Columns = None,
+    since: From = None,
+    until: Until = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", metavar="FOLDER", help="Folder for the table and its figure."),
@@ -58,6 +73,7 @@ def circuit(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from crane.cli.runs import check_folder, read_run
     from crane.common.output import staging
+    from crane.identification.hydraulics.cylinder_signals import needed
 
     if model not in MODELS:
         raise InputError(f"model '{model}' is unknown, {known(MODELS, model)}")
@@ -69,11 +85,15 @@ def circuit(
         raise InputError(f"--model {model} takes one recording, {len(recording)} are given")
     if out is not None:
         check_folder(out, force)
+    span = span_of(since, until)
     loaded = load(machine, lock, change)
     if joint not in loaded.active:
         raise InputError(f"'{joint}' is not an active joint, {known(loaded.active, joint)}")
-    runs = [read_run(path, loaded) for path in recording]
-    judge = None if validation is None else read_run(validation, loaded)
+    needs = needed(joint) if model == "orifices" else []
+    if model == "valve":
+        needs.append((f"voltage_{joint}",))
+    runs = [read_run(path, loaded, columns, span, needs) for path in recording]
+    judge = None if validation is None else read_run(validation, loaded, columns, needs=needs)
     with status("identifying"):
         if model == "orifices":
             text, figure = _orifices(loaded, runs, joint, method or "weak", period, judge)

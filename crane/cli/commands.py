@@ -10,18 +10,23 @@ import typer
 from crane.cli.shared import (
     Active,
     Argument,
+    Columns,
     Floating,
     Force,
     Free,
+    From,
+    Lock,
     MachineName,
     NoOpen,
     Out,
     OutFile,
     Packages,
+    Until,
     app,
     arguments,
     load,
     progress_bar,
+    span_of,
 )
 from crane.common.errors import InputError
 
@@ -92,6 +97,10 @@ def view(
         Path | None,
         typer.Option(metavar="RUN", help="A second run of the machine, laid over the first."),
     ] = None,
+    lock: Lock = None,
+    columns: Columns = None,
+    since: From = None,
+    until: Until = None,
     out: OutFile = None,
     no_open: NoOpen = False,
     force: Force = False,
@@ -104,19 +113,22 @@ def view(
     recording = other = None
     if is_run(what):
         path = Path(what)
-        given = None if machine is None else load(machine)
-        recording = read_run(path, given)
+        given, span = _machine_of_run(machine, lock), span_of(since, until)
+        recording = read_run(path, given, columns, span)
         loaded = given or machine_of(what, recording.machine)
         if over is not None:
-            other = read_run(over, loaded)
+            other = read_run(over, loaded, columns, span)
         page = out or (path if path.is_dir() else path.parent) / PAGE
-    elif over is not None:
-        raise InputError(f"--over is for runs, and '{what}' is none, leave it out")
-    elif machine is None:
+    else:
+        of_runs = {
+            "--over": over, "--machine": machine, "--lock": lock, "--columns": columns,
+            "--from": since, "--until": until,
+        }  # fmt: skip
+        for option, value in of_runs.items():
+            if value is not None:
+                raise InputError(f"{option} is for runs, and '{what}' is none, leave it out")
         loaded = load(what)
         page = out or Path(file_name(loaded.name) + ".html")
-    else:
-        raise InputError(f"--machine is for runs, and '{what}' is none, leave it out")
     check_free(page, force)
     report(loaded, recording, page, other)
     print(f"written to {page}")
@@ -128,6 +140,10 @@ def view(
 def plot(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="A run's folder or a recording.")],
     machine: RunMachine = None,
+    lock: Lock = None,
+    columns: Columns = None,
+    since: From = None,
+    until: Until = None,
     out: OutFile = None,
     force: Force = False,
 ) -> None:
@@ -135,7 +151,7 @@ def plot(
     from crane.cli.runs import FIGURE, check_free, read_run
     from crane.view.plots.recording import plot_recording
 
-    recording = read_run(run, None if machine is None else load(machine))
+    recording = read_run(run, _machine_of_run(machine, lock), columns, span_of(since, until))
     figure = out or (run if run.is_dir() else run.parent) / FIGURE
     check_free(figure, force)
     plot_recording(recording, figure)
@@ -155,6 +171,12 @@ def demo(out: Out = Path("demo-output"), force: Force = False) -> None:
     print(f"figures:    {out}/*/{FIGURE}\nanimations: {out}/*/{PAGE} (open them in a browser)")
 
 
+def _machine_of_run(name: str | None, lock: list[str] | None) -> "Machine | None":
+    if name is None and lock:
+        raise InputError("--lock is for a machine, name it by --machine")
+    return None if name is None else load(name, lock)
+
+
 def is_run(what: str) -> bool:
     """Whether a run is meant and no machine."""
     from crane.description.sources import FOLDERS
@@ -166,10 +188,11 @@ def is_run(what: str) -> bool:
 
 def _describe(machine: "Machine") -> Iterator[str]:
     from crane.common.units import quantity
+    from crane.description.sensors import Sensor
     from crane.dynamics import Dynamics
     from crane.dynamics.lengths import Lengths
 
-    closure = machine.closure
+    closure, ideal = machine.closure, Sensor().numbers()
     structure = closure.structure
     mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
     yield f"{machine.name}"
@@ -240,6 +263,10 @@ def _describe(machine: "Machine") -> Iterator[str]:
                 f"    {joint:<{width}}{kind}, {size * cylinder.area_a:.4g} and "
                 f"{size * cylinder.area_b:.4g} {unit}"
             )
+    for name, sensor in machine.sensors.items():
+        known = [f"{what} {x:g}" for what, x in sensor.numbers().items() if x != ideal[what]]
+        where = [f"{sensor.column} [{sensor.unit}]" if sensor.unit else sensor.column]
+        yield f"  sensor      {name}: {', '.join([x for x in where if x] + known) or 'ideal'}"
     for task in machine.tasks.values():
         yield f"  task        {task.name}, {task.duration:g} s: {task.description}"
 

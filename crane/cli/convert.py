@@ -12,12 +12,15 @@ from crane.cli.shared import (
     Floating,
     Force,
     Free,
+    From,
     Lock,
     MachineName,
     Packages,
+    Until,
     _place,
     app,
     load,
+    span_of,
 )
 from crane.common.errors import InputError, known
 
@@ -82,16 +85,20 @@ def import_log(
         Path,
         typer.Option("--out", metavar="FILE", parser=_place, help="The recording, a .csv file."),
     ],
+    since: From = None,
+    until: Until = None,
     force: Force = False,
 ) -> None:
     """Write the recording that is in the log of another program."""
     from crane.cli.runs import check_free
     from crane.recordings import timeseries
     from crane.recordings.logs import read_log
+    from crane.recordings.reading import within
 
     if out.suffix.lower() != ".csv":
         raise InputError(f"{out}: a recording is written as .csv, name it so")
+    span = span_of(since, until)
     check_free(out, force)
-    table = read_log(log, columns)
+    table = within(read_log(log, columns), span, log)
     timeseries.write(out, table)
     print(f"{len(table.values)} samples of {len(table.units)} columns written to {out}")

@@ -1,4 +1,4 @@
-"""Commands that change or find parameters: study, excite, identify, payload."""
+"""The command that changes parameters: study."""
 
 import os
 from typing import Annotated
@@ -10,8 +10,6 @@ from crane.cli.shared import (
     MachineName,
     Out,
     app,
-    by_joint,
-    load,
     progress_bar,
 )
 
@@ -58,48 +56,3 @@ def study(
         )  # fmt: skip
     write_study(out, result)
     print(f"{result.to_text()}\nwritten to {out}")
-
-
-@app.command()
-def excite(
-    machine: MachineName,
-    out: Out,
-    period: Annotated[float, typer.Option(help="In seconds.")] = 10.0,
-    harmonics: Annotated[int, typer.Option(help="Of the period.")] = 5,
-    periods: Annotated[int, typer.Option(help="How many steady ones.")] = 3,
-    criterion: Annotated[str, typer.Option(help="logdet or condition.")] = "logdet",
-    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
-    noise: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="JOINT=VALUE", help="Deviation of its force; 1 % of the limit if not given."
-        ),
-    ] = None,
-    acceleration: Annotated[
-        list[str] | None, typer.Option(metavar="JOINT=VALUE", help="A limit beside the URDF's.")
-    ] = None,
-    step: Annotated[float, typer.Option(help="Of the recording in seconds.")] = 0.01,
-    force: Force = False,
-) -> None:
-    """Find a periodic motion that tells most about a machine's parameters."""
-    # its matrices are small: threads would only wait for each other
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from crane.cli.runs import check_folder
-    from crane.common.output import staging
-    from crane.identification.excitation.excite import excite as run
-    from crane.view.plots.excitation import plot_excitation
-
-    check_folder(out, force)
-    loaded = load(machine)
-    with progress_bar("optimising") as progress:
-        found = run(
-            loaded, period=period, harmonics=harmonics, periods=periods, criterion=criterion,
-            noise=by_joint("--noise", noise), acceleration=by_joint(
-                "--acceleration", acceleration
-            ), step=step, seed=seed, progress=progress,
-        )  # fmt: skip
-    with staging(out) as part:
-        found.to_csv(part / "reference.csv")
-        found.to_yaml(part / "coefficients.yaml")
-        plot_excitation(found, part / "reference.png")
-    print(f"{found.to_text()}\n\nwritten to {out}; see it with: crane view {out}/reference.csv")

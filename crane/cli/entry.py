@@ -17,6 +17,7 @@ from crane.cli import (  # noqa: F401  register their commands
     commands,
     convert,
     design,
+    excite,
     identify,
     live,
     modes,

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,6 +11,7 @@ import typer
 from crane.cli.shared import (
     Columns,
     Force,
+    From,
     Lock,
     MachineName,
     Method,
@@ -18,11 +20,13 @@ from crane.cli.shared import (
     Recordings,
     Train,
     Trust,
+    Until,
     Validation,
     app,
     by_joint,
     load,
     progress_bar,
+    span_of,
     status,
     window,
 )
@@ -47,6 +51,8 @@ def identify(
     train: Train = None,
     validation: Validation = None,
     columns: Columns = None,
+    since: From = None,
+    until: Until = None,
     method: Method = "wls",
     term: Annotated[
         list[str] | None,
@@ -103,7 +109,8 @@ def identify(
     from crane.identification.mechanics.write import check_rewritable
 
     check_folder(out, force)
-    span, changes, known = window(train), terms(term), priors(prior)
+    fitted, changes, known = window(train), terms(term), priors(prior)
+    span = span_of(since, until)
     slowest, grid = by_joint("--slow", slow), values_tried(tried)
     loaded = load(machine, lock)
     if known is None:
@@ -111,7 +118,7 @@ def identify(
         loaded = loaded.replace(estimation=estimation)
     if feasible:
         check_rewritable(loaded)
-    learned, judges = _divided(_read(recording, loaded, columns), span)
+    learned, judges = _divided(_read(recording, loaded, columns, span), fitted)
     judges += _read(validation or [], loaded, columns)
     if bandwidth is not None:
         shortest = max(min(float(x.time[-1] - x.time[0]) for x in learned), 1e-3)
@@ -201,13 +208,18 @@ def values_tried(words: Sequence[str] | None) -> "dict[str, list[float | Known]]
     return found
 
 
-def _read(paths: Sequence[Path], machine: "Machine", columns: Path | None) -> "list[Recording]":
+def _read(
+    paths: Sequence[Path],
+    machine: "Machine",
+    columns: Path | None,
+    span: "tuple[float, float]" = (-inf, inf),
+) -> "list[Recording]":
     from crane.cli.runs import read_run
 
     found = []
     for path in paths:
         with status(f"reading {path.name}"):
-            found.append(read_run(path, machine, columns))
+            found.append(read_run(path, machine, columns, span))
     return found
 
 
@@ -230,6 +242,8 @@ def payload(
     machine: MachineName,
     recording: RecordingFile,
     columns: Columns = None,
+    since: From = None,
+    until: Until = None,
     frame: Annotated[
         str | None, typer.Option(help="Link that carries the load; the tip if not given.")
     ] = None,
@@ -240,8 +254,9 @@ def payload(
     """Estimate mass and centre of mass of what a machine carries from a recording."""
     from crane.identification.mechanics.payload import identify_payload
 
+    span = span_of(since, until)
     loaded = load(machine, lock)
-    (carried,) = _read([recording], loaded, columns)
+    (carried,) = _read([recording], loaded, columns, span)
     with progress_bar("estimating") as progress:
         estimate = identify_payload(loaded, carried, frame, method, trust=trust, progress=progress)
     print(estimate.to_text(), end="")

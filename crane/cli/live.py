@@ -9,12 +9,16 @@ from crane.cli.shared import (
     Active,
     Argument,
     Change,
+    Columns,
     Floating,
     Free,
+    From,
     Lock,
     Packages,
+    Until,
     app,
     load,
+    span_of,
 )
 from crane.cli.waiting import shown
 from crane.common.errors import InputError
@@ -32,6 +36,9 @@ def live(
     run: Annotated[
         Path | None, typer.Option(metavar="RUN", help="A run of the machine to play.")
     ] = None,
+    columns: Columns = None,
+    since: From = None,
+    until: Until = None,
     host: Annotated[
         str, typer.Option(metavar="ADDRESS", help="To listen on; 0.0.0.0 for all computers.")
     ] = "127.0.0.1",
@@ -63,14 +70,17 @@ def live(
                 "--set, --lock, --active and --free are for machines, name the run with --run"
             )
         given = None if machine is None else load(machine)
-        recording = read_run(Path(what), given)
+        recording = read_run(Path(what), given, columns, span_of(since, until))
         loaded = given or machine_of(what, recording.machine)
     elif machine is not None:
         raise InputError(f"--machine is for runs, and '{what}' is none, leave it out")
     else:
         loaded = load(what, lock, change, active, free, floating, packages, argument)
+        of_runs = {"--columns": columns, "--from": since, "--until": until}
+        for option in [x for x, given in of_runs.items() if given is not None and run is None]:
+            raise InputError(f"{option} is for runs, name one by --run")
         if run is not None:
-            recording = read_run(run, loaded)
+            recording = read_run(run, loaded, columns, span_of(since, until))
     playback = None if recording is None else Playback(loaded, recording)
     with shown():
         serve(Session(loaded), playback, host, port)

@@ -17,9 +17,8 @@ from crane.common.output import staging
 from crane.description.sources import find, unchanged
 from crane.formats import recalled
 from crane.machine import Machine
-from crane.recordings import timeseries
-from crane.recordings.logs import read_log
-from crane.recordings.measured import completed, is_measured, read_measured
+from crane.recordings.measured import completed, is_measured
+from crane.recordings.reading import ALWAYS, Span, quantities, read, readings
 from crane.recordings.recording import Recording
 from crane.recordings.summary import subject, summarize, title
 from crane.simulation.replays import Comparison
@@ -228,15 +227,23 @@ def _write_machine(result: "Identification", folder: Path) -> None:
         warnings.warn(text, CraneWarning, stacklevel=3)
 
 
-def read_run(path: Path, machine: Machine | None = None, columns: Path | None = None) -> Recording:
-    """The recording of a run's folder or of a CSV or npz file.
+def read_run(
+    path: Path,
+    machine: Machine | None = None,
+    columns: Path | None = None,
+    span: Span = ALWAYS,
+    needs: Sequence[Sequence[str]] = (),
+) -> Recording:
+    """The recording of a run's folder, of a CSV or npz file, or of a log of another program.
 
     Args:
         path: Folder or file.
         machine: What was recorded. Coordinates and forces that the file does not have are
             computed with it, see `crane.recordings.measured`; where no machine is given, with the
             one that the file names, if it has pressures or angles instead of forces.
-        columns: Says which columns of a raw log are which, see `crane.recordings.logs`.
+        columns: Which columns of a log are which, see `crane.recordings.logs`.
+        span: From when to when [s], by the recording's clock.
+        needs: Columns that have to be there besides, of each any one, where a machine is given.
 
     Raises:
         RecordingError: There is none, it is malformed, or it does not tell enough.
@@ -246,15 +253,14 @@ def read_run(path: Path, machine: Machine | None = None, columns: Path | None = 
         if not (path / RECORDING).is_file():
             raise RecordingError(f"{path}: no {RECORDING} in this folder, give a run's folder")
         path = path / RECORDING
-    if machine is not None and columns is not None:
-        return completed(machine, read_log(path, columns), path)
     if machine is not None:
-        return read_measured(machine, path)
-    table = timeseries.read(path)
+        return completed(machine, read(path, machine, columns, span), path, needs)
+    table = readings(path, columns=columns)
     named = table.notes.get("machine", "")
     if named and is_measured(table):
-        return completed(machine_of(path, named), table, path)
-    return Recording.from_table(table, path)
+        machine = machine_of(path, named)
+        return completed(machine, quantities(table, path, machine, span), path)
+    return Recording.from_table(quantities(table, path, None, span), path)
 
 
 def machine_of(path: str | Path, named: str) -> Machine:

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -51,6 +52,19 @@ RecordingFile = Annotated[
     Path,
     typer.Argument(metavar="RECORDING", help="A recording (CSV or npz) with forces or pressures."),
 ]
+Columns = Annotated[
+    Path | None,
+    typer.Option(
+        "--columns", metavar="FILE", help="Which columns of a raw log are which, as for import."
+    ),
+]
+From = Annotated[
+    float | None,
+    typer.Option("--from", metavar="SECONDS", help="Read from here on, by the recording's clock."),
+]
+Until = Annotated[
+    float | None, typer.Option("--until", metavar="SECONDS", help="Read up to here.")
+]
 Method = Annotated[
     str, typer.Option(help="wls (joints by their noise), ols, or huber (robust to outliers).")
 ]
@@ -93,10 +107,6 @@ Validation = Annotated[
     list[Path] | None,
     typer.Option(metavar="FILE", help="A recording that is held out; may be repeated."),
 ]
-Columns = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Which columns of raw logs are which, as for import."),
-]
 Train = Annotated[
     str | None,
     typer.Option(metavar="FROM:TO", help="Seconds that are fitted; the rest is held out."),
@@ -108,6 +118,18 @@ Trust = Annotated[
     ),
 ]
 NoOpen = Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")]
+
+
+def span_of(since: float | None, until: float | None) -> tuple[float, float]:
+    """From when to when [s], by --from and --until.
+
+    Raises:
+        InputError: Nothing lies between them.
+    """
+    span = -inf if since is None else since, inf if until is None else until
+    if not span[0] < span[1]:
+        raise InputError(f"nothing lies from {span[0]:g} to {span[1]:g} s, give a later --until")
+    return span
 
 
 def by_joint(
@@ -143,7 +165,7 @@ def window(text: str | None) -> tuple[float, float]:
     """
     first, colon, last = (text or ":").partition(":")
     try:
-        start, end = float(first or 0.0), float(last or "inf")
+        start, end = float(first or "-inf"), float(last or "inf")
     except ValueError:
         start, end = 0.0, 0.0
     if not colon or not start < end:

@@ -11,17 +11,21 @@ from crane.cli.shared import (
     Active,
     Argument,
     Change,
+    Columns,
     Floating,
     Force,
     Free,
+    From,
     Lock,
     MachineName,
     Out,
     Packages,
+    Until,
     app,
     load,
     progress_bar,
     say,
+    span_of,
 )
 from crane.common.errors import InputError, known
 
@@ -53,6 +57,9 @@ def simulate(
         float | None, typer.Option(help="In seconds; that of the task if not given.")
     ] = None,
     step: Annotated[float, typer.Option(help="Between recorded instants in seconds.")] = 1e-3,
+    columns: Columns = None,
+    since: From = None,
+    until: Until = None,
     method: Annotated[
         str | None,
         typer.Option(
@@ -90,8 +97,11 @@ def simulate(
         for option, value in {"--method": method, "--tolerance": tolerance}.items():
             if value is not None:
                 raise InputError(f"{option} does not go with --inputs, leave it out")
-        _replay(loaded, inputs, out, step)
+        _replay(loaded, inputs, out, step, columns, span_of(since, until))
         return
+    of_inputs = {"--columns": columns, "--from": since, "--until": until}
+    for option in [option for option, given in of_inputs.items() if given is not None]:
+        raise InputError(f"{option} is for --inputs, leave it out")
     control = _control(loaded, task, controller)
     if task is None and duration is None:
         tasks = ", ".join(loaded.tasks) or "none"
@@ -135,11 +145,18 @@ def _control(
     return controller(name or usual(machine), machine, task_trajectory(machine, task))
 
 
-def _replay(machine: "Machine", inputs: Path, out: Path, step: float) -> None:
+def _replay(
+    machine: "Machine",
+    inputs: Path,
+    out: Path,
+    step: float,
+    columns: Path | None,
+    span: tuple[float, float],
+) -> None:
     from crane.cli.runs import write_comparison
     from crane.simulation.replays import replay
 
     with progress_bar("simulating") as progress:
-        recording, comparison = replay(machine, inputs, step, progress)
+        recording, comparison = replay(machine, inputs, step, progress, columns, span)
     print(write_comparison(out, recording, comparison), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")

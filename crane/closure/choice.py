@@ -18,7 +18,6 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from scipy.linalg import qr
 
 from crane.closure.coordinates import Coordinates
 from crane.common.samples import Array
@@ -29,6 +28,7 @@ DEAD = 1e-5  # sigma_min of a choice that drives nothing at home, see `crane.clo
 _IDLE = re.compile("passive|free", re.IGNORECASE)  # names of joints that nothing drives
 _FAIR = 100.0  # condition up to which actuators are proposed before better joints
 _SWAPS = 200
+_EQUAL = 1e-9  # share by which what differs only by rounding does
 
 
 @dataclass(frozen=True)
@@ -140,18 +140,33 @@ def choose(basis: Array, among: Sequence[int], kept: Sequence[int] = ()) -> Indi
         return None
     chosen = list(kept)
     if missing:
-        pivots = qr(rows.T, mode="r", pivoting=True)[1]
-        chosen += [free[int(i)] for i in pivots[:missing]]
+        chosen += [free[i] for i in _pivots(rows, missing)]
     if np.linalg.svd(basis[chosen], compute_uv=False).min(initial=1.0) < DEAD:
         return None
     for _ in range(_SWAPS if missing else 0):
         moved = np.abs(np.linalg.solve(basis[chosen].T, basis[free].T)).T  # (free, n)
         moved[:, : len(kept)] = 0.0
-        j, i = np.unravel_index(int(moved.argmax()), moved.shape)
-        if moved[j, i] <= 1.0 + 1e-9:
+        j, i = np.unravel_index(_largest(moved.ravel()), moved.shape)
+        if moved[j, i] <= 1.0 + _EQUAL:
             break
         chosen[int(i)] = free[int(j)]
     return np.sort(np.array(chosen, dtype=np.intp))
+
+
+def _pivots(rows: Array, count: int) -> list[int]:
+    """Of a QR factorisation of rows^T with column pivoting."""
+    left, found = rows.copy(), []
+    for _ in range(count):
+        sizes = np.linalg.norm(left, axis=1)
+        found.append(at := _largest(sizes))
+        way = left[at] / max(float(sizes[at]), 1e-300)
+        left -= np.outer(left @ way, way)
+    return found
+
+
+def _largest(values: Array) -> int:
+    """Index of the largest, of equal ones the first: rounding does not choose."""
+    return int(np.argmax(values >= (1.0 - _EQUAL) * values.max()))
 
 
 def proposals(

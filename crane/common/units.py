@@ -18,6 +18,23 @@ READING: Mapping[str, tuple[tuple[str, float, float], ...]] = {
     "m3": (("l", 1e3, 0.0),),
     "kg": (("t", 1e-3, 1e4),),
 }
+# unit: (SI unit, a, b) with x a / b in SI units; two factors, so that 12.3 mm is 0.0123 m exactly
+TO_SI = {
+    "ms": ("s", 1.0, 1e3),
+    "deg": ("rad", math.pi, 180.0),
+    "deg/s": ("rad/s", math.pi, 180.0),
+    "mm": ("m", 1.0, 1e3),
+    "cm": ("m", 1.0, 1e2),
+    "mm/s": ("m/s", 1.0, 1e3),
+    "cm/s": ("m/s", 1.0, 1e2),
+    "kN": ("N", 1e3, 1.0),
+    "kN m": ("N m", 1e3, 1.0),
+    "kPa": ("Pa", 1e3, 1.0),
+    "MPa": ("Pa", 1e6, 1.0),
+    "bar": ("Pa", 1e5, 1.0),
+    "l/min": ("m3/s", 1.0, 6e4),
+    "mV": ("V", 1.0, 1e3),
+}
 _NOTHING = 1e-6  # is rounding noise in any of these units
 
 
@@ -42,3 +59,8 @@ def quantity(value: float, unit: str, digits: int = 3) -> str:
     """A number (in SI) in the unit to read it in: 13.36 t, 4.2 kN, 350 bar."""
     name, scale = reading(unit, value)
     return f"{number(scale * value, digits)} {name}"
+
+
+def spellings(unit: str) -> list[str]:
+    """An SI unit and the units of a file that are converted to it."""
+    return [unit, *(other for other, (si, _, _) in TO_SI.items() if si == unit)]

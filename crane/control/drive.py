@@ -57,6 +57,10 @@ class ValveDrive(Law):
         self.scales = self.circuit.scales
         self.channels = self._channels()
 
+    def on(self, machine: Machine) -> "ValveDrive":
+        """The same commands and starting pressures at another machine."""
+        return ValveDrive(machine, self.command, self._pressures)
+
     def update(self, time: float, q: Array, v_a: Array, state: Array) -> None:
         """Let the command look at the machine."""
         vapour = self.circuit.hydraulics.oil.vapour_pressure

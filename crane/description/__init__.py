@@ -2,6 +2,7 @@
 
 from crane.description.changes import changed, driven, locked, parameters
 from crane.description.inertia import inertia_problem
+from crane.description.sensors import Sensor
 from crane.description.sources import bundled, examples
 from crane.description.spec import (
     LOOP_TYPES,
@@ -22,6 +23,6 @@ from crane.description.spec import (
 
 __all__ = [
     "LOOP_TYPES", "Chain", "Coupling", "Drive", "Element", "EndStop", "ForceElement", "Friction",
-    "GasSpring", "LoopSpec", "MachineSpec", "PIGains", "Rope", "Task", "bundled", "changed",
-    "driven", "examples", "inertia_problem", "locked", "parameters",
+    "GasSpring", "LoopSpec", "MachineSpec", "PIGains", "Rope", "Sensor", "Task", "bundled",
+    "changed", "driven", "examples", "inertia_problem", "locked", "parameters",
 ]  # fmt: skip

@@ -14,6 +14,14 @@ from crane.common.errors import CraneWarning, InputError, known
 from crane.common.magnitudes import doubt
 from crane.common.samples import FARTHEST, as_number
 from crane.description.floating import grounded
+from crane.description.sensors import (
+    SENSOR,
+    named_numbers,
+    parsed,
+    quantities,
+    unit_of,
+    with_numbers,
+)
 from crane.description.sources import bundled
 from crane.description.spec import (
     Chain,
@@ -86,7 +94,8 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
     `supply.pressure`, `oil.bulk_modulus`, `cylinder.JOINT.area_a`, `valve.JOINT.c1`; of what acts
     along joints or between frames `spring.JOINT.stiffness`, `gas_spring.JOINT.pressure`,
     `rope.LINK-LINK.length`, `end_stop.JOINT.stiffness`; and `payload.mass`, a point mass at the
-    tip, or the load that the machine file names, scaled to that mass.
+    tip, or the load that the machine file names, scaled to that mass; of its sensors
+    `sensor.QUANTITY.zero`, `.scale`, `.delay`, `.noise`, which may be set of any quantity.
     """
     found = {name: _number(part, way) for name, part, way in _numbers(spec)}
     for joint in (joint.name for joint in spec.tree.moving):
@@ -105,7 +114,7 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
             found |= {f"{head}.{name}": getattr(part, name) for name in number_names(type(part))}
     if spec.tip is not None:
         found[PAYLOAD] = 0.0
-    return found
+    return found | named_numbers(spec.sensors)
 
 
 def _elements(spec: MachineSpec) -> dict[str, tuple[str, int, Element | EndStop]]:
@@ -144,8 +153,11 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
     elements = _elements(spec)
     replaced: dict[str, dict[str, float]] = {}
     renewed: dict[str, dict[str, float]] = {}
+    off: dict[str, float] = {}
     for name in sorted(changes, key=lambda name: name == PAYLOAD):  # last: it adds to a link
-        if name not in names:
+        if name.startswith(SENSOR):
+            _check_sensor(spec, name)
+        elif name not in names:
             raise InputError(unknown_parameter(spec, names, name))
         value = as_number(changes[name], f"parameter '{name}'", "")
         head, _, rest = name.partition(".")
@@ -155,6 +167,8 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
             raise InputError(f"parameter '{name}' is {value:g}, it must not be negative")
         if name == PAYLOAD:
             tree, chains = _load(spec, tree, value)
+        elif name.startswith(SENSOR):
+            off[name] = value
         elif head == "friction":
             _set(friction, rest, value, Friction)
         elif (part := name.rpartition(".")[0]) in elements:
@@ -187,7 +201,16 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
         gas_springs=tuple(lists["gas_springs"]),
         ropes=tuple(lists["ropes"]),
         end_stops=tuple(lists["end_stops"]),
+        sensors=MappingProxyType(with_numbers(spec.sensors, off)),
     )
+
+
+def _check_sensor(spec: MachineSpec, name: str) -> None:
+    """See that a number is of a sensor that a machine may have."""
+    quantity, _ = parsed(name)
+    if unit_of(spec.tree, quantity) is None and quantity not in spec.sensors:
+        hint = known(quantities(spec.tree), quantity)
+        raise InputError(f"'{name}' is of no quantity of '{spec.name}', {hint}")
 
 
 def _changed(part: Link | Joint, way: _Way, value: float, name: str) -> Link | Joint:

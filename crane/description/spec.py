@@ -9,6 +9,7 @@ from typing import ClassVar
 from crane.common.errors import InputError
 from crane.common.samples import as_number
 from crane.description.estimation import Estimation
+from crane.description.sensors import Sensor
 from crane.description.tree import Joint, Tree, Vector
 from crane.hydraulics.components import Hydraulics
 
@@ -413,6 +414,7 @@ class MachineSpec:
     free: tuple[str, ...] = ()  # independent coordinates that nothing drives
     drives: tuple[Drive, ...] = ()  # what the format says motors act on; (): the active joints
     ropes: tuple[Rope, ...] = ()
+    sensors: Mapping[str, Sensor] = field(default_factory=dict)  # by quantity
     estimation: Estimation = Estimation()
 
     @property

@@ -18,7 +18,7 @@ from crane.machine import Machine
 from crane.machine.masses import has_mass
 
 BACKENDS = ("compiled", "pinocchio")
-_ARGUMENTS = {  # of the quantities that `derivatives` takes
+ARGUMENTS = {  # of the quantities that `derivatives` takes
     "inverse": ("q_a", "v_a", "a_a"),
     "forward": ("q_a", "v_a", "tau_a"),
     "mass_matrix": ("q_a",),
@@ -263,9 +263,9 @@ class Dynamics:
             InputError: An unknown quantity or name, a missing argument, or a machine whose
                 formulas take too long to compile.
         """
-        if quantity not in _ARGUMENTS:
-            raise InputError(f"quantity '{quantity}' is unknown, {known(_ARGUMENTS, quantity)}")
-        n, asked = self._n, _ARGUMENTS[quantity]
+        if quantity not in ARGUMENTS:
+            raise InputError(f"quantity '{quantity}' is unknown, {known(ARGUMENTS, quantity)}")
+        n, asked = self._n, ARGUMENTS[quantity]
         if friction and quantity not in ("inverse", "forward"):
             raise InputError(
                 f"'{quantity}' is without friction or with its own, leave friction out"
@@ -288,7 +288,7 @@ class Dynamics:
         for i, name in enumerate(asked[1:]):
             inputs[:, i * n : (i + 1) * n] = rows[name]
         key = quantity.replace("_", " ") + (FRICTION if friction else "")
-        shape = self._shape(quantity)
+        shape = self.shape(quantity)
         states = [name for name in by if name in asked]
         numbers = [name for name in by if name not in ("q_a", "v_a", "a_a", "tau_a")]
         if wrong := [name for name in by if name not in (*states, *numbers)]:
@@ -309,7 +309,8 @@ class Dynamics:
             found |= {name: every[..., i].copy() for i, name in enumerate(numbers)}
         return {name: found[name] if stacked else found[name][0] for name in by}
 
-    def _shape(self, quantity: str) -> tuple[int, ...]:
+    def shape(self, quantity: str) -> tuple[int, ...]:
+        """Of one sample of a quantity that `derivatives` takes."""
         n, model = self._n, self.machine.model
         shapes = {
             "mass_matrix": (n, n),

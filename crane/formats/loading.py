@@ -173,6 +173,7 @@ def _assembled(
         tasks=MappingProxyType(dict(spec.tasks)),
         control=MappingProxyType(dict(spec.control)),
         hydraulics=spec.hydraulics,
+        sensors=MappingProxyType(dict(spec.sensors)),
         chosen=MappingProxyType(
             {key: tuple(names) for key, names in said.items() if names is not None}
         ),

@@ -26,6 +26,7 @@ from crane.description import (
     GasSpring,
     PIGains,
     Rope,
+    Sensor,
     Task,
     bundled,
     examples,
@@ -85,6 +86,7 @@ class Machine:
         control: PI gains by active joint.
         hydraulics: The circuit that drives it, None for a machine without.
         estimation: What `identify` estimates, and knows before.
+        sensors: What is known of its sensors by quantity, see `crane.description.sensors`.
         free: Active joints that nothing drives: no force but friction, springs and stops.
         motors: What the file says that motors act on (actuators of a MJCF), or all drives where
             there are more than freedoms; empty where `drives` are the active joints.
@@ -116,6 +118,7 @@ class Machine:
     control: Mapping[str, PIGains]
     hydraulics: Hydraulics | None
     estimation: Estimation
+    sensors: Mapping[str, Sensor]
     free: tuple[str, ...]
     motors: tuple[Drive, ...]
     changes: Mapping[str, float]
@@ -268,9 +271,10 @@ class Machine:
         ropes: tuple[Rope, ...] | None = None,
         end_stops: tuple[EndStop, ...] | None = None,
         hydraulics: Hydraulics | None = None,
+        sensors: Mapping[str, Sensor] | None = None,
         estimation: Estimation | None = None,
     ) -> "Machine":
-        """The same machine with other friction, springs, ropes, stops, hydraulics or estimation.
+        """The same machine with other friction, springs, ropes, stops, hydraulics or sensors.
 
         Raises:
             InputError: A joint is unknown, has two gas springs, an end stop or a cylinder but no
@@ -314,6 +318,7 @@ class Machine:
             ropes=self.ropes if ropes is None else tuple(ropes),
             end_stops=self.end_stops if end_stops is None else tuple(end_stops),
             hydraulics=self.hydraulics if hydraulics is None else hydraulics,
+            sensors=self.sensors if sensors is None else MappingProxyType(dict(sensors)),
             estimation=self.estimation if estimation is None else estimation,
         )
 

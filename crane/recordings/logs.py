@@ -10,13 +10,15 @@ from the arrays of the log, and notes as a recording has them:
 
 Arrays are those of an npz file, or the columns of a CSV by the words of its header row; names that
 are no identifiers stand in quotes. a[i] is the i-th column of a table a, counted from 0, or the
-i-th number of a list. There are + - * /, brackets, numbers and pi.
+i-th number of a list. There are + - * /, brackets, numbers and pi. Notes such as
+`# sensor.q2.delay: 0.02` say what is known of the sensors, see crane.description.sensors.
 """
 
 import ast
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +34,21 @@ _OPERATORS = {
 }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Line:
+    """A column of a recording that is computed from those of a log.
+
+    Attributes:
+        where: It is written, for errors.
+        heading: Its name and unit, as in 'q2 [deg]'.
+        expression: Over the columns of the log.
+    """
+
+    where: str
+    heading: str
+    expression: str
+
+
 def read_log(path: str | Path, columns: str | Path) -> Table:
     """The table of a recording from a log.
 
@@ -43,26 +60,52 @@ def read_log(path: str | Path, columns: str | Path) -> Table:
         Columns in SI units, time strictly increasing.
 
     Raises:
-        RecordingError: A file is missing or malformed, or a column cannot be computed; the
-            message names file and line.
+        RecordingError: A file is missing or malformed, or columns cannot be computed; the
+            message names file and lines, of all that the log does not have.
     """
-    path, columns = Path(path), Path(columns)
-    notes, lines = _lines(columns)
-    arrays = timeseries.arrays(path)
-    found = {}
-    for line, (heading, expression) in lines.items():
+    notes, lines = lines_of(Path(columns))
+    arrays = timeseries.arrays(Path(path))
+    missing = [(line, name) for line in lines for name in absent(line.expression, arrays)]
+    if missing:
+        told = [f"{line.where}: the log has no '{name}'" for line, name in missing]
+        hint = known(arrays, missing[0][1] if len(missing) == 1 else None)
+        raise RecordingError(f"{'; '.join(told)}, {hint}")
+    return assembled(Path(path), Path(columns), arrays, lines, notes)
+
+
+def assembled(
+    path: Path,
+    columns: Path,
+    arrays: Mapping[str, np.ndarray],
+    lines: Sequence[Line],
+    notes: dict[str, str],
+) -> Table:
+    """The table that lines make of the arrays of a log.
+
+    Args:
+        path: The log.
+        columns: Where the lines are written.
+        arrays: Of the log, by name.
+        lines: Its columns.
+        notes: Of the table.
+
+    Raises:
+        RecordingError: A column cannot be computed, or holds what no recording does.
+    """
+    found: dict[str, np.ndarray] = {}
+    for line in lines:
         try:
-            if heading in found:
-                raise RecordingError(f"column '{heading}' is there twice, remove one")
-            found[heading] = _evaluated(expression, arrays)
+            if line.heading in found:
+                raise RecordingError(f"column '{line.heading}' is there twice, remove one")
+            found[line.heading] = _evaluated(line.expression, arrays)
         except RecordingError as error:
-            raise RecordingError(f"{columns}:{line}: {error}") from None
+            raise RecordingError(f"{line.where}: {error}") from None
     count = max((len(x) for x in found.values() if x.ndim), default=1)
-    for line, (heading, _) in lines.items():
-        if found[heading].shape not in ((), (count,)):
+    for line in lines:
+        if found[line.heading].shape not in ((), (count,)):
             raise RecordingError(
-                f"{columns}:{line}: '{heading}' has {len(found[heading])} samples, others have "
-                f"{count}, choose a column of a table by its number, as in a[0]"
+                f"{line.where}: '{line.heading}' has {len(found[line.heading])} samples, others "
+                f"have {count}, choose a column of a table by its number, as in a[0]"
             )
     whole = {name: np.broadcast_to(values, (count,)) for name, values in found.items()}
     table = timeseries.from_columns(columns, whole, notes)
@@ -77,8 +120,34 @@ def read_log(path: str | Path, columns: str | Path) -> Table:
     return table
 
 
-def _lines(path: Path) -> tuple[dict[str, str], dict[int, tuple[str, str]]]:
-    """Notes, and heading and expression by the number of their line."""
+def absent(expression: str, arrays: Container[str]) -> list[str]:
+    """Names of an expression that a log does not have."""
+    return [name for name in names_in(expression) if name not in arrays and name != "pi"]
+
+
+def names_in(expression: str) -> list[str]:
+    """Columns of a log in an expression; none of one that cannot be read."""
+    try:
+        nodes = list(ast.walk(ast.parse(expression, mode="eval")))
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return []
+    if any(isinstance(node, ast.Call | ast.Attribute) for node in nodes):
+        return []
+    names = [node.id for node in nodes if isinstance(node, ast.Name)]
+    names += [
+        str(node.value)
+        for node in nodes
+        if isinstance(node, ast.Constant) and type(node.value) is str
+    ]
+    return list(dict.fromkeys(names))
+
+
+def lines_of(path: Path) -> tuple[dict[str, str], list[Line]]:
+    """Notes and columns of a file of columns.
+
+    Raises:
+        RecordingError: It is missing or malformed.
+    """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
@@ -86,7 +155,7 @@ def _lines(path: Path) -> tuple[dict[str, str], dict[int, tuple[str, str]]]:
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise RecordingError(f"{path}: {reason}, give a file of columns") from None
-    notes, found = {}, {}
+    notes, found = {}, []
     for number, line in enumerate(text.splitlines(), start=1):
         if line.strip().startswith("#"):
             key, _, value = line.strip().removeprefix("#").partition(":")
@@ -98,7 +167,7 @@ def _lines(path: Path) -> tuple[dict[str, str], dict[int, tuple[str, str]]]:
                     f"{path}:{number}: is no column, write 'name [unit] = expression', as in "
                     "'q1 [deg] = angle[0] - 90'"
                 )
-            found[number] = match[1], match[2]
+            found.append(Line(f"{path}:{number}", match[1], match[2]))
     if not found:
         raise RecordingError(f"{path}: names no columns, write 'name [unit] = expression'")
     return notes, found

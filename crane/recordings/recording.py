@@ -27,13 +27,14 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import RecordingError, at, known
 from crane.common.samples import Array
+from crane.description.sensors import FORCE as FORCE
+from crane.description.sensors import FORCE_UNITS as FORCE_UNITS
+from crane.description.sensors import VELOCITY as VELOCITY
+from crane.description.sensors import VELOCITY_UNITS as VELOCITY_UNITS
 from crane.recordings import timeseries
 from crane.recordings.timeseries import TIME, Table, check_unit
 
-VELOCITY_UNITS = {"rad": "rad/s", "m": "m/s"}
-FORCE_UNITS = {"rad": "N m", "m": "N"}
-
-VELOCITY, FORCE = "_velocity", "_force"
+SENSORS, IDEAL = "sensors", "ideal"  # a note of quantities themselves
 _LISTED = 40  # names in a message
 
 
@@ -57,6 +58,8 @@ class Recording:
         machine: Name of the bundled machine or path of the machine file, "" if not known.
         task: What it was doing, "" if not known.
         controller: What drove it, "" if not known.
+        ideal: Whether the columns are the quantities themselves, simulated or corrected by what
+            is known of the sensors, which a file says in its note `sensors`.
     """
 
     time: Array
@@ -70,6 +73,7 @@ class Recording:
     machine: str = ""
     task: str = ""
     controller: str = ""
+    ideal: bool = False
     copy: InitVar[bool] = True
 
     def __post_init__(self, copy: bool) -> None:
@@ -197,6 +201,8 @@ class Recording:
         notes = {"crane recording": "", "machine": self.machine, "task": self.task}
         if self.controller:
             notes["controller"] = self.controller
+        if self.ideal:
+            notes[SENSORS] = IDEAL
         timeseries.write_columns(path, self._units(), list(self.columns().values()), notes)
 
     @classmethod
@@ -259,6 +265,7 @@ class Recording:
             machine=table.notes.get("machine", ""),
             task=table.notes.get("task", ""),
             controller=table.notes.get("controller", ""),
+            ideal=table.notes.get(SENSORS) == IDEAL,
         )
 
 

@@ -2,13 +2,12 @@
 
 Comment lines `# key: value`, then one header row `time [s],name [unit],...`, then one row per
 sample. A unit may be left out, for all columns but time. What is read is in SI units: columns in
-bar, deg, mm and others of `_TO_SI` are converted, those in other units stay as they are. Numbers
-are written with the fewest digits that give the same float64 again.
+bar, deg, mm and others of `crane.common.units.TO_SI` are converted, those in other units stay as
+they are. Numbers are written with the fewest digits that give the same float64 again.
 """
 
 import csv
 import io
-import math
 import re
 import stat
 import warnings
@@ -22,34 +21,18 @@ import numpy as np
 from crane.common.errors import RecordingError, at
 from crane.common.output import replacing
 from crane.common.samples import Array, Brief
+from crane.common.units import TO_SI
+from crane.common.units import spellings as spellings
+from crane.description.sensors import TIME as TIME
 from crane.recordings.npz import MOST, MOST_COLUMNS, read_arrays, read_columns
 
 T = TypeVar("T")
 
-TIME = "time"
 _WORD = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
 _ROWS_AT_ONCE = 4096
 _BLOCK = 1 << 20  # bytes, and so many at most in a line
 _LONG_HEADING, _LONG_NAME = 1 << 16, 200  # characters
 _LARGEST = 1e30  # in SI units; what is computed from larger ones overflows
-
-# unit: (SI unit, a, b) with x a / b in SI units; two factors, so that 12.3 mm is 0.0123 m exactly
-_TO_SI = {
-    "ms": ("s", 1.0, 1e3),
-    "deg": ("rad", math.pi, 180.0),
-    "deg/s": ("rad/s", math.pi, 180.0),
-    "mm": ("m", 1.0, 1e3),
-    "cm": ("m", 1.0, 1e2),
-    "mm/s": ("m/s", 1.0, 1e3),
-    "cm/s": ("m/s", 1.0, 1e2),
-    "kN": ("N", 1e3, 1.0),
-    "kN m": ("N m", 1e3, 1.0),
-    "kPa": ("Pa", 1e3, 1.0),
-    "MPa": ("Pa", 1e6, 1.0),
-    "bar": ("Pa", 1e5, 1.0),
-    "l/min": ("m3/s", 1.0, 6e4),
-    "mV": ("V", 1.0, 1e3),
-}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -83,9 +66,15 @@ def check_column(name: str, unit: str) -> None:
             )
 
 
-def spellings(unit: str) -> list[str]:
-    """An SI unit and the units of a file that are converted to it."""
-    return [unit, *(other for other, (si, _, _) in _TO_SI.items() if si == unit)]
+def column(table: Table, name: str, unit: str | None = None) -> Array:
+    """A column (N,), in a unit.
+
+    Raises:
+        RecordingError: It is in another one.
+    """
+    if unit is not None:
+        check_unit(name, table.units[name], spellings(unit))
+    return table.values[:, list(table.units).index(name)]
 
 
 def write(path: str | Path, table: Table) -> None:
@@ -264,8 +253,8 @@ def _count_lines(path: Path) -> int:
 def _in_si(table: Table) -> Table:
     units, values = dict(table.units), table.values
     for i, (name, unit) in enumerate(table.units.items()):
-        if unit in _TO_SI:
-            units[name], a, b = _TO_SI[unit]
+        if unit in TO_SI:
+            units[name], a, b = TO_SI[unit]
             with np.errstate(over="ignore"):  # infinite values are refused with their name
                 values[:, i] = values[:, i] * a / b
     for i, name in enumerate(table.units):
@@ -323,7 +312,7 @@ def _units(heading: str) -> dict[str, str]:
         )
     units: dict[str, str] = {}
     for position, cell in enumerate(cells, start=1):
-        name, unit = _heading(cell)
+        name, unit = heading_of(cell)
         if not name or len(cell) > _LONG_NAME:
             hint = f", at most {_LONG_NAME} characters" if name else ""
             raise RecordingError(
@@ -334,12 +323,15 @@ def _units(heading: str) -> dict[str, str]:
         check_column(name, unit)
         units[name] = unit
     if TIME not in units:
-        raise RecordingError(f"no column '{TIME}' in the header, add '{TIME} [s]'")
+        raise RecordingError(
+            f"no column '{TIME}' in the header, add '{TIME} [s]', or say by a file of columns "
+            "(--columns) which column of a log is which"
+        )
     check_unit(TIME, units[TIME], spellings("s"))
     return units
 
 
-def _heading(cell: str) -> tuple[str, str]:
+def heading_of(cell: str) -> tuple[str, str]:
     """Name and unit in 'name [unit]'; no name where it is something else."""
     name, bracket, unit = cell.strip().partition("[")
     if bracket:

@@ -46,6 +46,7 @@ def recorded(
         machine=machine.call,
         task=task,
         controller=_name_of(control),
+        ideal=True,
         copy=False,
     )
 

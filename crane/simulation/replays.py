@@ -10,27 +10,24 @@ import numpy as np
 from crane.common.errors import CraneWarning, InputError, RecordingError, at, known
 from crane.common.samples import Array, Brief, as_number
 from crane.control import Signals, ValveDrive
+from crane.description.sensors import SIGNAL, SUPPLY, TANK
 from crane.machine import Machine
-from crane.recordings import timeseries
-from crane.recordings.measured import (
-    check_pressures,
-    column,
-    joint_motion,
-    moved_locks,
-    tell_disagreement,
-)
+from crane.recordings.disagreement import tell_disagreement
+from crane.recordings.inclined import with_angles
+from crane.recordings.measured import check_pressures, moved_locks
+from crane.recordings.missing import Missing
+from crane.recordings.postures import drives_of, joint_motion
+from crane.recordings.reading import ALWAYS, Span, read
 from crane.recordings.recording import (
-    FORCE,
-    FORCE_UNITS,
     VELOCITY,
-    VELOCITY_UNITS,
     Recording,
     derivative,
 )
-from crane.recordings.timeseries import TIME, Table, check_unit, spellings
+from crane.recordings.strokes import check_strokes
+from crane.recordings.timeseries import TIME, Table, column
+from crane.simulation.readings import read_off, recorded_of
 from crane.simulation.run import Progress, simulate
 
-_SIGNAL, _SUPPLY, _TANK = "voltage_", "pressure_supply", "pressure_tank"
 _FIRST, _LONGEST = 0.1, 1.0  # over which the start is fitted, and a rest looked for [s]
 _FEWEST = 5  # samples of that fit
 _BEYOND = 0.01  # of a range, beyond a limit, that noise does not explain
@@ -100,7 +97,12 @@ class Comparison:
 
 
 def replay(
-    machine: Machine, path: str | Path, step: float = 1e-3, progress: Progress | None = None
+    machine: Machine,
+    path: str | Path,
+    step: float = 1e-3,
+    progress: Progress | None = None,
+    columns: str | Path | None = None,
+    span: Span = ALWAYS,
 ) -> tuple[Recording, Comparison]:
     """Simulate a hydraulic machine with measured valve signals.
 
@@ -116,6 +118,9 @@ def replay(
         path: A CSV or npz file.
         step: Of the simulation [s].
         progress: Called with the finished share, 0 to 1.
+        columns: Which columns of a log are which, if not as the machine's sensors say, see
+            `crane.recordings.logs`.
+        span: From when to when [s], by the file's own clock; the simulation counts from zero.
 
     Returns:
         The simulated recording, and its comparison with the file.
@@ -125,7 +130,7 @@ def replay(
         InputError: The machine has no valves.
     """
     step = as_number(step, "the step", "s", above=0)
-    table = timeseries.read(path)
+    table = read(path, machine, columns, span)
     try:
         inputs = inputs_of(machine, table)
         drive = inputs.drive(machine)
@@ -140,15 +145,16 @@ def replay(
         machine, drive, initial, steps * step, step, label=label, progress=progress
     )
     try:
-        return recording, compare(table, recording)
+        return recording, compare(machine, table, recording)
     except RecordingError as error:
         raise RecordingError(at(str(path), error)) from None
 
 
-def compare(table: Table, recording: Recording) -> Comparison:
-    """Channels that a file and a simulation both hold, but for the inputs.
+def compare(machine: Machine, table: Table, recording: Recording) -> Comparison:
+    """Channels that a file and a simulation both tell, but for the inputs.
 
     Args:
+        machine: What was simulated.
         table: What was measured.
         recording: What was simulated from the same instant on.
 
@@ -158,22 +164,15 @@ def compare(table: Table, recording: Recording) -> Comparison:
     time = column(table, TIME)
     time = time - time[0]
     inside = time <= recording.time[-1] * (1 + 1e-12)
-    columns = recording.columns()
-    units = recording.units | recording.channel_units
-    units |= {x + VELOCITY: VELOCITY_UNITS[unit] for x, unit in recording.units.items()}
-    units |= {x + FORCE: FORCE_UNITS[unit] for x, unit in recording.units.items()}
-    for name, unit in table.units.items():
-        if name in units:
-            check_unit(name, unit, spellings(units[name]))
+    names = recorded_of(machine, table, recording)
     found = [
         Channel(
             name,
             table.units[name],
             column(table, name)[inside],
-            np.interp(time[inside], recording.time, columns[name]),
+            np.interp(time[inside], recording.time, simulated),
         )
-        for name in table.units
-        if name in columns and name not in (TIME, _SUPPLY, _TANK) and not name.startswith(_SIGNAL)
+        for name, simulated in zip(names, read_off(machine, recording, names).T, strict=True)
     ]
     return Comparison(time[inside], tuple(found))
 
@@ -221,30 +220,40 @@ def inputs_of(machine: Machine, table: Table) -> Inputs:
     time = time - time[0]
     if len(time) < 2:
         raise RecordingError("has one sample, give at least two")
-    signals = _signals(machine, joints, table)
+    signals, pressures, missing = {}, {}, Missing(machine, table)
+    with missing.noted():
+        signals = _signals(machine, joints, table)
     check_pressures(machine, table)
     supply, tank = (
-        column(table, name, "Pa") if name in table.units else None for name in (_SUPPLY, _TANK)
+        column(table, name, "Pa") if name in table.units else None for name in (SUPPLY, TANK)
     )
-    moved = list(signals.values())
-    pressures = _pressures(joints, table, time)
-    there = any(joint in table.units for joint in machine.joints)
-    initial = _initial(machine, table, time, moved) if there else None
+    with missing.noted():
+        pressures = _pressures(joints, table, time)
+    angled = with_angles(machine, table)
+    there = any(joint in angled.units for joint in machine.joints)
+    if there:
+        with missing.noted():
+            drives_of(machine, list(angled.units))
+    missing.refuse()
+    if there:
+        check_strokes(machine, table)
+        tell_disagreement(machine, table)
+    initial = _initial(machine, angled, time, list(signals.values())) if there else None
     return Inputs(time, signals, supply, tank, pressures, initial)
 
 
 def _signals(machine: Machine, joints: Sequence[str], table: Table) -> dict[str, Array]:
     """Of the valves that were moved, by joint [V]."""
     signals = {}
-    for name in (name for name in table.units if name.startswith(_SIGNAL)):
-        joint = name.removeprefix(_SIGNAL)
+    for name in (name for name in table.units if name.startswith(SIGNAL)):
+        joint = name.removeprefix(SIGNAL)
         if joint in machine.locks:
             continue  # the valve of a joint that is held moves nothing
         if joint not in joints:
             raise RecordingError(f"column '{name}' is of no valve, {known(joints, joint)}")
         signals[joint] = column(table, name, "V")
     if not signals:
-        names = ", ".join(f"'{_SIGNAL}{joint} [V]'" for joint in joints)
+        names = ", ".join(f"'{SIGNAL}{joint} [V]'" for joint in joints)
         raise RecordingError(f"no signal of a valve, give at least one of {names}")
     return signals
 
@@ -270,7 +279,6 @@ def _initial(
     """Active coordinates and velocities at the start."""
     for text in moved_locks(machine, _columns(table), table.units):
         raise RecordingError(f"{text}, do not lock it, or lock it where it is")
-    tell_disagreement(machine, table)
     q_a, v_a = joint_motion(machine, table)
     _warn_of_limits(machine, time, q_a)
     steady = time <= _steady(time, signals)
@@ -335,11 +343,12 @@ def _first(time: Array, x: Array, order: int) -> float:
     deviations of both (Lepski 1990).
     """
     lowest, highest, found = -np.inf, np.inf, 0.0
+    last = max(int(np.searchsorted(time, time[0] + _FIRST, side="right")), _FEWEST)
     if order == 0 and len(x) > _FEWEST:  # the sample itself, its noise by third differences
-        std = float(np.sqrt(np.mean(np.diff(x[time <= time[0] + _FIRST], 3) ** 2) / 20))
+        std = float(np.sqrt(np.mean(np.diff(x[:last], 3) ** 2) / 20))
         found, lowest, highest = float(x[0]), x[0] - 2 * std, x[0] + 2 * std
-    count, last = _FEWEST, np.searchsorted(time, time[0] + _FIRST, side="right")
-    while count <= max(last, _FEWEST):
+    count = _FEWEST
+    while count <= last:
         value, std = _parabola(time[:count], x[:count], order)
         if value + 2 * std < lowest or value - 2 * std > highest:
             break

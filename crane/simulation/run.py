@@ -167,6 +167,7 @@ def integrate(
     method: str | None = None,
     progress: Progress | None = None,
     tolerance: float | None = None,
+    chart: Chart | None = None,
 ) -> tuple[Array, Parts, list[str]]:
     """What `simulate` computes, without channels; see there for arguments and errors.
 
@@ -179,13 +180,14 @@ def integrate(
         method: See `simulate`.
         progress: See `simulate`.
         tolerance: See `simulate`.
+        chart: The machine in its own coordinates, for who wants to know when what stuck.
 
     Returns:
         Times (N,), what `crane.simulation.integration.row_layout` names, (N, .) each, and what is
         to be said of the motion. N is smaller than there are steps where it was interrupted.
     """
     machine, reference = dynamics.machine, reference_of(control)
-    q_a, v_a = _start(machine, initial, reference)
+    q_a, v_a = start_of(machine, initial, reference)
     try:
         # from home, whatever was solved before: a run is the same to the last bit
         posture = machine.closure.solve(q_a, guess=machine.home)
@@ -193,8 +195,8 @@ def integrate(
     except ClosureError as error:
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
     state = np.concatenate([posture, v_a, own, np.zeros(_ENERGIES)])
-    make = _integration(dynamics, control, len(own), method, tolerance)
-    chart = Chart.of(dynamics)
+    make = integration_of(dynamics, control, len(own), method, tolerance)
+    chart = chart or Chart.of(dynamics)
     integration = ChartedSteps(chart, control, len(own), make)
     layout = row_layout(machine, control, len(own))
     times = step * np.arange(steps + 1, dtype=np.float64)
@@ -241,7 +243,7 @@ def _own_start(control: Controller, dynamics: Dynamics, q: Array) -> Array:
     return control.start(q[dynamics.machine.closure.active])
 
 
-def _integration(
+def integration_of(
     dynamics: Dynamics, control: Controller, own: int, named: str | None, tolerance: float | None
 ) -> Callable[[Chart], Way]:
     """What integrates by a method, or by the usual one."""
@@ -345,11 +347,12 @@ def reference_beyond(machine: Machine, control: Controller, until: float) -> str
     return "" if reference is None else beyond_limits(machine, reference, until)
 
 
-def _start(
+def start_of(
     machine: Machine,
     initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None,
     reference: Trajectory | None,
 ) -> tuple[Array, Array]:
+    """Active coordinates and velocities (n,) that a simulation starts from, see `simulate`."""
     size, rest = len(machine.active), np.zeros(len(machine.active))
     if initial is None:
         if reference is not None:

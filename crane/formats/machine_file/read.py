@@ -37,6 +37,7 @@ from crane.formats.machine_file.forces import (
 from crane.formats.machine_file.open_loops import warn_of_open_loops
 from crane.formats.machine_file.posture import read_home
 from crane.formats.machine_file.section import Section
+from crane.formats.machine_file.sensors import read_sensors
 from crane.formats.machine_file.tasks import read_tasks
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.opening import is_robot
@@ -48,7 +49,7 @@ Part = TypeVar("Part")
 _KEYS = (
     "name", "source", "chains", "loops", "active", "free", "drives", "home", "friction", "forces",
     "gas_springs", "ropes", "end_stops", "rotor_inertia", "couplings",
-    "tip", "payload", "tasks", "control", "hydraulics", "identification",
+    "tip", "payload", "tasks", "control", "hydraulics", "sensors", "identification",
 )  # fmt: skip
 
 
@@ -146,6 +147,7 @@ def _read_machine(path: Path) -> MachineSpec:
         name, source, path, chains, with_rotors(tree.tree, rotors), loops, active, home, friction,
         forces, gas_springs, end_stops, tip, tasks, control, hydraulics, couplings, where, payload,
         free, _part(_drives, (), top, tree), _part(read_ropes, (), top, tree),
+        _part(read_sensors, {}, top, tree),
         _part(read_estimation, Estimation(), top),
     )  # fmt: skip
 

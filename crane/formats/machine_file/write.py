@@ -12,6 +12,7 @@ from lxml import etree
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
 from crane.common.output import file_name, staging
 from crane.description import Task
+from crane.description.sensors import unit_of
 from crane.formats.machine_file.estimation import estimation_data
 from crane.formats.machine_file.read import read
 from crane.formats.parts import (
@@ -191,6 +192,11 @@ def _content(machine: Machine) -> dict[str, Any]:
     data["identification"] = estimation_data(machine)
     if machine.hydraulics is not None:
         data["hydraulics"] = _hydraulics(machine.hydraulics)
+    data["sensors"] = {
+        name: _numbers(sensor) or {"zero": 0.0}
+        for name, sensor in machine.sensors.items()
+        if unit_of(machine.tree, name) is not None  # a joint that is locked has none
+    }
     return data
 
 

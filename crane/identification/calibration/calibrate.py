@@ -1,28 +1,43 @@
 """A machine's numbers from recordings, through the simulation of what drove it."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from crane.common.errors import CraneError, InputError, RecordingError, at
 from crane.common.samples import Array
+from crane.description.sensors import (
+    SENSOR,
+    SIGNAL,
+    Sensor,
+    named_numbers,
+    unit_of,
+    with_numbers,
+)
 from crane.formats import load
 from crane.formats.loading import Variants
+from crane.identification.calibration.candidates import candidates
+from crane.identification.calibration.lacking import Lacking, lacking
 from crane.identification.calibration.problem import Case, Problem, case_of, noise_of
-from crane.identification.calibration.readings import sensors_of
-from crane.identification.calibration.result import Calibration, Fitted, Sensor
-from crane.identification.calibration.unknowns import SIGNAL, Unknown, unknowns_of
+from crane.identification.calibration.result import Calibration, Channel, Fitted
+from crane.identification.calibration.unknowns import Unknown, unknowns_of
 from crane.machine import Machine
-from crane.recordings import timeseries
-from crane.recordings.logs import read_log
-from crane.recordings.timeseries import Table
+from crane.recordings.logs import lines_of
+from crane.recordings.reading import ALWAYS, Span, known_sensors, readings, within
+from crane.recordings.recording import IDEAL, SENSORS
+from crane.recordings.timeseries import Table, heading_of
+from crane.simulation.readings import sensors_of
 
 Progress = Callable[[float], None]
 
 _ROUNDS = 3  # of weights
+# shares of the smoothing of friction that is gone on with, and of that of derivatives
+_SHARPER = ((0.3, 0.3), (0.1, 0.1), (0.0, 0.3), (0.0, 0.03))
+_TOLD = 0.1  # of derivatives that tell how well all is known
 _STEPS = 40  # of Gauss-Newton between them
-_SETTLED = 1e-4  # change of the cost, as a share, that ends them
+_SETTLED, _BEGUN = 1e-4, 1e-2  # change of the cost, as a share, that ends them
 _EXACT, _NOTHING = 1e-6, 1e-9  # of a channel's largest value, and of one that is zero [SI]
 _FLOOR = 0.2  # of a channel's variation, that no channel may be off by for nothing
 _GROWN, _SHRUNK, _STIFFEST = 10.0, 0.2, 1e8  # of Levenberg's damping
@@ -36,9 +51,10 @@ def calibrate(
     recordings: Sequence[str | Path] | str | Path,
     fit: Mapping[str, object] | Sequence[str],
     *,
-    train: tuple[float, float] = (0.0, np.inf),
+    train: Span = ALWAYS,
     validation: Sequence[str | Path] = (),
     columns: str | Path | None = None,
+    span: Span = ALWAYS,
     sensors: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
@@ -62,10 +78,13 @@ def calibrate(
         fit: Numbers by name: None, a start, or (start, low, high). Names are those of
             `crane.description.parameters`; with `*` a common factor of all that match;
             `sensor.COLUMN.zero`, `.scale` and `.delay` of what was measured.
-        train: From when to when [s] recordings are fitted; the rest is held out.
+        train: From when to when [s], by the files' own clocks, recordings are fitted; the rest
+            is held out.
         validation: Recordings that are held out whole.
-        columns: A file that says which columns of raw logs are which, see
-            `crane.recordings.logs`.
+        columns: A file that says which columns of raw logs are which, if not as the machine's
+            sensors say, see `crane.recordings.logs`.
+        span: From when to when [s], by the files' own clocks, recordings count at all; those of
+            `validation` count whole.
         sensors: Columns to compare; all that can be if not given.
         progress: Called with the finished share, 0 to 1.
 
@@ -81,29 +100,73 @@ def calibrate(
         raise InputError("no recording is given, name at least one")
     if not train[0] < train[1]:
         raise InputError(f"the window from {train[0]:g} to {train[1]:g} s is empty")
-    tables = [_table(path, columns) for path in (*paths, *validation)]
+    if train[0] < span[0] and train[0] > -np.inf or train[1] > span[1] and train[1] < np.inf:
+        raise InputError(
+            f"what is fitted, {train[0]:g} to {train[1]:g} s, is not within {span[0]:g} to "
+            f"{span[1]:g} s, which is read"
+        )
+    tables = [within(readings(path, machine, columns), span, path) for path in paths]
+    tables += [readings(path, machine, columns) for path in validation]
     cases = [
         _case(machine, path, table, sensors, train if i < len(paths) else (np.inf, np.inf))
         for i, (path, table) in enumerate(zip((*paths, *validation), tables, strict=True))
     ]
     if not any(case.train.any() for case in cases):
         raise InputError(f"no instant lies within {train[0]:g} to {train[1]:g} s")
+    for path, table in zip((*paths, *validation), tables, strict=True):
+        _check_readings(path, table, fit)
     variants = Variants(machine)
+    numbers = variants.values | named_numbers(cases[0].known)
     units = {
         name: table.units[name]
         for case, table in zip(cases, tables, strict=True)
         for name in (*case.sensors, *(SIGNAL + joint for joint in case.inputs.signals))
     }
-    unknowns = unknowns_of(fit, variants.spec, variants.values, units)
+
+    def asked(which: Mapping[str, object] | Sequence[str]) -> list[Unknown]:
+        return unknowns_of(which, variants.spec, numbers, units)
+
+    unknowns = asked(fit)
     problem = Problem(machine, unknowns, cases)
     search = _Search(problem, progress)
     before = [problem.residuals(case, np.zeros(problem.size)) for case in problem.cases]
     z = search.run(before)
-    return _result(problem, search, z, before, units)
+    found = _result(problem, search, z, before, units)
+    taken = {name for x in unknowns for name in (x.name, *dict(x.members))}
+    others = [x for x in candidates(machine, cases, numbers) if x.name not in taken]
+    bounds = {x.name: (x.start, x.low, x.high) for x in others}
+    more = asked(bounds) if bounds else []
+    extras = [replace(x, scale=other.deviation) for x, other in zip(more, others, strict=True)]
+    found = replace(found, lacking=tuple(search.lacking(extras, z)))
+    known = dict(machine.sensors) | dict(cases[0].known)
+    return replace(found, machine=_sensing(found.machine, known, columns, found.changes))
 
 
-def _table(path: str | Path, columns: str | Path | None) -> Table:
-    return timeseries.read(path) if columns is None else read_log(path, columns)
+def _check_readings(path: str | Path, table: Table, fit: Iterable[str]) -> None:
+    """See that numbers of sensors are fitted to what they read."""
+    for name in fit:
+        if name.startswith(SENSOR) and table.notes.get(SENSORS) == IDEAL:
+            raise InputError(
+                f"{path}: '{name}' cannot be fitted to quantities, which its note '{SENSORS}: "
+                f"{IDEAL}' says they are: give the readings, or remove the note if they are"
+            )
+
+
+def _sensing(
+    fitted: Machine,
+    known: Mapping[str, Sensor],
+    columns: str | Path | None,
+    changes: Mapping[str, float],
+) -> Machine:
+    """The fitted machine with all that is known of its sensors, and of their columns in logs."""
+    sensors = dict(known)
+    for line in lines_of(Path(columns))[1] if columns is not None else ():
+        name, unit = heading_of(line.heading)
+        if unit_of(fitted.tree, name) is not None:
+            known_as = sensors.get(name, Sensor())
+            sensors[name] = replace(known_as, column=line.expression, unit=unit)
+    own = {name: value for name, value in changes.items() if name.startswith(SENSOR)}
+    return fitted.replace(sensors=with_numbers(sensors, own))
 
 
 def _case(
@@ -119,7 +182,8 @@ def _case(
             if name not in found:
                 raise InputError(f"'{name}' cannot be compared, choose among {', '.join(found)}")
         found = found if sensors is None else list(sensors)
-        return case_of(machine, Path(path).name, table, found, window)
+        known = known_sensors(table, machine)
+        return case_of(machine, Path(path).name, table, known, found, window)
     except RecordingError as error:
         raise RecordingError(at(str(path), error)) from None
 
@@ -141,6 +205,7 @@ class _Search:
         self.low = np.array([(x.low - x.start) / x.scale for x in unknowns] + [-np.inf] * rest)
         self.high = np.array([(x.high - x.start) / x.scale for x in unknowns] + [np.inf] * rest)
         self.prior = np.array([0.0] * len(unknowns) + [1.0] * rest)
+        self._stage = max((x.stage for x in unknowns), default=0)
         self.sizes: dict[str, float] = {}
         self.jacobian = self.residual = self.blocks = np.zeros(0)
         self._done = 0
@@ -154,7 +219,8 @@ class _Search:
         self.sizes = dict(most)
         z = np.zeros(problem.size)
         sticks = any(law.sticks for law in problem.machine.friction.values())
-        problem.smooth = sticks
+        problem.smooth = float(sticks)
+        z = self._begun(z)
         for i in range(_ROUNDS):
             z = self._minimum(z)
             left = self._left([problem.residuals(case, z) for case in self._trained])
@@ -163,18 +229,26 @@ class _Search:
             self.sizes = fresh
             if moved < 0.05 and (i or not sticks):
                 break
-        if sticks:
-            problem.smooth = False
+        for problem.smooth, problem.slopes in _SHARPER if sticks else ():
             z = self._minimum(z)
-        # slopes over about the intervals, of what does not jump, tell how well all is known
-        problem.smooth = sticks
+        problem.slopes = _TOLD
         self._linearize(z)
-        problem.widen(np.sqrt(np.diag(self.covariance(z)[0])))
-        self._linearize(z)
-        problem.smooth = False
         if self._progress is not None:
             self._progress(1.0)
         return z
+
+    def _begun(self, z: Array) -> Array:
+        """The better one of two minima: of all numbers at once, and of stage after stage.
+
+        Where something rings, one phase more or less is a minimum, too.
+        """
+        stages = sorted({x.stage for x in self._problem.unknowns})
+        found = [self._minimum(z, _BEGUN)]
+        if len(stages) > 1:
+            for self._stage in stages:
+                z = self._minimum(z, _BEGUN)
+            found.append(z)
+        return min(found, key=self._cost)
 
     @property
     def _trained(self) -> list[Case]:
@@ -186,7 +260,8 @@ class _Search:
         largest: dict[str, float] = {}
         for case in self._trained:
             for name, x in zip(case.sensors, case.measured.T, strict=True):
-                found.setdefault(name, []).append(noise_of(x) ** 2)
+                said = case.known[name].noise if name in case.known else 0.0
+                found.setdefault(name, []).append((said or noise_of(x)) ** 2)
                 largest[name] = max(largest.get(name, 0.0), float(np.abs(x).max()))
         return {
             name: max(float(np.sqrt(np.mean(x))), _EXACT * largest[name], _NOTHING)
@@ -220,7 +295,7 @@ class _Search:
         total = float(np.sum((self.prior * z) ** 2))
         for case in self._trained:
             try:
-                left = self._problem.residuals(case, z) * self._weights(case)
+                left = self._problem.residuals(case, z, fitted=True) * self._weights(case)
             except CraneError:
                 return np.inf
             total += float(np.sum(left**2))
@@ -229,8 +304,8 @@ class _Search:
     def _linearize(self, z: Array) -> None:
         rows, left, blocks = [], [], []
         for number, case in enumerate(self._trained):
-            sizes = np.array([self.sizes[name] for name in case.sensors])
-            residual, slopes = self._problem.linearized(case, z, sizes)
+            fixed = {i for i, x in enumerate(self._problem.unknowns) if x.stage > self._stage}
+            residual, slopes = self._problem.linearized(case, z, fixed)
             weights = self._weights(case)
             some = case.train
             rows.append((slopes * weights[:, :, None])[some].reshape(-1, self._problem.size))
@@ -240,7 +315,23 @@ class _Search:
         self.jacobian, self.residual = np.vstack(rows), np.concatenate(left)
         self.blocks = np.concatenate(blocks)
 
-    def _minimum(self, z: Array) -> Array:
+    def lacking(self, others: Sequence[Unknown], z: Array) -> list[Lacking]:
+        """Numbers that are not fitted and would help, see `Lacking`."""
+        problem = self._problem
+        if not others:
+            return []
+        whole = Problem(problem.machine, [*problem.unknowns, *others], problem.cases)
+        count, more = len(problem.unknowns), len(others)
+        there = np.concatenate([z[:count], np.zeros(more), z[count:]])
+        rows = []
+        for case in self._trained:
+            wider = next(x for x in whole.cases if x.name == case.name)
+            _, slopes = whole.linearized(wider, there, set(range(count)))
+            own = (slopes * self._weights(case)[:, :, None])[case.train]
+            rows.append(own.reshape(-1, whole.size)[:, count : count + more])
+        return lacking(others, self.jacobian, np.vstack(rows), self.residual, self.prior)
+
+    def _minimum(self, z: Array, settled: float = _SETTLED) -> Array:
         """The nearest minimum for the present weights."""
         damping, cost = 1e-3, self._cost(z)
         if not np.isfinite(cost):  # say why
@@ -261,7 +352,7 @@ class _Search:
                 damping *= _GROWN
                 if damping > _STIFFEST:
                     return z
-            if before - cost < _SETTLED * before:
+            if before - cost < settled * before:
                 break
         return z
 
@@ -366,14 +457,13 @@ def _result(
         ))  # fmt: skip
     after = [problem.residuals(case, z) for case in problem.cases]
     seen = [
-        Sensor(case.name, name, units[name], case.inputs.time, case.train, case.measured[:, k],
+        Channel(case.name, name, units[name], case.clock, case.train, case.measured[:, k],
                old[:, k] + case.measured[:, k], new[:, k] + case.measured[:, k])
         for case, old, new in zip(problem.cases, before, after, strict=True)
         for k, name in enumerate(case.sensors)
     ]  # fmt: skip
-    machine = problem.variant(z)
     return Calibration(
-        machine, tuple(fitted), tuple(seen), problem.changes(z),
+        problem.fitted(z), tuple(fitted), tuple(seen), problem.changes(z),
         tuple(_coupled(unknowns, covariance)), problem.runs,
     )  # fmt: skip
 

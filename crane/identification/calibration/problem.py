@@ -1,31 +1,35 @@
 """What is left between recordings and the simulation of their inputs, and its derivatives."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from crane.common.errors import CraneError, InputError, SimulationError
+from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
+from crane.description.sensors import SENSOR, SIGNAL, Sensor, with_numbers
+from crane.dynamics import Dynamics
 from crane.formats.loading import Variants
-from crane.identification.calibration.readings import read
-from crane.identification.calibration.unknowns import SIGNAL, Unknown
+from crane.identification.calibration.unknowns import FITTED, Unknown
 from crane.machine import Machine
-from crane.recordings.measured import column
-from crane.recordings.timeseries import Table
+from crane.recordings.reading import Span, corrected
+from crane.recordings.timeseries import TIME, Table, column
+from crane.simulation.readings import read_off
+from crane.simulation.recorded import recorded
 from crane.simulation.replays import Inputs, inputs_of
-from crane.simulation.run import simulate
+from crane.simulation.run import simulate, start_of
+from crane.simulation.sensitivity.follow import Motion, follow
+from crane.simulation.sensitivity.setup import Setup, setup_of
+from crane.simulation.sensitivity.tangent import frames_of
 
-_NUDGE, _LARGEST = 1e-3, 0.1  # of an unknown's scale, for differences
-# Change of a reading, in the sizes of the channels, that differences aim at: far above what the
-# steps of the simulation leave undetermined, and too small to bend.
-_SEEN, _CLEAR = 0.02, 0.2
+_NUDGE = 1e-5  # of an unknown's scale, for differences of the numbers of a simulation
 _FEWEST = 20  # instants of a recording
 _SMOOTH = {"rad": 5e-3, "m": 2e-3}  # [rad/s], [m/s] over which friction changes its sign
-_SHARPEST = 1e-2  # [s] of a step of the simulation at most
+_SHARPEST, _FINEST = 1e-2, 5e-3  # [s] of a step of a simulation, and with derivatives, at most
+_ROUGH = 1e-4  # error of derivatives
 # What starts may be off by, one standard deviation, where nothing measures them: rad, m, rates.
 _PLACE, _PACE = {"rad": 5e-3, "m": 5e-3}, {"rad": 0.01, "m": 5e-3}
 _SURE = 2.0  # noises of a sensor that the start is off by, which is the mean of several samples
@@ -39,8 +43,10 @@ class Case:
     Attributes:
         name: Of its file.
         inputs: What drove the machine.
+        clock: (N,) instants as the file has them [s].
         sensors: Columns that are compared.
-        measured: (N, k) their values.
+        measured: (N, k) their readings.
+        known: What was known of the recording's sensors.
         train: (N,) which instants are fitted, true or false.
         first: Where its start is among all unknowns.
         starts: (s,) standard deviations of the start's deviations: q_A, v_A, pressures A and B.
@@ -48,26 +54,44 @@ class Case:
 
     name: str
     inputs: Inputs
+    clock: Array
     sensors: list[str]
     measured: Array
+    known: Mapping[str, Sensor]
     train: NDArray[np.bool_]
     first: int = 0
     starts: Array = field(default_factory=lambda: np.zeros(0))
 
 
 def case_of(
-    machine: Machine, name: str, table: Table, sensors: list[str], window: tuple[float, float]
+    machine: Machine,
+    name: str,
+    table: Table,
+    known: Mapping[str, Sensor],
+    sensors: list[str],
+    window: Span,
 ) -> Case:
     """A recording of a machine, of which the instants within a window [s] are fitted.
+
+    Args:
+        machine: The machine.
+        name: Of the file.
+        table: Its readings.
+        known: What is known of its sensors.
+        sensors: Columns to compare.
+        window: By the file's clock.
 
     Raises:
         RecordingError: See `inputs_of`.
         InputError: Too few instants, or nothing to compare.
     """
-    inputs = inputs_of(machine, table)
+    # what starts is read off without delays, signals stay as they were logged
+    at_once = {x: replace(s, delay=0.0) for x, s in known.items() if not x.startswith(SIGNAL)}
+    inputs = inputs_of(machine, corrected(table, at_once))
     if not sensors:
         raise InputError(f"{name}: nothing of it can be compared with the machine")
-    after, until = inputs.time >= window[0] - 1e-9, inputs.time <= window[1] + 1e-9
+    clock = column(table, TIME)
+    after, until = clock >= window[0] - 1e-9, clock <= window[1] + 1e-9
     train = np.logical_and(after, until)
     if len(train) < _FEWEST:
         raise InputError(f"{name}: {len(train)} instants, give at least {_FEWEST}")
@@ -89,7 +113,7 @@ def case_of(
         ]
     for joint in inputs.pressures:
         starts += [near(f"pressure_{joint}_{side}", "Pa", 0.0) for side in "ab"]
-    return Case(name, inputs, sensors, measured, train, starts=np.array(starts))
+    return Case(name, inputs, clock, sensors, measured, known, train, starts=np.array(starts))
 
 
 def noise_of(x: Array) -> float:
@@ -106,8 +130,10 @@ class Problem:
         cases: Recordings.
 
     Attributes:
-        smooth: Whether friction that sticks is smoothed, so that small changes do little: where
-            and when something sticks depends on everything before.
+        smooth: Over which share of a few millimetres per second friction that sticks is smoothed:
+            where and when something sticks depends on everything before, and what a small change
+            does then tells little of larger ones.
+        slopes: Share by which derivatives are smoothed at least.
     """
 
     def __init__(self, machine: Machine, unknowns: Sequence[Unknown], cases: Sequence[Case]):
@@ -118,12 +144,7 @@ class Problem:
             self.cases.append(replace(case, first=count))
             count += len(case.starts)
         self.size, self.runs = count, 0
-        self._nudges = np.full(count, _NUDGE)
-        self.smooth = False
-
-    def widen(self, deviations: Array) -> None:
-        """Take differences over standard deviations (p,), where these are small enough."""
-        self._nudges = np.clip(deviations, 1e-6, _LARGEST)
+        self.smooth = self.slopes = 0.0
 
     def values(self, z: Array) -> dict[str, float]:
         """Of the unknowns, by name."""
@@ -133,42 +154,51 @@ class Problem:
         }
 
     def changes(self, z: Array) -> dict[str, float]:
-        """Numbers of the machine."""
+        """Numbers of the machine and its sensors."""
         found: dict[str, float] = {}
         for unknown, value in zip(self.unknowns, self.values(z).values(), strict=True):
             found |= unknown.changes(value)
         return found
 
-    def variant(self, z: Array) -> Machine:
-        """The machine with these numbers."""
-        changes = self.changes(z)
+    def fitted(self, z: Array) -> Machine:
+        """The machine and its sensors with these numbers."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return self._variants.machine(self.changes(z))
+
+    def variant(self, z: Array, smooth: float) -> Machine:
+        """The machine with these numbers, to be simulated, its friction smoothed by a share."""
+        changes = {x: value for x, value in self.changes(z).items() if not x.startswith(SENSOR)}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             made = self._variants.machine(changes) if changes else self.machine
-        if not self.smooth:
+        if not smooth:
             return made
-        friction = {
-            joint: replace(law, smoothing=_SMOOTH[made.unit(joint)]) if law.sticks else law
-            for joint, law in made.friction.items()
-        }
+        friction = dict(made.friction)
+        for joint, law in friction.items():
+            if law.sticks:
+                friction[joint] = replace(law, smoothing=smooth * _SMOOTH[made.unit(joint)])
         return made.replace(friction=friction)
 
-    def simulated(self, case: Case, z: Array, machine: Machine | None = None) -> CubicSpline:
+    def simulated(self, case: Case, z: Array, fitted: bool) -> CubicSpline:
         """Readings of a case's sensors over time, but for what is amiss with these.
+
+        Args:
+            case: The recording.
+            z: Unknowns.
+            fitted: Whether only up to the last instant that is fitted.
 
         Raises:
             CraneError: The machine cannot be, or its simulation fails.
         """
         self.runs += 1
         inputs = self._started(case, z)
-        machine = self.variant(z) if machine is None else machine
-        time = inputs.time
-        step = min(float(np.median(np.diff(time))), _SHARPEST)
-        steps = int(np.ceil(time[-1] / step - 1e-9))
+        machine = self.variant(z, self.smooth)
+        step, steps = _steps(case, _SHARPEST, fitted)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             run = simulate(machine, inputs.drive(machine), inputs.initial, steps * step, step)
-        return CubicSpline(run.time, read(machine, run, case.sensors))
+        return CubicSpline(run.time, read_off(machine, run, case.sensors))
 
     def _started(self, case: Case, z: Array) -> Inputs:
         """Inputs with another start."""
@@ -179,34 +209,36 @@ class Problem:
         if initial is not None:
             low, high = self.machine.lower, self.machine.upper
             places = [
-                self._true(joint, float(x), values)
+                self._true(case, joint, float(x), values)
                 for joint, x in zip(self.machine.active, initial[0], strict=True)
             ]
             place = np.clip(np.array(places) + moved[:n], low, high)
             initial = place, initial[1] + moved[n : 2 * n]
             moved = moved[2 * n :]
         for joint, x in inputs.signals.items():
-            late = values.get(f"sensor.{SIGNAL}{joint}.delay", 0.0)
-            if late:
-                signals[joint] = np.interp(inputs.time - late, inputs.time, x)
-            scale = values.get(f"sensor.{SIGNAL}{joint}.scale", 1.0)
-            signals[joint] = scale * signals[joint] + values.get(
-                f"sensor.{SIGNAL}{joint}.zero", 0.0
-            )
+            name = SIGNAL + joint
+            signals[joint] = self._sensor(case, name, values).quantity(name, inputs.time, x)
         pairs = moved.reshape(-1, 2)
         pressures = {
             joint: (
-                max(self._true(f"pressure_{joint}_a", a, values) + float(da), 0.0),
-                max(self._true(f"pressure_{joint}_b", b, values) + float(db), 0.0),
+                max(self._true(case, f"pressure_{joint}_a", a, values) + float(da), 0.0),
+                max(self._true(case, f"pressure_{joint}_b", b, values) + float(db), 0.0),
             )
             for (joint, (a, b)), (da, db) in zip(inputs.pressures.items(), pairs, strict=True)
         }
         return replace(inputs, initial=initial, pressures=pressures, signals=signals)
 
-    def _true(self, name: str, reading: float, values: dict[str, float]) -> float:
-        """What a sensor stands for that reads so."""
-        zero = values.get(f"sensor.{name}.zero", 0.0)
-        return (reading - zero) / values.get(f"sensor.{name}.scale", 1.0)
+    def _sensor(self, case: Case, name: str, values: Mapping[str, float]) -> Sensor:
+        """With the numbers that are fitted."""
+        known = case.known.get(name, Sensor())
+        names = [f"{SENSOR}{name}.{what}" for what in FITTED]
+        fitted = {x: values[x] for x in names if x in values}
+        return with_numbers({name: known}, fitted)[name] if fitted else known
+
+    def _true(self, case: Case, name: str, x: float, values: Mapping[str, float]) -> float:
+        """What stands for a quantity x by what was known of its sensor, by what is known now."""
+        reading = case.known.get(name, Sensor()).out(x)
+        return self._sensor(case, name, values).into(reading)
 
     def _starts(self, name: str) -> bool:
         """Whether the start depends on a sensor."""
@@ -215,13 +247,12 @@ class Problem:
     def _sensed(self, case: Case, curve: CubicSpline, z: Array) -> tuple[Array, dict[int, Array]]:
         """Readings (N, k) as sensors give them, and their slopes (N, k) by sensors' unknowns."""
         time, values = case.inputs.time, self.values(z)
-        delays = np.array([values.get(f"sensor.{name}.delay", 0.0) for name in case.sensors])
-        scales = np.array([values.get(f"sensor.{name}.scale", 1.0) for name in case.sensors])
-        zeros = np.array([values.get(f"sensor.{name}.zero", 0.0) for name in case.sensors])
-        plain = curve(time) if not delays.any() else np.empty((len(time), len(delays)))
-        if delays.any():
-            for k, delay in enumerate(delays):
-                plain[:, k] = curve(np.maximum(time - delay, 0.0))[:, k]
+        sensors = [self._sensor(case, name, values) for name in case.sensors]
+        delays, scales, zeros = np.array([(s.delay, s.scale, s.zero) for s in sensors]).T
+        last = curve.x[-1]
+        plain = np.empty((len(time), len(delays)))
+        for k, delay in enumerate(delays):
+            plain[:, k] = curve(np.clip(time - delay, 0.0, last))[:, k]
         slopes: dict[int, Array] = {}
         for i, unknown in enumerate(self.unknowns):
             if unknown.sensor not in case.sensors:
@@ -232,73 +263,124 @@ class Problem:
             elif unknown.what == "scale":
                 slope[:, k] = plain[:, k]
             else:
-                late = np.maximum(time - delays[k], 0.0)
+                late = np.clip(time - delays[k], 0.0, last)
                 slope[:, k] = -scales[k] * curve.derivative()(late)[:, k] * (time > delays[k])
             slopes[i] = slope * unknown.scale
         return plain * scales + zeros, slopes
 
-    def residuals(self, case: Case, z: Array) -> Array:
+    def residuals(self, case: Case, z: Array, fitted: bool = False) -> Array:
         """(N, k) simulated less measured.
-
-        Raises:
-            CraneError: See `simulated`.
-        """
-        return self._sensed(case, self.simulated(case, z), z)[0] - case.measured
-
-    def linearized(self, case: Case, z: Array, sizes: Array) -> tuple[Array, Array]:
-        """Residuals (N, k) and their derivatives (N, k, p), by differences from one side.
 
         Args:
             case: The recording.
             z: Unknowns.
-            sizes: (k,) what matters in each channel.
+            fitted: Whether only up to the last instant that is fitted; what is behind it says
+                nothing.
 
         Raises:
             CraneError: See `simulated`.
         """
-        machine = self.variant(z)
-        curve = self.simulated(case, z, machine)
+        return self._sensed(case, self.simulated(case, z, fitted), z)[0] - case.measured
+
+    def linearized(
+        self, case: Case, z: Array, fixed: Set[int] = frozenset()
+    ) -> tuple[Array, Array]:
+        """Residuals (N, k) and their derivatives (N, k, p), see `crane.sensitivities`.
+
+        Up to the last instant that is fitted.
+
+        Args:
+            case: The recording.
+            z: Unknowns.
+            fixed: Indices of those whose derivatives are left 0.
+
+        Raises:
+            CraneError: See `simulated`.
+        """
+        self.runs += 1
+        smooth = max(self.smooth, self.slopes)
+        machine, inputs = self.variant(z, smooth), self._started(case, z)
+        drive, dynamics = inputs.drive(machine), Dynamics(machine)
+        step, steps = _steps(case, _FINEST, True)
+        own = case.first + np.flatnonzero(case.starts)
+        numbers = [i for i in range(len(self.unknowns)) if i not in fixed]
+        moving = [i for i in numbers if self._acts(case, self.unknowns[i].sensor)]
+        moving += own.tolist()
+        links = [link for link, _ in frames_of(machine, case.sensors)]
+        initial = start_of(machine, inputs.initial, None)
+
+        def setup(times: Array) -> tuple[Setup, Setup]:
+            base = setup_of(dynamics, drive, initial, links, times)
+            every = [
+                self._direction(case, z, i, smooth, base, links, times, machine) for i in moving
+            ]
+            return base, Setup(*(np.array(x) for x in zip(*every, strict=True)))
+
+        motion = Motion(dynamics, drive, initial, steps, step)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = follow(motion, case.sensors, setup, np.ones(len(moving)), _ROUGH)
+            run = recorded(machine, drive, found.time, found.parts, "")
+        curve = CubicSpline(found.time, read_off(machine, run, case.sensors))
         here, slopes = self._sensed(case, curve, z)
         out = np.zeros((*here.shape, self.size))
-        own = case.first + np.flatnonzero(case.starts)
-        for i in (*range(len(self.unknowns)), *own.tolist()):
-            sensor = self.unknowns[i].sensor if i < len(self.unknowns) else ""
-            if sensor in case.sensors and not self._starts(sensor):
-                out[:, :, i] = slopes.get(i, 0.0)
-                continue
-            change = self._difference(case, z, i, here, machine)
-            nudge = self._nudges[i]
-            seen = float(np.sqrt(np.mean((change * nudge / sizes)[case.train] ** 2)))
-            if seen < _SEEN and nudge < _LARGEST:
-                more = min(nudge * np.clip(_CLEAR / max(seen, 1e-12), 10.0, 1e3), _LARGEST)
-                self._nudges[i] = more
-                change = self._difference(case, z, i, here, machine)
-            elif seen > 10 * _CLEAR:
-                self._nudges[i] = max(nudge * _CLEAR / seen, 1e-6)
-            if not np.isfinite(change).all():
-                name = self.unknowns[i].name if i < len(self.unknowns) else "the start"
-                raise SimulationError(f"{case.name}: the simulation is not smooth over {name}")
-            out[:, :, i] = change
+        sensors = [self._sensor(case, name, self.values(z)) for name in case.sensors]
+        changes, last = CubicSpline(found.time, found.slopes), found.time[-1]
+        for k, sensor in enumerate(sensors):
+            late = np.clip(case.inputs.time - sensor.delay, 0.0, last)
+            out[:, k, moving] = sensor.scale * changes(late)[:, k]
+        for i in slopes.keys() & set(numbers):
+            out[:, :, i] += slopes[i]
+        if smooth > self.smooth and any(law.sticks for law in self.machine.friction.values()):
+            return self.residuals(case, z, fitted=True), out
         return here - case.measured, out
 
-    def _difference(self, case: Case, z: Array, i: int, here: Array, machine: Machine) -> Array:
-        """Of one unknown, forwards, or backwards where it cannot go on."""
+    def _acts(self, case: Case, sensor: str) -> bool:
+        """Whether a number of the machine, "", or of a sensor changes the simulation."""
+        return not sensor or sensor not in case.sensors or self._starts(sensor)
+
+    def _direction(
+        self,
+        case: Case,
+        z: Array,
+        i: int,
+        smooth: float,
+        base: Setup,
+        links: Sequence[str],
+        times: Array,
+        machine: Machine,
+    ) -> Setup:
+        """How the numbers of a simulation change with an unknown.
+
+        By a difference of the numbers alone, which are smooth: backwards where it cannot go on.
+        """
         starts = i >= len(self.unknowns)
         sides = (1.0, -1.0)
         if not starts:
             unknown = self.unknowns[i]
-            if unknown.start + unknown.scale * (z[i] + self._nudges[i]) > unknown.high:
+            if unknown.start + unknown.scale * (z[i] + _NUDGE) > unknown.high:
                 sides = (-1.0, 1.0)
-        nudge = self._nudges[i]
         for last, side in enumerate(sides):
             there = z.copy()
-            there[i] += side * nudge
+            there[i] += side * _NUDGE
             try:
-                curve = self.simulated(case, there, machine if starts else None)
+                other = machine if starts else self.variant(there, smooth)
+                inputs = self._started(case, there)
+                initial = start_of(other, inputs.initial, None)
+                dynamics, drive = Dynamics(other), inputs.drive(other)
+                found = setup_of(dynamics, drive, initial, links, times)
             except CraneError:
                 if last:
                     raise
                 continue
-            slope: Array = (self._sensed(case, curve, there)[0] - here) / (side * nudge)
-            return slope
+            return found.difference(base, side * _NUDGE)
         raise AssertionError
+
+
+def _steps(case: Case, longest: float, fitted: bool) -> tuple[float, int]:
+    """Length [s], at most some, and number of steps up to the last instant, or that is fitted."""
+    time = case.inputs.time
+    step = float(np.median(np.diff(time)))
+    step /= np.ceil(step / longest)
+    last = time[case.train][-1] if fitted else time[-1]
+    return step, max(int(np.ceil(last / step - 1e-9)), 1)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from crane.common.samples import Array, Brief
 from crane.common.units import reading
+from crane.identification.calibration.lacking import Lacking
 from crane.machine import Machine
 
 
@@ -33,7 +34,7 @@ class Fitted:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Sensor(Brief):
+class Channel(Brief):
     """A channel of a recording, SI units.
 
     Attributes:
@@ -74,14 +75,16 @@ class Calibration:
         changes: Numbers of the machine that differ, as `crane.load(changes=)` takes them.
         coupled: Pairs of names that the recordings tell apart badly, with their correlation.
         runs: Simulations it took.
+        lacking: Numbers that were not fitted and would help.
     """
 
     machine: Machine
     fitted: tuple[Fitted, ...]
-    sensors: tuple[Sensor, ...]
+    sensors: tuple[Channel, ...]
     changes: Mapping[str, float]
     coupled: tuple[tuple[str, str, float], ...]
     runs: int
+    lacking: tuple[Lacking, ...] = ()
 
     @property
     def values(self) -> dict[str, float]:
@@ -106,6 +109,11 @@ class Calibration:
         if self.coupled:
             lines += ["", "Told apart badly, of which a combination alone is known:", ""]
             lines += [f"- {a} and {b} (correlation {r:+.3f})" for a, b, r in self.coupled]
+        if self.lacking:
+            lines += ["", "What would take away more of what is left, if it were fitted, too:", ""]
+            lines += [
+                f"- {x.name} at about {x.value:.3g}: {100 * x.share:.0f} %" for x in self.lacking
+            ]
         held = any(not sensor.train.all() for sensor in self.sensors)
         lines += [
             "",

@@ -6,10 +6,13 @@ from dataclasses import dataclass
 
 from crane.common.errors import InputError, known
 from crane.description.changes import unknown_parameter
+from crane.description.sensors import SENSOR
 from crane.description.spec import MachineSpec
 
-SENSOR, SIGNAL = "sensor.", "voltage_"
-_SENSORS = {"zero": 0.0, "scale": 1.0, "delay": 0.0}
+_LAST = 1  # stage of what rings
+_ELASTIC = ("oil.*", "cylinder.*.stiffness", "cylinder.*.damping", "cylinder.*.gas_*",
+            "cylinder.*.hose_*", "cylinder.*.leakage*")  # fmt: skip
+FITTED = {"zero": 0.0, "scale": 1.0, "delay": 0.0}
 _SIZES = {
     "rad": 0.02,
     "m": 5e-3,
@@ -40,6 +43,8 @@ class Unknown:
         scale: How much counts as 1.
         members: Numbers of the machine that it changes, with what they are at first.
         sensor: Column of the sensor, "" of a number of the machine.
+        stage: From which stage of the search on it is fitted: what rings last, for what it is
+            measured by depends on all else.
     """
 
     name: str
@@ -49,6 +54,7 @@ class Unknown:
     scale: float
     members: tuple[tuple[str, float], ...] = ()
     sensor: str = ""
+    stage: int = 0
 
     def changes(self, value: float) -> dict[str, float]:
         """Numbers of the machine at a value."""
@@ -73,7 +79,7 @@ def unknowns_of(
     Args:
         fit: By name None, a start, or (start, low, high); None of these where not known. Or names.
         spec: The machine's description.
-        numbers: Of the machine by name, see `parameters`.
+        numbers: Of the machine and its sensors by name, see `parameters`.
         sensors: Units by column.
 
     Raises:
@@ -98,14 +104,14 @@ def _unknown(
         column, _, what = name.removeprefix(SENSOR).rpartition(".")
         if column not in sensors:
             raise InputError(f"'{name}' is of no sensor, {known(sensors, column)}")
-        if what not in _SENSORS:
-            raise InputError(f"'{name}': a sensor has no '{what}', {known(_SENSORS, what)}")
-        usual = _SENSORS[what]
+        if what not in FITTED:
+            raise InputError(f"'{name}': a sensor has no '{what}', {known(FITTED, what)}")
+        usual = numbers.get(name, FITTED[what])
         size = _DELAY if what == "delay" else _SIZES.get(sensors[column], 1.0)
         size = 0.05 if what == "scale" else size
         begin = usual if start is None else start
         least = (0.0 if what == "delay" else -float("inf")) if low is None else low
-        return _made(name, begin, least, high, size, sensor=column)
+        return _made(name, begin, least, high, size, ((name, usual),), column)
     if "*" in name:
         found = {x: numbers[x] for x in fnmatch.filter(numbers, name) if numbers[x]}
         if not found:
@@ -156,4 +162,6 @@ def _made(
     most = float("inf") if high is None else float(high)
     if not least < most or not least <= start <= most:
         raise InputError(f"'{name}': {start:g} does not lie within {least:g} to {most:g}")
-    return Unknown(name, float(start), least, most, scale, members, sensor)
+    elastic = any(fnmatch.fnmatch(name, pattern) for pattern in _ELASTIC)
+    stage = _LAST if elastic else 0
+    return Unknown(name, float(start), least, most, scale, members, sensor, stage=stage)

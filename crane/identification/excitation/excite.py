@@ -16,6 +16,7 @@ from crane.identification.excitation.fourier import Fourier
 from crane.identification.excitation.information import CRITERIA, Information, Quality
 from crane.identification.excitation.limits import QUANTITIES, Limits, by_joint, gear, limits
 from crane.identification.excitation.search import COARSE, Search
+from crane.identification.excitation.text import columns
 from crane.identification.mechanics.base import Base, base_parameters, random_samples
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.term import Samples
@@ -148,19 +149,7 @@ class Excitation(Brief):
             numbers = (nominal[i], before.std[i], after.std[i])
             name = self.base.names[self.base.independent[i]]
             least.append((name, *(f"{x:.3g}" for x in numbers)))
-        return "\n\n".join(_table(rows) for rows in (figures, shares, least))
-
-
-def _table(rows: list[tuple[str, ...]]) -> str:
-    """Words in columns, the first one to the left."""
-    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
-    return "\n".join(
-        "  ".join(
-            [row[0].ljust(widths[0])]
-            + [word.rjust(width) for word, width in zip(row[1:], widths[1:], strict=True)]
-        ).rstrip()
-        for row in rows
-    )
+        return "\n\n".join(columns(rows) for rows in (figures, shares, least))
 
 
 def excite(

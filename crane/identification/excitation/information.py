@@ -98,13 +98,7 @@ class Information:
 
     def quality(self, at: Samples, count: float) -> Quality:
         """Figures of one motion, see `sizes`."""
-        _, sizes, directions = np.linalg.svd(self._rows(at, count, 1)[0], full_matrices=False)
-        with np.errstate(divide="ignore"):
-            shares = (self.scale @ directions.T) ** 2 / (sizes**2 + self._known)
-            condition = float(np.exp(_by_condition(sizes)))
-        return Quality(
-            condition, -float(_by_logdet(sizes)), float(sizes[-1]), np.sqrt(shares.sum(axis=1))
-        )
+        return quality(self._rows(at, count, 1)[0], self.scale, self._known)
 
     def _columns(self, at: Samples) -> Array:
         return self.model.regressor(at)[:, :, self.base.independent]
@@ -113,6 +107,22 @@ class Information:
         """N^-1 W S (sets, samples n, r), each of a recording's weight."""
         W = self._columns(at) * (np.sqrt(count * sets / len(at.q_a)) / self.noise[:, None])
         return W.reshape(sets, -1, self.base.rank) @ self.scale
+
+
+def quality(rows: Array, scale: Array, known: float) -> Quality:
+    """Figures of information M = R^T R.
+
+    Args:
+        rows: R (N, r), of parameters in their scales.
+        scale: S (r, r), these scales.
+        known: 1 where S S^T is what is known beforehand and counts in the deviations, else 0.
+    """
+    _, sizes, directions = np.linalg.svd(rows, full_matrices=False)
+    with np.errstate(divide="ignore"):
+        shares = (scale @ directions.T) ** 2 / (sizes**2 + known)
+        condition = float(np.exp(_by_condition(sizes)))
+    std = np.sqrt(shares.sum(axis=1))
+    return Quality(condition, -float(_by_logdet(sizes)), float(sizes[-1]), std)
 
 
 def _by_logdet(sizes: Array) -> Array:

@@ -10,6 +10,7 @@ from crane.hydraulics.components import Cylinder, Valve
 from crane.identification.signals.motion import average_periods, differentiate, sampling
 from crane.machine import Machine
 from crane.recordings.measured import moved_locks
+from crane.recordings.missing import check_there
 from crane.recordings.recording import Recording
 
 _SLACK = 1e-3  # of the stroke by which a noisy sensor may leave it
@@ -61,6 +62,12 @@ def parts(machine: Machine, joint: str) -> tuple[Cylinder, Valve]:
     if joint not in circuit.cylinders:
         raise InputError(f"'{joint}' has no cylinder, {known(circuit.cylinders, joint)}")
     return circuit.cylinders[joint], circuit.valves[joint]
+
+
+def needed(joint: str) -> list[tuple[str, ...]]:
+    """Channels of a cylinder: four pressures, and the signal of its valve or the spool."""
+    names = [f"pressure_{joint}_a", f"pressure_{joint}_b", "pressure_supply", "pressure_tank"]
+    return [*((name,) for name in names), (f"voltage_{joint}", f"spool_{joint}")]
 
 
 def column(recording: Recording, joint: str) -> int:
@@ -137,17 +144,13 @@ def cylinder_signals(
             f"limits are {lower:.4g} and {upper:.4g}, check its zero and unit"
         )
     step = sampling(recording.time)
-    pressures = [
-        channel(recording, name, "Pa")
-        for name in (
-            f"pressure_{joint}_a", f"pressure_{joint}_b", "pressure_supply", "pressure_tank",
-        )
-    ]  # fmt: skip
-    spool = f"spool_{joint}"
+    check_there(needed(joint), recording.channels)
+    *names, (signal, spool) = needed(joint)
+    pressures = [channel(recording, name, "Pa") for (name,) in names]
     if spool in recording.channels:
         y = opening(valve, recording.channels[spool])
     else:
-        voltage = channel(recording, f"voltage_{joint}", "V")
+        voltage = channel(recording, signal, "V")
         y = opening(valve, spool_position(valve, voltage, step))
     time, columns = recording.time, np.column_stack([q - lower, y, *pressures])
     if period is not None:

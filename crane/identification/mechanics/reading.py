@@ -80,7 +80,7 @@ def _columns(machine: Machine, recording: Recording) -> list[int]:
     missing = [joint for joint in machine.active if joint not in recording.joints]
     if missing:
         listed = ", ".join(f"'{joint}'" for joint in missing)
-        held = "lock " + ", ".join(f"{joint}=VALUE" for joint in missing)
+        held = " ".join(f"--lock {joint}=VALUE" for joint in missing)
         raise RecordingError(
             f"{listed} of '{machine.name}' not recorded, {known(recording.joints)}; lock what was "
             f"held ({held})"

@@ -15,6 +15,7 @@ where a joint starts or stops, the motion is that of an ordinary differential eq
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,6 +37,24 @@ Trial = Callable[[float], tuple[Array, float]]
 """Length of a step [s] -> the state behind it and the margin there."""
 
 
+class Switch(NamedTuple):
+    """A joint that starts or stops.
+
+    Attributes:
+        time: [s].
+        state: Then.
+        slip: (k,) see `Sticking`, from then on.
+        held: (k,) likewise.
+        moving: Likewise.
+    """
+
+    time: float
+    state: Array
+    slip: Array
+    held: Array
+    moving: bool
+
+
 class Sticking:
     """What the joints of a machine do whose friction sticks.
 
@@ -52,6 +71,7 @@ class Sticking:
         moving: Whether anything moves.
         settled: Whether all this has been found.
         undetermined: Whether forces at rest were, of joints that hold the same.
+        switches: What has happened, the start first.
     """
 
     def __init__(self, machine: Machine, columns: tuple[int, ...], limits: Array):
@@ -62,6 +82,7 @@ class Sticking:
         self.slip = np.zeros(len(columns))
         self.held = np.zeros(len(columns), dtype=bool)
         self.moving, self.settled, self.undetermined = True, False, False
+        self.switches: list[Switch] = []
 
     @property
     def notes(self) -> list[str]:
@@ -75,6 +96,11 @@ class Sticking:
             "ways than one: the motion is determined, how they share the load is not, and their "
             "'rest_' channels are one way"
         ]
+
+    def note(self, time: float, state: Array) -> None:
+        """Remember what has changed at a time [s] and a state."""
+        now = Switch(time, state.copy(), self.slip.copy(), self.held.astype(float), self.moving)
+        self.switches.append(now)
 
     def tell(self, dynamics: Dynamics) -> None:
         """Make the present modes those of a machine's dynamics."""

@@ -109,10 +109,11 @@ class Switching:
         """Find anew what sticks at a state."""
         if self._code is None:
             self.slow.settle(time, state)
-            return
-        self._code.adopt()
-        self.slow.settle(time, state, self._code.observe(time, state)[0])
-        self._code.adopt()
+        else:
+            self._code.adopt()
+            self.slow.settle(time, state, self._code.observe(time, state)[0])
+            self._code.adopt()
+        self._sticking.note(time, state)
 
     def _switched(self, time: float, state: Array, length: float, step: float) -> float:
         """Go on to where a joint starts or stops within a step.

@@ -102,15 +102,19 @@ def _undetermined(a_a: Sequence[Number], friction: bool) -> list[Number]:
     raise InputError("inverse dynamics of coordinates that do not determine the motion")
 
 
-def machine_at(chart: Chart, tape: Tape, layout: Layout, state: int) -> Traced:
+def machine_at(
+    chart: Chart, tape: Tape, layout: Layout, state: int, folds: tuple[Array, Array] | None = None
+) -> Traced:
     """The machine at the state in an argument.
 
-    Geometry and numbers of the machine are the arguments 0 and 1.
+    Geometry and numbers of the machine are the arguments 0 and 1; `folds` has both with NaN where
+    none may become part of the formulas, the machine's own if not given.
     """
     dynamics, closure = chart.dynamics, chart.machine.closure
-    q, posture, loops = closure.fast.trace(tape, 0, state)
+    geometry, pattern = folds or (None, dynamics.pattern)
+    q, posture, loops = closure.fast.trace(tape, 0, state, geometry)
     parts = layout.view(tape.loads(state, 0, layout.size))
-    constants = Constants(tape, 1, dynamics.pattern)
+    constants = Constants(tape, 1, pattern)
     sweep = Sweep(posture, loops, constants, q, parts.v_a, dynamics.form, modes=True)
     v_a = parts.v_a if chart.own else [sweep.rates[i + 1] for i in chart.seen]
     return Traced(chart, sweep, parts, [q[i] for i in chart.seen], v_a)

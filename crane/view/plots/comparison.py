@@ -37,11 +37,8 @@ def _figure(comparison: Comparison) -> Figure:
         axes.plot(time, scale * channel.measured[::every], color=RECORDED, label="measured")
         axes.plot(time, scale * channel.simulated[::every], label="simulated", **DASHED)
         label = f" [{unit}]" if unit else ""
-        axes.set_ylabel(plain(f"{channel.name}{label}"))
-        axes.set_title(
-            plain(f"RMS {scale * channel.rms:.3g} {unit}, {100 * channel.relative:.3g} %"),
-            fontsize=8,
-        )
+        off = f"RMS {scale * channel.rms:.3g} {unit}, {100 * channel.relative:.3g} %"
+        axes.set_title(plain(f"{channel.name}{label}\n{off}"), fontsize=8)
         axes.margins(x=0.0)
     for axes in panels[count:]:
         axes.set_visible(False)

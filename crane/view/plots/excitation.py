@@ -1,4 +1,4 @@
-"""A reference for identification as one figure: strokes, velocities, forces, and their limits."""
+"""What excites a machine as one figure: a reference and its limits, or signals of valves."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,7 +10,9 @@ from matplotlib.figure import Figure
 
 from crane.common.output import replacing
 from crane.common.samples import Array
+from crane.common.units import reading
 from crane.identification.excitation.excite import Excitation
+from crane.identification.excitation.signals import SignalExcitation
 from crane.recordings.recording import FORCE_UNITS
 from crane.recordings.summary import READING_UNITS
 from crane.view.plots.recording import DASHED, FAINT, RECORDED, STYLE
@@ -59,6 +61,44 @@ def _draw_joint(
             (reference.duration - reference.lead, reference.duration),
         ):
             axes.axvspan(*way, color=FAINT, alpha=0.5)
+        axes.set_ylabel(f"{what} [{label}]")
+        axes.margins(x=0.0)
+    column[0].set_title(plain(joint))
+    column[-1].set_xlabel("time [s]")
+
+
+def plot_signals(excitation: SignalExcitation, path: str | Path) -> None:
+    """Write the figure of valve signals as png: signal, stroke with its ends dashed, pressures.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    count = len(excitation.signals)
+    with mpl.rc_context(STYLE), replacing(path) as part:
+        figure = Figure(figsize=(3.0 * count + 0.6, 6.0), layout="constrained")
+        grid = figure.subplots(3, count, sharex=True, squeeze=False)
+        for i, joint in enumerate(excitation.signals):
+            _draw_valve(list(grid[:, i]), excitation, joint)
+        figure.savefig(part, format="png", dpi=200)
+
+
+def _draw_valve(column: Sequence[Axes], excitation: SignalExcitation, joint: str) -> None:
+    """Signal, stroke and pressures of a cylinder below each other."""
+    run, machine = excitation.run.columns(), excitation.machine
+    i = machine.active.index(joint)
+    unit, scale = READING_UNITS[machine.unit(joint)]
+    ends = machine.lower[i], machine.upper[i]
+    bar, per_bar = reading("Pa", 1e5)
+    rows = (
+        ("signal", "V", 1.0, [f"voltage_{joint}"], ()),
+        ("stroke", unit, scale, [joint], ends),
+        ("pressures A, B", bar, per_bar, [f"pressure_{joint}_{side}" for side in "ab"], ()),
+    )
+    for axes, (what, label, factor, names, limits) in zip(column, rows, strict=True):
+        for name, color in zip(names, (RECORDED, "#2a8c4a"), strict=False):
+            axes.plot(excitation.run.time, factor * run[name], color=color)
+        for end in limits:
+            axes.axhline(factor * end, **DASHED)
         axes.set_ylabel(f"{what} [{label}]")
         axes.margins(x=0.0)
     column[0].set_title(plain(joint))

@@ -1,0 +1,68 @@
+"""Traced formulas as CasADi's expressions: the same operations, one by one."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from crane.codegen.scalar import Expression, Number, needed
+from crane.common.errors import InputError
+
+_BINARY = {
+    "add": lambda a, b: a + b,
+    "subtract": lambda a, b: a - b,
+    "multiply": lambda a, b: a * b,
+    "divide": lambda a, b: a / b,
+}
+_NAMES = {
+    "sin": "sin", "cos": "cos", "exp": "exp", "log": "log", "tanh": "tanh", "sqrt": "sqrt",
+    "abs": "fabs", "maximum": "fmax", "copysign": "copysign",
+}  # fmt: skip
+
+
+def library() -> Any:
+    """CasADi.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        import casadi
+    except ImportError:
+        raise InputError(
+            "CasADi is not installed, install it: pip install 'crane-dynamics[casadi]'"
+        ) from None
+    return casadi
+
+
+def expressions(outputs: Sequence[Number], arguments: Sequence[Any]) -> list[Any]:
+    """CasADi's scalars of traced formulas.
+
+    Args:
+        outputs: (m,) formulas on one tape.
+        arguments: What stands for each argument of the tape: numbers, or CasADi's symbols.
+
+    Raises:
+        InputError: CasADi is not installed.
+    """
+    ca = library()
+    operations = next((x.tape.operations for x in outputs if isinstance(x, Expression)), [])
+    found: dict[int, Any] = {}
+    for index in needed(outputs):
+        kind, *operands = operations[index]
+        if kind == "load":
+            array, place = operands
+            value = arguments[array][place]
+            found[index] = value if isinstance(value, ca.SX) else ca.SX(float(value))
+        else:
+            values = [found[x] if type(x) is int else ca.SX(x) for x in operands]
+            found[index] = _operation(ca, kind)(*values)
+    return [found[x.index] if isinstance(x, Expression) else ca.SX(float(x)) for x in outputs]
+
+
+def _operation(ca: Any, kind: str) -> Callable[..., Any]:
+    if kind in _BINARY:
+        return _BINARY[kind]
+    if kind == "negate":
+        return lambda x: -x
+    if kind == "positive":
+        return lambda x, yes, no: ca.if_else(x > 0, yes, no)
+    return getattr(ca, _NAMES[kind])

@@ -1,0 +1,144 @@
+"""Numbers that recordings may tell, and how far files are usually off."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.description.sensors import INCLINATION, SENSOR, SIGNAL
+from crane.hydraulics import Hydraulics
+from crane.identification.calibration.problem import Case
+from crane.machine import Machine
+
+_MOVED = 0.05  # of a spool's stroke, by which a valve is opened
+_SLOW, _FAST = 5.0, 200.0  # of spools [1/s]
+_LATE, _LATEST = 0.1, 0.6  # [s] of signals
+_TILTED = 0.05  # [rad] that inclinometers are mounted off
+_PRESSED = 2e5  # [Pa] that pressure sensors are off
+_GAS = 5e-3  # of a chamber's volume
+_LEAKED = 1e-2  # of a valve's full flow at the supply's pressure
+_BRAKED = 1e-2  # of a cylinder's force at the supply's pressure
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A number that may be fitted.
+
+    Attributes:
+        name: See `Unknown`.
+        start: Where it begins.
+        deviation: Standard deviation of what a file says of it.
+        low: Least value.
+        high: Largest.
+    """
+
+    name: str
+    start: float
+    deviation: float
+    low: float = -np.inf
+    high: float = np.inf
+
+
+def candidates(
+    machine: Machine, cases: Sequence[Case], numbers: Mapping[str, float]
+) -> list[Candidate]:
+    """What recordings of a machine may tell.
+
+    Args:
+        machine: The machine.
+        cases: Its recordings.
+        numbers: Of the machine and its sensors by name.
+    """
+    found: list[Candidate] = []
+    for sensor in dict.fromkeys(name for case in cases for name in case.sensors):
+        found += _of_sensor(sensor, numbers)
+    hydraulics = machine.hydraulics
+    if hydraulics is None:
+        return found
+    for joint in hydraulics.joints:
+        ways = _ways(joint, hydraulics, cases)
+        if ways:
+            found += _of_valve(joint, hydraulics, numbers, ways > 1)
+            found += _of_cylinder(joint, machine, hydraulics, numbers)
+    if numbers.get("payload.mass", 0.0):
+        found.append(_scaled("payload.mass", numbers["payload.mass"], 0.5, 3.0))
+    found.append(_scaled("oil.bulk_modulus", hydraulics.oil.bulk_modulus, 0.5, 5.0))
+    return found
+
+
+def _scaled(name: str, start: float, share: float, most: float) -> Candidate:
+    """A positive number that a file knows to a share of itself, and by a factor at most."""
+    return Candidate(name, start, share * start, start / most, start * most)
+
+
+def _ways(joint: str, hydraulics: Hydraulics, cases: Sequence[Case]) -> int:
+    """In how many ways a valve is opened."""
+    valve = hydraulics.valves[joint]
+    signals = [case.inputs.signals[joint] for case in cases if joint in case.inputs.signals]
+    if not signals:
+        return 0
+    u = (np.concatenate(signals) - valve.neutral) / (valve.full - valve.neutral)
+    return int(u.max() > _MOVED) + int(u.min() < -_MOVED)
+
+
+def _of_sensor(name: str, numbers: Mapping[str, float]) -> Iterator[Candidate]:
+    zero, delay = (f"{SENSOR}{name}.{what}" for what in ("zero", "delay"))
+    if name.startswith(INCLINATION):
+        yield Candidate(zero, numbers.get(zero, 0.0), _TILTED)
+    elif name.startswith("pressure_"):
+        yield Candidate(zero, numbers.get(zero, 0.0), _PRESSED)
+    yield Candidate(delay, numbers.get(delay, 0.0), _LATE, 0.0)
+
+
+def _of_valve(
+    joint: str, hydraulics: Hydraulics, numbers: Mapping[str, float], both: bool
+) -> Iterator[Candidate]:
+    valve, name = hydraulics.valves[joint], f"valve.{joint}"
+    stroke = abs(valve.full - valve.neutral)
+    drift, dead = 0.02 * stroke, valve.dead_band
+    if both:  # else neutral and dead band cannot be told apart
+        least, most = valve.neutral - 3.0 * drift, valve.neutral + 3.0 * drift
+        yield Candidate(f"{name}.neutral", valve.neutral, drift, least, most)
+    yield Candidate(f"{name}.dead_band", dead, 0.05, max(dead - 0.15, 0.0), dead + 0.15)
+    orifices = [f"{name}.c{i}" for i in range(1, 5)]
+    if valve.margin and len({numbers[x] for x in orifices}) == 1:
+        yield _scaled(f"{name}.c*", 1.0, 0.3, 2.5)
+    else:
+        for one in orifices:
+            yield _scaled(one, numbers[one], 0.3, 2.5)
+    if valve.bandwidth:
+        yield Candidate(f"{name}.bandwidth", valve.bandwidth, valve.bandwidth, _SLOW, _FAST)
+    delay = f"{SENSOR}{SIGNAL}{joint}.delay"
+    yield Candidate(delay, numbers.get(delay, 0.0), _LATE, 0.0, _LATEST)
+
+
+def _of_cylinder(
+    joint: str, machine: Machine, hydraulics: Hydraulics, numbers: Mapping[str, float]
+) -> Iterator[Candidate]:
+    cylinder, valve = hydraulics.cylinders[joint], hydraulics.valves[joint]
+    pressure = hydraulics.supply.pressure
+    at = machine.active.index(joint)
+    stroke = float(machine.upper[at] - machine.lower[at])
+    brake = _BRAKED * pressure * cylinder.area_a
+    pace = valve.c1 * np.sqrt(pressure) / cylinder.area_a
+    for what, size in (("coulomb", brake), ("viscous", brake / pace)):
+        name = f"friction.{joint}.{what}"
+        if name in numbers:
+            start = numbers[name]
+            deviation = max(3.0 * start, size)
+            yield Candidate(name, start, deviation, 0.0, start + 5.0 * deviation)
+    volumes = (
+        cylinder.area_a * stroke + cylinder.hose_a,
+        cylinder.area_b * stroke + cylinder.hose_b,
+    )
+    leak = _LEAKED * valve.c1 / np.sqrt(pressure)
+    for side, volume in zip("ab", volumes, strict=True):
+        for what, size in (("gas", _GAS * volume), ("leakage", leak), ("hose", 0.5 * volume)):
+            name = f"cylinder.{joint}.{what}_{side}"
+            start = numbers[name]
+            yield Candidate(name, start, max(start, size), 0.0)
+    name = f"cylinder.{joint}.stiffness"
+    if start := numbers[name]:
+        yield _scaled(name, start, 1.0, 20.0)
+    name = f"cylinder.{joint}.leakage"
+    yield Candidate(name, numbers[name], max(numbers[name], leak), 0.0)

@@ -1,0 +1,76 @@
+"""All numbers of a simulation."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from crane.common.samples import Array
+from crane.control import TracedController, ValveDrive
+from crane.dynamics import Dynamics
+
+FRAME = 6  # numbers of a frame
+
+
+class Setup(NamedTuple):
+    """What a simulation depends on.
+
+    Attributes:
+        geometry: Where joints and loops are, see `crane.closure.traced.Geometry`.
+        numbers: Masses and force laws, see `crane.dynamics.traced.numbers_of`, without what joints
+            do whose friction sticks.
+        settings: Of the controller; a circuit's are among them.
+        frames: Per frame that is observed, where it is on its body (3,) and its x axis (3,).
+        references: (N, c) of the controller at N instants.
+        start: (m,) the minimal state at first.
+    """
+
+    geometry: Array
+    numbers: Array
+    settings: Array
+    frames: Array
+    references: Array
+    start: Array
+
+    def difference(self, other: "Setup", over: float) -> "Setup":
+        """(self - other) / over."""
+        return Setup(*((one - two) / over for one, two in zip(self, other, strict=True)))
+
+
+def setup_of(
+    dynamics: Dynamics,
+    control: TracedController,
+    initial: tuple[Array, Array],
+    frames: Sequence[str],
+    times: Array,
+) -> Setup:
+    """The numbers of a simulation.
+
+    Args:
+        dynamics: Of the machine.
+        control: Its controller.
+        initial: q_A and v_A at first.
+        frames: Links that are observed.
+        times: (N,) [s].
+    """
+    machine = dynamics.machine
+    q = machine.closure.solve(initial[0], guess=machine.home)
+    own = np.zeros(0)
+    if hasattr(control, "start_at"):
+        own = control.start_at(dynamics, q)
+    if isinstance(control, ValveDrive):
+        own = own[: control.circuit.stiff]
+    places = [np.zeros(0)]
+    for link in frames:
+        frame = machine.model.frames[machine.frame(link)]
+        body = machine.coordinates.bodies[int(frame.parentJoint)]
+        turn = machine.closure.fast.geometry.turns[body].T
+        places += [turn @ frame.placement.translation, turn @ frame.placement.rotation[:, 0]]
+    return Setup(
+        machine.closure.fast.geometry.numbers,
+        np.where(np.isnan(dynamics.pattern), 0.0, dynamics.numbers),
+        np.asarray(control.settings, dtype=np.float64),
+        np.concatenate(places),
+        control.references(times),
+        np.concatenate([*initial, own]),
+    )

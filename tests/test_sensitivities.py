@@ -1,0 +1,187 @@
+"""Sensitivities of simulations: closed forms, and differences of simulations."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import crane
+from crane.common.errors import CraneError
+from crane.formats.loading import Variants
+
+MASS, STIFFNESS, DAMPING = 2.0, 50.0, 0.6
+
+
+def block(folder, friction="{}", spring=""):
+    """A block that slides along x."""
+    (folder / "block.urdf").write_text(
+        f"""<robot name="block"><link name="base"/><link name="block"><inertial>
+        <mass value="{MASS}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+        </link><joint name="x" type="prismatic"><parent link="base"/><child link="block"/>
+        <axis xyz="1 0 0"/><limit lower="-100" upper="100" effort="1" velocity="1"/></joint>
+        </robot>"""
+    )
+    (folder / "block.yaml").write_text(
+        f"name: block\nchains: [{{name: block, urdf: block.urdf}}]\nloops: []\nactive: [x]\n"
+        f"home: {{x: 0}}\nfriction: {friction}\n{spring}"
+    )
+    return crane.load(folder / "block.yaml")
+
+
+def test_a_damped_spring_as_its_closed_form(tmp_path):
+    spring = f"forces: [{{joint: x, stiffness: {STIFFNESS}, damping: {DAMPING}}}]"
+    machine = block(tmp_path, spring=spring)
+    by = ("start.x", "start.x_velocity", "block.mass", "spring.x.stiffness", "spring.x.damping")
+    found = crane.sensitivities(machine, None, ([0.3], [0.1]), 5.0, 2e-3, by=by,
+                                outputs=("x", "x_velocity"))  # fmt: skip
+
+    def motion(x0, v0, m, k, d):
+        roots = np.roots(np.array([m, d, k], dtype=complex))
+        weights = np.linalg.solve(np.array([[1, 1], roots]), np.array([x0, v0], dtype=complex))
+        waves = weights * np.exp(np.outer(found.recording.time, roots))
+        return np.stack([waves.sum(1).real, (waves * roots).sum(1).real], axis=1)
+
+    at = np.array([0.3, 0.1, MASS, STIFFNESS, DAMPING])
+    for i, name in enumerate(by):
+        h = 1e-3 * at[i] * np.eye(5)[i]
+        weights = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+        true = sum(w * (motion(*(at + j * h)) - motion(*(at - j * h))) for j, w in weights)
+        true /= 1e-3 * at[i]
+        assert found.slopes[:, :, i] == pytest.approx(true, abs=1e-9 * np.abs(true).max()), name
+    assert found.values == pytest.approx(at)
+
+
+def test_behind_a_stop_everything_depends_on_when_it_stopped(tmp_path):
+    """A block swings on a spring until friction F holds it, at (-1)^n (x0 - 2 n F / k)."""
+    coulomb, x0 = 1.7, 0.3
+    spring = f"forces: [{{joint: x, stiffness: {STIFFNESS}}}]"
+    machine = block(tmp_path, f"{{x: {{coulomb: {coulomb}}}}}", spring)
+    by = ("start.x", "friction.x.coulomb", "spring.x.stiffness", "block.mass")
+    outputs = ("x", "x_velocity")
+    found = crane.sensitivities(machine, None, [x0], 4.0, 2e-3, by=by, outputs=outputs)
+    n = round((x0 * STIFFNESS / coulomb - 1.0) / 2.0 + 0.4999)
+    assert found.recording.q[-1, 0] == pytest.approx(
+        (-1) ** n * (x0 - 2 * n * coulomb / STIFFNESS)
+    )
+    true = (-1) ** n * np.array([1.0, -2 * n / STIFFNESS, 2 * n * coulomb / STIFFNESS**2, 0.0])
+    assert found.slopes[-1, 0] == pytest.approx(true, abs=1e-8)
+    assert found.slopes[-1, 1] == pytest.approx(0.0, abs=1e-8)
+    # and during the first half swing
+    w, time = np.sqrt(STIFFNESS / MASS), found.recording.time
+    first = time < np.pi / w
+    assert found.of("x", "start.x")[first] == pytest.approx(np.cos(w * time[first]), abs=1e-8)
+
+
+class Ramp(crane.Law):
+    """A force that grows."""
+
+    def references(self, times):
+        return 3.0 * times[:, None]
+
+    def law(self, at):
+        return at.reference, ()
+
+
+def test_behind_a_start_everything_depends_on_when_it_started(tmp_path):
+    """A growing force c t moves a block from t = F / c on: x = c (t - F / c)^3 / (6 m)."""
+    coulomb = 2.0
+    machine = block(tmp_path, f"{{x: {{coulomb: {coulomb}}}}}")
+    by = ("friction.x.coulomb", "block.mass")
+    found = crane.sensitivities(machine, Ramp(machine), [0.0], 2.0, 2e-3, by=by, outputs=("x",))
+    since = np.maximum(found.recording.time - coulomb / 3.0, 0.0)
+    assert found.slopes[:, 0, 0] == pytest.approx(-(since**2) / (2 * MASS), abs=1e-9)
+    assert found.slopes[:, 0, 1] == pytest.approx(-3.0 * since**3 / (6 * MASS**2), abs=1e-9)
+
+
+def differences(machine, made, by, duration, step, outputs, share):
+    """Derivatives (N, k, p) of order 4, and how far those over half as much differ."""
+    variants, out, doubt = Variants(machine), [], []
+
+    def run(name, value):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            other = variants.machine({name: value})
+            controller, initial = made(other)
+            columns = crane.simulate(
+                other, controller, initial, duration, step, tolerance=1e-12
+            ).columns()
+        return np.column_stack([columns[output] for output in outputs])
+
+    for name in by:
+        value = variants.values[name]
+        found = []
+        size = abs(value) if value else 0.1
+        for h in (share * size, 0.5 * share * size):
+            near, far = (run(name, value + i * h) - run(name, value - i * h) for i in (1, 2))
+            found.append((8 * near - far) / (12 * h))
+        out.append(found[1])
+        doubt.append(np.abs(found[1] - found[0]))
+    return np.stack(out, axis=2), np.stack(doubt, axis=2)
+
+
+def compare(machine, made, by, duration, step, outputs, share):
+    """To 1e-6, or as well as differences of simulations know; these know a good part to 1e-5."""
+    controller, initial = made(machine)
+    found = crane.sensitivities(
+        machine, controller, initial, duration, step, by=by, outputs=outputs, tolerance=1e-10
+    )
+    true, doubt = differences(machine, made, by, duration, step, outputs, share)
+    gap, doubt = np.abs(found.slopes - true).max(axis=0), doubt.max(axis=0)
+    columns = found.recording.columns()
+    sizes = np.array([np.ptp(columns[output]) for output in outputs])[:, None]
+    numbers = np.where(found.values, np.abs(found.values), 0.1)
+    size = np.maximum(np.abs(true).max(axis=0), 1e-6 * sizes / numbers)
+    assert (gap <= 1e-6 * size + 3.0 * doubt).all(), (gap / size, doubt / size)
+    assert np.median(doubt / size) < 1e-5
+
+
+def test_a_closed_chain_under_computed_torque():
+    machine = crane.load("mini_forwarder")
+    reference = crane.task_trajectory(machine, "lift")
+
+    def made(other):
+        return crane.ComputedTorque(machine, reference), None
+
+    by = ("link3.mass", "friction.X1.viscous", "link3_G.x")
+    compare(machine, made, by, 2.0, 1e-3, ("X1", "q2", "X1_force", "tip_z"), 1e-2)
+
+
+HYDRAULIC = ("payload.mass", "oil.bulk_modulus", "valve.X_lift.c1", "cylinder.X_lift.hose_a",
+             "lift_eye.x", "friction.X_lift.viscous")  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sticks", "share"), [(True, 1e-4), (False, 3e-4)])
+def test_ten_seconds_on_valves(sticks, share):
+    changes = {"payload.mass": 150.0} | ({} if sticks else {
+        f"friction.{joint}.{key}": 0.0 for joint in ("X_lift", "X_tilt")
+        for key in ("coulomb", "stiction")
+    })  # fmt: skip
+    machine = crane.load("patu655", changes=changes, lock={"X_ext": 0.1, "slew": 0.0})
+
+    def made(other):
+        valve = other.hydraulics.valves["X_lift"]
+        levers = valve.neutral + 0.4 * np.array([0, 0, 1, 1, 0, 0]) * (valve.full - valve.neutral)
+        signals = crane.Signals(other, [0, 0.5, 1, 4, 4.5, 10.0], {"X_lift": levers})
+        return signals, [0.2, 0.3]
+
+    outputs = ("X_lift", "X_tilt", "pressure_X_lift_a", "tip_z")
+    compare(machine, made, HYDRAULIC, 10.0, 1e-3, outputs, share)
+
+
+def test_what_has_no_sensitivity_is_refused(tmp_path):
+    machine = block(tmp_path)
+    start = ([0.0], [1.0])
+    for options, text in (
+        ({"by": ["start.y"]}, "'start.y' is no start of an active joint"),
+        ({"by": ["mass"]}, "'mass'"),
+        ({"by": ["block.mass"], "outputs": ["y"]}, "'y' is no output of 'block'"),
+        ({"by": []}, "no number is named"),
+    ):
+        with pytest.raises(CraneError, match=text):
+            crane.sensitivities(machine, None, start, 0.1, **options)
+    with pytest.raises(CraneError, match="write it as a crane.control.Law"):
+        crane.sensitivities(machine, lambda t, q, v: q, start, 0.1, by=["block.mass"])
+    with pytest.raises(CraneError, match="dead centre"):
+        crank = crane.load("tests/data/slider_crank.yaml")
+        crane.sensitivities(crank, None, ([1.0], [0.0]), 2.0, by=["start.theta"])
