@@ -229,7 +229,7 @@ inclination_tilt_boom [deg] = z2_deg
     found = quiet(crane.calibrate, machine, LIFTING, fit, columns=columns, train=(0.0, 10.0))
     left = {sensor.name: sensor for sensor in found.sensors}
     for name, fitted, held_out in (
-        ("X_lift", 2.5e-3, 6e-3), ("pressure_X_lift_a", 1.0e5, 0.8e5),
+        ("X_lift", 2e-3, 5.5e-3), ("pressure_X_lift_a", 0.75e5, 0.8e5),
         ("pressure_X_lift_b", 0.3e5, 1.0e5), ("pressure_X_tilt_a", 0.3e5, 0.6e5),
         ("pressure_X_tilt_b", 0.3e5, 0.6e5), ("inclination_tilt_boom", 6e-3, 8e-3),
     ):  # fmt: skip

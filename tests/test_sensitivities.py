@@ -4,10 +4,12 @@ import warnings
 
 import numpy as np
 import pytest
+from typed import typed
 
 import crane
 from crane.common.errors import CraneError
 from crane.formats.loading import Variants
+from crane.recordings import timeseries
 
 MASS, STIFFNESS, DAMPING = 2.0, 50.0, 0.6
 
@@ -185,3 +187,23 @@ def test_what_has_no_sensitivity_is_refused(tmp_path):
     with pytest.raises(CraneError, match="dead centre"):
         crank = crane.load("tests/data/slider_crank.yaml")
         crane.sensitivities(crank, None, ([1.0], [0.0]), 2.0, by=["start.theta"])
+
+
+def test_the_command_tells_what_a_motion_depends_on(tmp_path):
+    out = tmp_path / "out"
+    command = ("sensitivities", "mini_forwarder", "--task", "lift", "--duration", "0.1")
+    numbers = ("--by", "link3.mass", "--by", "start.X1", "--outputs", "X1,X1_force,q1")
+    done = typed(*command, *numbers, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "| link3.mass | 0.218 | 0.00218 |" in done.stdout and "X1_force [N]" in done.stdout
+    names = {"sensitivities.md", "sensitivities.csv", "sensitivities.png"}
+    assert {path.name for path in out.iterdir()} == names
+    table = timeseries.read(out / "sensitivities.csv")
+    first = dict(zip(table.units, table.values[0], strict=True))
+    assert first["X1 by start.X1"] == pytest.approx(1.0) and first["X1 by link3.mass"] == 0.0
+    for options, said in (
+        (numbers, "is not empty"), (("--by", "nix"), "'nix' is unknown"),
+        (("--by", "start.X1", "--outputs", "foo"), "'foo' is no output"),
+    ):  # fmt: skip
+        done = typed(*command, *options, *(("--out", out) if options is numbers else ()))
+        assert done.returncode == 2 and said in done.stderr

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from crane.identification.mechanics.result import Identification
     from crane.motion.workspaces import Workspace
     from crane.simulation.linear import LinearModel
+    from crane.simulation.sensitivity import Sensitivities
 
 RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
 COMPARISON = "comparison.md"
@@ -166,6 +167,20 @@ def write_calibration(folder: Path, found: "Calibration") -> None:
         except InputError as error:
             text = f"the machine is not written, take the --set options of the report: {error}"
             warnings.warn(text, CraneWarning, stacklevel=2)
+
+
+def write_sensitivities(folder: Path, found: "Sensitivities") -> None:
+    """Write table, derivatives and picture into a folder, created where there is none.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.plots.sensitivities import plot_sensitivities
+
+    with staging(folder) as part:
+        (part / "sensitivities.md").write_text(found.to_text() + "\n", encoding="utf-8")
+        found.to_csv(part / "sensitivities.csv")
+        plot_sensitivities(found, part / "sensitivities.png")
 
 
 def write_modes(

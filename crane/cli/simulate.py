@@ -102,12 +102,8 @@ def simulate(
     of_inputs = {"--columns": columns, "--from": since, "--until": until}
     for option in [option for option, given in of_inputs.items() if given is not None]:
         raise InputError(f"{option} is for --inputs, leave it out")
-    control = _control(loaded, task, controller)
-    if task is None and duration is None:
-        tasks = ", ".join(loaded.tasks) or "none"
-        raise InputError(f"no task: name a --task ({tasks}), or a --duration to let it go")
-    if duration is None and task is not None:
-        duration = loaded.tasks[task].duration
+    control = control_of(loaded, task, controller)
+    duration = duration_of(loaded, task, duration)
     label = task or ("hold" if control else "free motion")
     try:
         with progress_bar("simulating") as progress:
@@ -123,9 +119,14 @@ def simulate(
     print(f"\nwritten to {out}; see it with: crane view {out}")
 
 
-def _control(
+def control_of(
     machine: "Machine", task: str | None, name: str | None
 ) -> "Controller | Command | None":
+    """What drives a machine along a task, by a controller's name; see `simulate`.
+
+    Raises:
+        InputError: There is no such task or controller.
+    """
     from crane.control import controller, joystick, usual
     from crane.motion.trajectories import point_to_point, task_trajectory
 
@@ -143,6 +144,20 @@ def _control(
             raise InputError(f"task '{task}' moves levers, leave --controller out")
         return joystick(machine, task)
     return controller(name or usual(machine), machine, task_trajectory(machine, task))
+
+
+def duration_of(machine: "Machine", task: str | None, duration: float | None) -> float:
+    """How long a simulation takes [s].
+
+    Raises:
+        InputError: Nothing tells.
+    """
+    if duration is not None:
+        return duration
+    if task is None:
+        tasks = ", ".join(machine.tasks) or "none"
+        raise InputError(f"no task: name a --task ({tasks}), or a --duration to let it go")
+    return machine.tasks[task].duration
 
 
 def _replay(

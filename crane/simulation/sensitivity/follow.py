@@ -290,10 +290,12 @@ class _Follower:
         self._scale = np.maximum(self._scale, np.abs(every).max(axis=0))
         if not depth:
             return every, seen
-        curve = bent(both)
-        error = np.abs(curve[..., :m] @ every[:-1] + curve[..., m:])
-        error = error * nodes.lengths[:, None, None]
-        rough = np.flatnonzero((error > self._accuracy * self._scale).any(axis=(1, 2)))
+        rough = np.arange(len(phi))
+        if len(phi) > 1:
+            curve = bent(both)
+            error = np.abs(curve[..., :m] @ every[:-1] + curve[..., m:])
+            error = error * nodes.lengths[:, None, None]
+            rough = np.flatnonzero((error > self._accuracy * self._scale).any(axis=(1, 2)))
         for i in rough.tolist():
             begins, ends = nodes.times[2 * i], nodes.times[2 * i + 2]
             finer = self._simulated(nodes.states[2 * i], begins, ends, nodes.states[2 * i + 2])

@@ -10,12 +10,22 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, known
 from crane.common.samples import Array
+from crane.common.units import reading
 from crane.control import Command, Controller, TracedController, ValveDrive, reference_of
+from crane.description.sensors import (
+    FORCE,
+    FORCE_UNITS,
+    INCLINATION,
+    VELOCITY,
+    VELOCITY_UNITS,
+)
 from crane.dynamics import Dynamics
 from crane.dynamics.named import SMALL, Named
 from crane.formats import load
 from crane.machine import Machine
-from crane.recordings.recording import VELOCITY, Recording
+from crane.recordings import timeseries
+from crane.recordings.recording import Recording
+from crane.recordings.timeseries import Table
 from crane.simulation.recorded import recorded
 from crane.simulation.run import Force, Progress, as_controller, count_steps, start_of
 from crane.simulation.sensitivity.follow import Motion, follow
@@ -23,6 +33,7 @@ from crane.simulation.sensitivity.setup import Setup, setup_of
 from crane.simulation.sensitivity.tangent import frames_of
 
 START = "start."
+NOTHING = 1e-9  # of an output, in the unit that it is read in
 _NUDGE = 1e-4  # rad, machine's size, per `Closure.pace`, of starts
 _CENTRAL = ((1, 8.0 / 12.0), (-1, -8.0 / 12.0), (2, -1.0 / 12.0), (-2, 1.0 / 12.0))
 
@@ -61,15 +72,52 @@ class Sensitivities:
         found: Array = self.slopes[:, self.outputs.index(output), self.by.index(by)]
         return found
 
-    def to_markdown(self, share: float = 0.01) -> str:
-        """What a change of each number by a share does to each output, root mean square."""
-        head = ["number", "value", *self.outputs]
-        lines = [" | ".join(["", *head, ""]).strip(), "|---|" + "---:|" * (len(head) - 1)]
-        sizes = np.sqrt(np.mean(self.slopes**2, axis=0)).T * np.abs(self.values[:, None]) * share
-        for name, value, row in zip(self.by, self.values, sizes, strict=True):
-            cells = [name, f"{value:.6g}", *(f"{x:.3g}" for x in row)]
-            lines.append(f"| {' | '.join(cells)} |")
-        return "\n".join(lines) + "\n"
+    @property
+    def changes(self) -> Array:
+        """(p,) small changes of the numbers: a hundredth, or a thousandth [SI] of starts and 0."""
+        numbers = [not name.startswith(START) for name in self.by]
+        small: Array = np.where(numbers & (self.values != 0), 0.01 * np.abs(self.values), 1e-3)
+        return small
+
+    def unit(self, output: str) -> str:
+        """SI unit of an output."""
+        units = self.recording.units | self.recording.channel_units
+        if output in units:
+            return units[output]
+        if output.startswith(INCLINATION):
+            return "rad/s" if output.endswith(VELOCITY) else "rad"
+        for end, kinds in ((VELOCITY, VELOCITY_UNITS), (FORCE, FORCE_UNITS)):
+            if (joint := output.removesuffix(end)) != output and joint in units:
+                return kinds[units[joint]]
+        return ""
+
+    def to_text(self) -> str:
+        """A table, Markdown: what a small change of each number does to each output."""
+        effects = self.slopes * self.changes
+        units = [
+            reading(self.unit(output), float(np.abs(effects[:, k]).max()))
+            for k, output in enumerate(self.outputs)
+        ]
+        head = [f"{x} [{unit}]" for x, (unit, _) in zip(self.outputs, units, strict=True)]
+        lines = [f"| number | value | more by | {' | '.join(head)} |"]
+        lines += ["| --- | ---: | ---: |" + " ---: |" * len(head)]
+        for i, (name, value) in enumerate(zip(self.by, self.values, strict=True)):
+            sizes = np.sqrt(np.mean(effects[:, :, i] ** 2, axis=0))
+            shown = [scale * x for x, (_, scale) in zip(sizes, units, strict=True)]
+            cells = [f"{x:.3g}" if x > NOTHING else "0" for x in shown]
+            lines.append(f"| {name} | {value:.6g} | {self.changes[i]:.3g} | {' | '.join(cells)} |")
+        return "\n".join([*lines, "", "Root mean square of the change over the motion."])
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write all derivatives over time, a column "OUTPUT by NUMBER" each.
+
+        Raises:
+            OutputError: It cannot be written.
+        """
+        names = [f"{output} by {name}" for output in self.outputs for name in self.by]
+        values = np.column_stack([self.recording.time, self.slopes.reshape(len(self.slopes), -1)])
+        units = {"time": "s"} | dict.fromkeys(names, "")
+        timeseries.write(path, Table(units, values, {"machine": self.recording.machine}))
 
 
 def sensitivities(

@@ -40,11 +40,9 @@ def steps(by_state: Array, by_number: Array, lengths: Array) -> tuple[Array, Arr
 def bent(values: Array) -> Array:
     """By step, what a parabola through its three nodes leaves out of its mean, and more.
 
-    Fourth differences over 15, of values (2 n + 1, .) at the nodes; infinite of a single step.
+    Fourth differences over 15, of values (2 n + 1, .) at the nodes of at least two steps.
     """
     count = len(values) // 2
-    if count < 2:
-        return np.full((count, *values.shape[1:]), np.inf)
     at = np.clip(2 * np.arange(count) + 1, 2, len(values) - 3)
     weights = ((-2, 1.0), (-1, -4.0), (0, 6.0), (1, -4.0), (2, 1.0))
     out: Array = sum((weight * values[at + i] for i, weight in weights), np.zeros(())) / 15.0
