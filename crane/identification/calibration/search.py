@@ -1,0 +1,267 @@
+"""The search for a calibration: Levenberg and Marquardt's method within bounds."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from crane.common.errors import CraneError
+from crane.common.samples import Array
+from crane.identification.calibration.lacking import Lacking, lacking
+from crane.identification.calibration.problem import Case, Problem, noise_of
+from crane.identification.calibration.unknowns import Unknown
+
+Progress = Callable[[float], None]
+
+_ROUNDS = 3  # of weights
+# shares of the smoothing of friction that is gone on with, and of that of derivatives
+_SHARPER = ((0.3, 0.3), (0.1, 0.1), (0.0, 0.3), (0.0, 0.03))
+_TOLD = 0.1  # of derivatives that tell how well all is known
+_STEPS = 40  # of Gauss-Newton between them
+_SETTLED, _BEGUN = 1e-4, 1e-2  # change of the cost, as a share, that ends them
+_EXACT, _NOTHING = 1e-6, 1e-9  # of a channel's largest value, and of one that is zero [SI]
+_FLOOR = 0.2  # of a channel's variation, that no channel may be off by for nothing
+_GROWN, _SHRUNK, _STIFFEST = 10.0, 0.2, 1e8  # of Levenberg's damping
+_BLOCKS = 8, 40  # least and most blocks of a covariance
+
+
+class Search:
+    """Levenberg and Marquardt's method within bounds, and the channels' weights.
+
+    Attributes:
+        sizes: (k,) by sensor, what is left of its channel.
+        jacobian: (M, p) weighted derivatives at the end, of what is fitted.
+        residual: (M,) weighted, likewise.
+        blocks: (M,) block of each row.
+    """
+
+    def __init__(self, problem: Problem, progress: Progress | None):
+        self._problem, self._progress = problem, progress
+        unknowns = problem.unknowns
+        rest = problem.size - len(unknowns)
+        self.low = np.array([(x.low - x.start) / x.scale for x in unknowns] + [-np.inf] * rest)
+        self.high = np.array([(x.high - x.start) / x.scale for x in unknowns] + [np.inf] * rest)
+        self.prior = np.array([0.0] * len(unknowns) + [1.0] * rest)
+        self._stage = max((x.stage for x in unknowns), default=0)
+        self.sizes: dict[str, float] = {}
+        self.jacobian = self.residual = self.blocks = np.zeros(0)
+        self._done = 0
+
+    def run(self) -> Array:
+        """The unknowns."""
+        problem = self._problem
+        noise = self._noise()
+        spread = self._spread()
+        most = {name: max(noise[name], _FLOOR * spread[name]) for name in noise}
+        self.sizes = dict(most)
+        z = np.zeros(problem.size)
+        sticks = any(law.sticks for law in problem.machine.friction.values())
+        problem.smooth = float(sticks)
+        z = self._begun(z)
+        for i in range(_ROUNDS):
+            z = self._minimum(z)
+            left = self._left([problem.residuals(case, z) for case in self._trained])
+            fresh = {name: min(max(noise[name], left[name]), most[name]) for name in left}
+            moved = max(abs(np.log(fresh[name] / self.sizes[name])) for name in fresh)
+            self.sizes = fresh
+            if moved < 0.05 and (i or not sticks):
+                break
+        for problem.smooth, problem.slopes in _SHARPER if sticks else ():
+            z = self._minimum(z)
+        problem.slopes = _TOLD
+        self._linearize(z)
+        if self._progress is not None:
+            self._progress(1.0)
+        return z
+
+    def _begun(self, z: Array) -> Array:
+        """The better one of two minima: of all numbers at once, and of stage after stage.
+
+        Where something rings, one phase more or less is a minimum, too.
+        """
+        stages = sorted({x.stage for x in self._problem.unknowns})
+        found = [self._minimum(z, _BEGUN)]
+        if len(stages) > 1:
+            for self._stage in stages:
+                z = self._minimum(z, _BEGUN)
+            found.append(z)
+        return min(found, key=self._cost)
+
+    @property
+    def _trained(self) -> list[Case]:
+        return [case for case in self._problem.cases if case.train.any()]
+
+    def _noise(self) -> dict[str, float]:
+        """Of each channel, by its third differences, and no less than its digits."""
+        found: dict[str, list[float]] = {}
+        largest: dict[str, float] = {}
+        for case in self._trained:
+            for name, x in zip(case.sensors, case.measured.T, strict=True):
+                said = case.known[name].noise if name in case.known else 0.0
+                found.setdefault(name, []).append((said or noise_of(x)) ** 2)
+                largest[name] = max(largest.get(name, 0.0), float(np.abs(x).max()))
+        return {
+            name: max(float(np.sqrt(np.mean(x))), _EXACT * largest[name], _NOTHING)
+            for name, x in found.items()
+        }
+
+    def _spread(self) -> dict[str, float]:
+        found: dict[str, list[Array]] = {}
+        for case in self._trained:
+            for name, x in zip(case.sensors, case.measured[case.train].T, strict=True):
+                found.setdefault(name, []).append(x - x.mean())
+        return {name: max(float(np.std(np.concatenate(x))), 1e-12) for name, x in found.items()}
+
+    def _left(self, residuals: list[Array]) -> dict[str, float]:
+        """Root mean square of each channel over what is fitted."""
+        found: dict[str, list[Array]] = {}
+        for case, residual in zip(self._trained, residuals, strict=True):
+            for name, x in zip(case.sensors, residual[case.train].T, strict=True):
+                found.setdefault(name, []).append(x)
+        return {
+            name: max(float(np.sqrt(np.mean(np.concatenate(x) ** 2))), _NOTHING)
+            for name, x in found.items()
+        }
+
+    def _weights(self, case: Case) -> Array:
+        """(N, k) one over the channels' sizes, 0 of what is held out."""
+        return case.train[:, None] / np.array([self.sizes[name] for name in case.sensors])
+
+    def _cost(self, z: Array) -> float:
+        """Half the sum of squares, infinite where the machine cannot be."""
+        total = float(np.sum((self.prior * z) ** 2))
+        for case in self._trained:
+            try:
+                left = self._problem.residuals(case, z, fitted=True) * self._weights(case)
+            except CraneError:
+                return np.inf
+            total += float(np.sum(left**2))
+        return 0.5 * total
+
+    def _linearize(self, z: Array) -> None:
+        rows, left, blocks = [], [], []
+        for number, case in enumerate(self._trained):
+            fixed = {i for i, x in enumerate(self._problem.unknowns) if x.stage > self._stage}
+            residual, slopes = self._problem.linearized(case, z, fixed)
+            weights = self._weights(case)
+            some = case.train
+            rows.append((slopes * weights[:, :, None])[some].reshape(-1, self._problem.size))
+            left.append((residual * weights)[some].ravel())
+            time = np.repeat(case.inputs.time[some], len(case.sensors))
+            blocks.append(time + 1e9 * number)
+        self.jacobian, self.residual = np.vstack(rows), np.concatenate(left)
+        self.blocks = np.concatenate(blocks)
+
+    def lacking(self, others: Sequence[Unknown], z: Array) -> list[Lacking]:
+        """Numbers that are not fitted and would help, see `Lacking`."""
+        problem = self._problem
+        if not others:
+            return []
+        whole = Problem(problem.machine, [*problem.unknowns, *others], problem.cases)
+        count, more = len(problem.unknowns), len(others)
+        there = np.concatenate([z[:count], np.zeros(more), z[count:]])
+        rows = []
+        for case in self._trained:
+            wider = next(x for x in whole.cases if x.name == case.name)
+            _, slopes = whole.linearized(wider, there, set(range(count)))
+            own = (slopes * self._weights(case)[:, :, None])[case.train]
+            rows.append(own.reshape(-1, whole.size)[:, count : count + more])
+        return lacking(others, self.jacobian, np.vstack(rows), self.residual, self.prior)
+
+    def _minimum(self, z: Array, settled: float = _SETTLED) -> Array:
+        """The nearest minimum for the present weights."""
+        damping, cost = 1e-3, self._cost(z)
+        if not np.isfinite(cost):  # say why
+            for case in self._trained:
+                self._problem.residuals(case, z)
+        for _ in range(_STEPS):
+            self._linearize(z)
+            hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
+            gradient = self.jacobian.T @ self.residual + self.prior**2 * z
+            before = cost
+            while True:
+                there = self._step(z, hessian, gradient, damping)
+                new = self._cost(there)
+                self._report()
+                if new < cost:
+                    z, cost, damping = there, new, max(damping * _SHRUNK, 1e-9)
+                    break
+                damping *= _GROWN
+                if damping > _STIFFEST:
+                    return z
+            if before - cost < settled * before:
+                break
+        return z
+
+    def _step(self, z: Array, hessian: Array, gradient: Array, damping: float) -> Array:
+        """A damped step, of which what would leave its bounds stays on them."""
+        size = np.diag(hessian)
+        scaled = hessian + damping * np.diag(np.maximum(size, 1e-12 * size.max()))
+        free = np.ones(len(z), dtype=bool)
+        step = np.zeros(len(z))
+        for _ in range(len(z)):
+            at = np.flatnonzero(free)
+            right = -gradient[at] - scaled[np.ix_(at, ~free)] @ step[~free]
+            step[at] = np.linalg.lstsq(scaled[np.ix_(at, at)], right, rcond=1e-12)[0]
+            there = z + step
+            out = free & ((there < self.low) | (there > self.high))
+            if not out.any():
+                break
+            step[out] = np.clip(there, self.low, self.high)[out] - z[out]
+            free &= ~out
+        return np.clip(z + step, self.low, self.high)
+
+    def _report(self) -> None:
+        self._done += 1
+        if self._progress is not None:
+            self._progress(1.0 - 0.97**self._done)
+
+    def covariance(self, z: Array) -> tuple[Array, int]:
+        """(p, p) of the unknowns in their scales, and the number of blocks.
+
+        H^-1 (sum_b g_b g_b^T) H^-1 with g_b the gradient of a block, and at least that of white
+        noise; as if there were no bounds.
+        """
+        hessian = self.jacobian.T @ self.jacobian + np.diag(self.prior**2)
+        inverse = np.linalg.pinv(hessian, rcond=1e-13, hermitian=True)
+        length, count = self._length()
+        numbers = np.unique(np.floor(self.blocks / length), return_inverse=True)[1]
+        weighed = self.jacobian * self.residual[:, None]
+        sums = np.zeros((numbers.max() + 1, len(z)))
+        np.add.at(sums, numbers, weighed)
+        count = len(sums)
+        meat = sums.T @ sums * (count / max(count - 1, 1)) + np.diag(self.prior**2)
+        robust = inverse @ meat @ inverse
+        freedom = max(len(self.residual) - len(z), 1)
+        white = inverse * float(self.residual @ self.residual) / freedom
+        more = np.sqrt(np.maximum(np.diag(white) / np.maximum(np.diag(robust), 1e-300), 1.0))
+        return robust * np.outer(more, more), count
+
+    def _length(self) -> tuple[float, int]:
+        """Of a block [s]: four times over which what is left remembers itself."""
+        longest, whole = 0.0, 0.0
+        for case in self._trained:
+            time = case.inputs.time[case.train]
+            whole += float(time[-1] - time[0])
+        start = 0
+        for case in self._trained:
+            k, count = len(case.sensors), int(case.train.sum())
+            rows = self.residual[start : start + k * count].reshape(count, k)
+            start += k * count
+            step = float(np.median(np.diff(case.inputs.time)))
+            for x in rows.T:
+                longest = max(longest, step * _memory(x))
+        length = min(max(4.0 * longest, whole / _BLOCKS[1]), whole / _BLOCKS[0])
+        return max(length, 1e-9), int(whole / length) if length else 1
+
+
+def _memory(x: Array) -> float:
+    """Samples over which a sequence remembers itself: its integral correlation time."""
+    x = x - x.mean()
+    power = float(x @ x)
+    if not power:
+        return 0.0
+    size = 1 << (2 * len(x) - 1).bit_length()
+    spectrum = np.fft.rfft(x, size)
+    correlation = np.fft.irfft(spectrum * spectrum.conj(), size)[: len(x)] / power
+    negative = np.flatnonzero(correlation < 0.05)
+    return float(correlation[: negative[0] if len(negative) else len(x)].sum())
