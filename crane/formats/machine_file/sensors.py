@@ -21,7 +21,7 @@ def _sensor(name: str, item: Section, tree: TreeBuilder) -> Sensor:
     unit = unit_of(tree.tree, name)
     if unit is None:
         problem = f"'{name}' is no quantity of this machine, {known(quantities(tree.tree), name)}"
-        raise item.fail(None, problem)
+        raise tree.unknown(str(item.fail(None, problem)))
     given = item.text("unit", "")
     if given and given not in spellings(unit):
         problem = f"'{name}' is in [{given}], give {' or '.join(spellings(unit)) or 'no unit'}"

@@ -77,7 +77,7 @@ class TreeBuilder:
         if chain.parent is None:
             return
         if chain.parent not in self.links:
-            raise self._unknown(
+            raise self.unknown(
                 f"{chain.where}: chain '{chain.name}' hangs from '{chain.parent}', no frame "
                 f"of an earlier chain, {known(self.links, chain.parent)}"
             )
@@ -87,7 +87,7 @@ class TreeBuilder:
         self._enter(joint)
         self._body[urdf.root] = self._body.get(chain.parent, urdf.root)
 
-    def _unknown(self, message: str) -> CraneError:
+    def unknown(self, message: str) -> CraneError:
         """The error about a name that is not there, unless a chain is not, either."""
         return DescriptionError(message) if self.complete else FollowUpError(message)
 
@@ -108,12 +108,12 @@ class TreeBuilder:
         if joint in self._every:
             problem = f"{where}: joint '{joint}' is fixed, name a moving one"
             raise DescriptionError(problem) if self.joints else FollowUpError(problem)
-        raise self._unknown(f"{where}: joint '{joint}' is unknown, {known(self.joints, joint)}")
+        raise self.unknown(f"{where}: joint '{joint}' is unknown, {known(self.joints, joint)}")
 
     def check_link(self, link: str, where: str, what: str) -> None:
         """Raise for a link that does not exist, called `what`."""
         if link not in self.links:
-            raise self._unknown(f"{where}: {what} '{link}' is unknown, {known(self.links, link)}")
+            raise self.unknown(f"{where}: {what} '{link}' is unknown, {known(self.links, link)}")
 
     def joint(self, section: Section) -> str:
         """The joint that a section names."""

@@ -28,7 +28,7 @@ from crane.simulation.sensitivity.tangent import frames_of
 _NUDGE = 1e-5  # of an unknown's scale, for differences of the numbers of a simulation
 _FEWEST = 20  # instants of a recording
 _SMOOTH = {"rad": 5e-3, "m": 2e-3}  # [rad/s], [m/s] over which friction changes its sign
-_SHARPEST, _FINEST = 1e-2, 5e-3  # [s] of a step of a simulation, and with derivatives, at most
+_SHARPEST, _FINEST = 1e-2, 2e-3  # [s] of a step of a simulation, and with derivatives, at most
 _ROUGH = 1e-4  # error of derivatives
 # What starts may be off by, one standard deviation, where nothing measures them: rad, m, rates.
 _PLACE, _PACE = {"rad": 5e-3, "m": 5e-3}, {"rad": 0.01, "m": 5e-3}
