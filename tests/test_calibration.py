@@ -225,11 +225,12 @@ inclination_tilt_boom [deg] = z2_deg
         "cylinder.X_*.leakage_*": (1.0, 0.0, 3.0), "friction.X_lift.coulomb": (210.0, 0.0, 3000.0),
         "cylinder.X_lift.gas_b": (1e-4, 0.0, 3e-3), "sensor.inclination_lift_boom.zero": None,
         "sensor.inclination_tilt_boom.zero": None, "sensor.pressure_X_lift_b.zero": None,
+        "lift_boom_rod.x": None,
     }  # fmt: skip
     found = quiet(crane.calibrate, machine, LIFTING, fit, columns=columns, train=(0.0, 10.0))
     left = {sensor.name: sensor for sensor in found.sensors}
     for name, fitted, held_out in (
-        ("X_lift", 2e-3, 5.5e-3), ("pressure_X_lift_a", 0.75e5, 0.8e5),
+        ("X_lift", 1.1e-3, 3e-3), ("pressure_X_lift_a", 0.63e5, 0.8e5),
         ("pressure_X_lift_b", 0.3e5, 1.0e5), ("pressure_X_tilt_a", 0.3e5, 0.6e5),
         ("pressure_X_tilt_b", 0.3e5, 0.6e5), ("inclination_tilt_boom", 6e-3, 8e-3),
     ):  # fmt: skip
