@@ -264,6 +264,7 @@ def test_numbers_keep_their_sign():
     assert (pin.low, pin.high) == (-np.inf, np.inf)
 
 
+@pytest.mark.slow
 def test_recordings_that_are_held_out_whole_and_several_that_are_fitted(tmp_path):
     machine = simple(tmp_path)
     paths = [recorded(machine, tmp_path / f"run{seed}.csv", 40 + seed) for seed in range(3)]
@@ -350,6 +351,7 @@ def test_a_sensor_that_is_said_to_be_noisy_hardly_counts(fitted):
     assert wide > 5 * narrow
 
 
+@pytest.mark.slow
 def test_what_a_model_lacks_is_named_with_how_much_of_it(tmp_path):
     """Air in a chamber that nobody asked for; without it nothing is missed."""
     machine, gas = simple(tmp_path), 2e-5
