@@ -68,7 +68,7 @@ def test_what_neither_prior_nor_motion_tells_is_named(four_bar, one_way):
         ((1, 2, 3), False, "the prior is no pair, give means"),
         ({"crank_arm": 0.1}, False, "prior 'crank_arm' is 0.1, of bodies give a share of mass and "
          "size, as 10 %, or name one of their parameters, such as crank_arm.m"),
-        ({"crank.viscous": "0 %"}, False, "'0 %' says no standard deviation above 0, write 50"),
+        ({"crank.viscous": "0 %"}, False, "'0 %' says no standard deviation of 1e-12 or more"),
         ({"crank.viscuos": 1}, False, "prior 'crank.viscuos' is unknown, did you mean"),
         (-1.0, False, "the prior's relative standard deviation is -1.0, give a number above"),
     ],

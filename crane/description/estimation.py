@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from crane.common.errors import InputError
 
 Numbers = tuple[float, ...]
+_SUREST = 1e-12  # least deviation, which weights can still be made of
+_SHARES = 1e-7, 1e6  # of those that are relative
 
 
 @dataclass(frozen=True)
@@ -23,12 +25,20 @@ class Known:
     relative: bool = False
     mean: float | None = None
 
+    def __post_init__(self) -> None:
+        least, most = _SHARES if self.relative else (_SUREST, math.inf)
+        if not least <= self.std < most:
+            raise InputError(
+                f"a standard deviation of {self.std:g} is none to estimate with, give {least:g} "
+                f"or more{' as a share' if self.relative else ''}"
+            )
+
     @classmethod
     def read(cls, given: object) -> "Known":
         """From a number, or "50", "10 %", "609 +- 60", "609 +- 10 %".
 
         Raises:
-            InputError: It is none of these, or the deviation is not above zero.
+            InputError: It is none of these, or the deviation is next to nothing.
         """
         text = str(given)
         mean, sign, std = text.rpartition("+-")
@@ -38,10 +48,10 @@ class Known:
             centre = float(mean) if sign else None
         except ValueError:
             value, share, centre = math.nan, False, None
-        if not (0 < value < math.inf) or not math.isfinite(centre or 0.0):
+        if not (_SUREST <= value < math.inf) or not math.isfinite(centre or 0.0):
             raise InputError(
-                f"'{text}' says no standard deviation above 0, write 50, 10 %, 609 +- 60 or "
-                "609 +- 10 %"
+                f"'{text}' says no standard deviation of {_SUREST:g} or more, write 50, 10 %, "
+                "609 +- 60 or 609 +- 10 %"
             )
         return cls(value, share, centre)
 
