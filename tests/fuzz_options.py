@@ -105,6 +105,10 @@ CALLS = {
         "rig.yaml --task lift --step 0.01 --out {out}",
         "rig.yaml --inputs valves.csv --out {out}",
     ],
+    "sensitivities": [
+        "slider.yaml --task swing --duration 0.1 --by crank.mass --out {out}",
+        "rig.yaml --duration 0.1 --by load_x.mass --by start.x",
+    ],
     "workspace": ["slider.yaml --samples 100 --out {out}", "rig.yaml --samples 100 --out {out}"],
 }
 # Calls that once ended in a traceback, in silence or never.
