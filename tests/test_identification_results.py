@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 import crane
 from crane import cli
 from crane.cli.runs import read_run
-from crane.common.errors import InputError, OutputError, RecordingError
+from crane.common.errors import CraneWarning, InputError, OutputError, RecordingError
 from crane.identification.mechanics.division import divided
 from crane.identification.mechanics.friction import friction
 from crane.identification.mechanics.identify import identify
@@ -288,6 +288,23 @@ def test_the_intervals_of_a_load_cover_it(mini):
     assert "the mass may be zero" in bare.to_text()
 
 
+@pytest.mark.parametrize("way", [0.02, None])
+def test_a_load_that_lifts_is_refused(mini, way):
+    """Forces less by as much as a load adds: of all that moves, and of a lift."""
+    bare, loaded = (
+        motion(machine, 1) if way is None else one_way(machine, way)
+        for machine in (mini, mini.with_payload(LOAD))
+    )
+    given = dataclasses.replace(bare, tau=2 * bare.tau - loaded.tau)
+    with pytest.raises(RecordingError) as caught:
+        identify_payload(mini, given)
+    text = str(caught.value)
+    assert re.match(r"the mass comes out as -0\.2\d* to -0\.[12]\d* kg, and no load weighs", text)
+    assert "look at signs and units of forces" in text and "trust it (trust)" in text
+    with pytest.warns(CraneWarning, match="no load weighs less than nothing"):
+        assert identify_payload(mini, given, trust=True).mass < 0
+
+
 def test_what_a_motion_does_not_tell_of_a_load(mini):
     """Without slewing, nothing at right angles to the crane's plane."""
     estimate = identify_payload(mini, motion(mini.with_payload(LOAD), still=[0]))
@@ -396,6 +413,9 @@ def test_a_lift_that_was_recorded_is_weighed():
     mass, band = estimate.static
     assert low < 211.4 < high and low < mass < high and high - low < 250
     assert np.isnan(estimate.com).all() and estimate.friction == {}
+    # in the first seconds weights that are not as described count for more than the load
+    with pytest.raises(RecordingError, match="no load weighs less than nothing"):
+        identify_payload(machine, read_run(RAW, machine, COLUMNS, (0.0, 2.0)))
 
 
 def test_a_machine_that_is_not_as_described_widens_the_interval(mini):

@@ -14,6 +14,7 @@ from crane.identification.estimation.estimators import Estimate
 from crane.identification.estimation.regressor import triangular
 from crane.identification.mechanics.against import check_forces
 from crane.identification.mechanics.base import Base
+from crane.identification.mechanics.checks import doubt
 from crane.identification.mechanics.equations import Equations, Progress
 from crane.identification.mechanics.friction import friction
 from crane.identification.mechanics.identify import METHODS, equations_of, in_parts
@@ -76,7 +77,7 @@ def identify_payload(
     Raises:
         InputError: An unknown frame or method, or one that does not move.
         RecordingError: A recording that cannot serve, or does not tell the mass, or not even to a
-            tenth of the machine's own and to itself.
+            tenth of the machine's own and to itself; or a mass that is surely negative.
 
     Source: Efron, Stein 1981, Annals of Statistics 9(3), the jackknife.
     """
@@ -100,12 +101,14 @@ def identify_payload(
             low, high = first.interval()[0].tolist()
             told = not low <= 0 <= high
             com = np.nan_to_num(first.com)
+            _check_mass(first, trust)
             return replace(first, static=case.static(first.friction, com) if told else None)
     except _NotToldError as error:
         why = str(error)
     point = case.point(progress)
     if point is None or case.vague(point):
         _refuse(one_way, first or point, why, case.static({}, np.zeros(3)))
+    _check_mass(point, trust)
     return point
 
 
@@ -259,6 +262,22 @@ def _widened(
     scale = np.sqrt(np.maximum(more, 1.0))
     freedom = np.where(more > 1, _SEGMENTS - 1, found.freedom)
     return covariance * np.outer(scale, scale), freedom
+
+
+def _check_mass(estimate: PayloadEstimate, trust: bool) -> None:
+    """Doubt a mass whose whole interval is negative: something else is wrong.
+
+    Raises:
+        RecordingError: It is not trusted.
+    """
+    low, high = estimate.interval()[0].tolist()
+    if high < 0:
+        text = (
+            f"the mass comes out as {low:.3g} to {high:.3g} kg, and no load weighs less than "
+            "nothing: look at signs and units of forces or pressures, and identify the machine "
+            "without a load first"
+        )
+        doubt(text, trust)
 
 
 def _refuse(
