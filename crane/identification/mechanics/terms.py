@@ -5,10 +5,12 @@ with together, each with its factor (q5+q6, q6+0.5*q5); KIND one of `KINDS`.
 """
 
 import fnmatch
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 from crane.common.errors import InputError, known
+from crane.common.samples import as_number
 from crane.description.estimation import Numbers
 from crane.identification.mechanics.friction import Presliding, RestMemory, friction, root
 from crane.identification.mechanics.inertias import Inertial, RotorInertia
@@ -56,17 +58,21 @@ def terms_of(machine: Machine, changes: Changes) -> list[Term]:
         changes: As in a machine file under `identification`, `terms`: later ones win.
 
     Raises:
-        InputError: A name that nothing has, or numbers that do not fit.
+        InputError: A name that nothing has, or numbers that do not fit or are not above 0.
     """
     wanted, asked = _default(machine), set()
     for name, numbers in (*machine.estimation.terms.items(), *changes.items()):
         where, _, kind = name.rpartition(".")
-        if not where or kind not in KINDS:
+        if kind not in KINDS:
             raise InputError(f"term '{name}': '{kind}' is unknown, {known(KINDS, kind)}")
+        if not where:
+            raise InputError(f"term '{name}' does not say of what, write q1.{kind} or q*.{kind}")
         low, high = KINDS[kind].count
         if numbers is not None and not low <= len(numbers) <= high:
             wants = f"give {KINDS[kind].numbers}" if high else "it takes none"
             raise InputError(f"term '{name}' has {len(numbers)} numbers, {wants}")
+        for number in numbers or ():
+            as_number(number, f"a number of term '{name}'", "", above=0)
         for place in _places(machine, where, kind):
             kinds = wanted.setdefault(place, {})
             if numbers is None:
@@ -85,17 +91,22 @@ def combined(name: str) -> Direction | None:
     """The direction of joints that a motor turns with together, None of a single name.
 
     Raises:
-        InputError: A factor that is no number.
+        InputError: A factor that is no number or 0, or a joint twice.
     """
     if "+" not in name:
         return None
-    factors = {}
+    factors: dict[str, float] = {}
     for part in name.split("+"):
-        factor, star, joint = part.rpartition("*")
+        factor, star, joint = (word.strip() for word in part.rpartition("*"))
         try:
-            factors[joint.strip()] = float(factor) if star else 1.0
+            share = float(factor) if star else 1.0
         except ValueError:
-            raise InputError(f"'{name}': '{factor}' is no factor, write q5+0.5*q6") from None
+            share = 0.0
+        if not share or not math.isfinite(share):
+            raise InputError(f"'{name}': '{factor}' is no factor, write q5+0.5*q6")
+        if joint in factors:
+            raise InputError(f"'{name}' names '{joint}' twice, give it once with its factor")
+        factors[joint] = share
     return Direction(name, factors)
 
 
