@@ -16,6 +16,7 @@ from crane.formats import write_machine
 from crane.identification.mechanics.cross_validation import (
     FOLDS,
     cross_validate,
+    settings_of,
     trials_text,
 )
 from crane.identification.mechanics.friction import Presliding, RestMemory, friction, root
@@ -314,6 +315,58 @@ def test_the_prior_that_predicts_is_chosen(arm):
     few = {name: getattr(given, name)[:200] for name in ("time", "q", "v", "a", "tau")}
     with pytest.raises(InputError, match="200 samples are too few for 5 parts, give at least 250"):
         cross_validate(arm, Motion(**few), {"bandwidth": [5.0]})
+
+
+@pytest.mark.parametrize(
+    ("tried", "options", "message"),
+    [
+        ({"link9": ["1 %"]}, {}, "prior 'link9' is unknown, did you mean 'link"),
+        ({"bodies": ["1 %", "3"]}, {}, "prior 'bodies' is 3.0, of bodies give a share"),
+        ({"bandwidth": [np.nan, 5.0]}, {}, "the bandwidth is nan Hz, give a number above 0"),
+        ({"bandwidth": [5.0, -5.0]}, {}, "the bandwidth is -5.0 Hz, give a number above 0"),
+        ({"bandwidth": ["x"]}, {}, "bandwidth is 'x', give numbers in Hz"),
+        ({"bodies": ["1 %"]}, {"prior": (0, 1)}, "the prior is numbers of all parameters, give it"),
+        ({"bandwidth": [5.0]}, {"method": "x"}, "some part of the training is not told by the oth"),
+    ],
+)
+def test_what_cannot_be_tried(arm, tried, options, message):
+    """A name that nothing has is no setting that predicts badly."""
+    with pytest.raises(InputError) as caught:
+        cross_validate(arm, moved(arm), tried, **options)
+    assert str(caught.value).startswith(message)
+    assert "method" not in options or "(lastly: method 'x' is unknown" in str(caught.value)
+
+
+def test_a_part_at_rest_judges_nothing(arm):
+    """The others do."""
+    motion, rest = moved(arm), slice(640, 960)
+    held = {name: getattr(motion, name).copy() for name in ("time", "q", "v", "a", "tau")}
+    held["q"][rest] = held["q"][640]
+    held["v"][rest] = held["a"][rest] = 0.0
+    (trial,) = cross_validate(
+        arm, Motion(**held), {"bodies": ["1 %"]}, bandwidth=5.0, slow={"q*": 0.01}
+    )
+    assert np.isnan(trial.errors).tolist() == [False, False, True, False, False]
+    assert trial.mean < 0.1 and " - " in trials_text([trial])
+
+
+def test_a_share_of_everything_stands_beside_what_is_tried(arm):
+    (trial,) = cross_validate(arm, moved(arm), {"bodies": ["1 %"]}, prior=0.3, bandwidth=5.0)
+    assert trial.mean < 0.1
+    assert settings_of(trial, {"prior": 0.3})["prior"] == {
+        "*": Known(0.3, relative=True), "bodies": Known(0.01, relative=True)
+    }  # fmt: skip
+
+
+def test_what_is_given_counts_after_what_the_machine_file_says(arm):
+    """Also where both say something of the same name: the last that speaks counts."""
+    known = {"*": Known(0.3, relative=True), "bodies": Known(0.01, relative=True)}
+    told = arm.replace(estimation=Estimation(prior=known))
+    ours, plain = (
+        identify(machine, moved(arm), prior=prior, bandwidth=5.0).parameters
+        for machine, prior in ((told, 0.5), (arm, {"*": "50 %"}))
+    )
+    np.testing.assert_array_equal(ours, plain)
 
 
 def test_parts_are_predicted_by_the_others_alone(arm):

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from crane.common.errors import CraneError, CraneWarning, InputError
-from crane.common.samples import Array
+from crane.common.samples import Array, as_number
 from crane.identification.mechanics.equations import Equations, Progress
 from crane.identification.mechanics.identify import Recorded, identify, motions_of
+from crane.identification.mechanics.model import Model
+from crane.identification.mechanics.priors import by_name, stated
 from crane.identification.mechanics.result import aligned
 from crane.identification.signals.motion import Motion
 from crane.machine import Machine
@@ -27,8 +29,8 @@ class Trial:
 
     Attributes:
         settings: By name.
-        errors: (k,) norm of the residuals over that of the forces of each part left out; nan where
-            it cannot be identified without it.
+        errors: (k,) norm of the residuals over that of the forces of each part left out; infinite
+            where it cannot be identified without it, nan where nothing moves in it.
     """
 
     settings: Mapping[str, object]
@@ -36,9 +38,9 @@ class Trial:
 
     @property
     def mean(self) -> float:
-        """Root mean square of the errors, infinite where there is none."""
-        told = self.errors[np.isfinite(self.errors)]
-        return float(np.sqrt(np.mean(told**2))) if len(told) == len(self.errors) else np.inf
+        """Root mean square of the errors of parts that move."""
+        told = self.errors[~np.isnan(self.errors)]
+        return float(np.sqrt(np.mean(told**2))) if len(told) else np.inf
 
 
 def cross_validate(
@@ -63,7 +65,7 @@ def cross_validate(
         options: Of `identify`, the same for all.
 
     Raises:
-        InputError: Nothing is tried, or a recording is too short for its parts.
+        InputError: Nothing is tried or what cannot be, or a recording is too short for its parts.
         RecordingError: A recording cannot serve.
     """
     if not tried or not all(tried.values()):
@@ -74,17 +76,23 @@ def cross_validate(
             f"{shortest} samples are too few for {FOLDS} parts, give at least {FOLDS * _FEWEST}"
         )
     grid = [dict(zip(tried, values, strict=True)) for values in itertools.product(*tried.values())]
+    _check(machine, grid, options)
     lowest = _lowest(machine, tried, options)
-    trials: list[Trial] = []
+    trials, reason = list[Trial](), ""
     for done, settings in enumerate(grid):
-        errors = [_left_out(machine, motions, k, settings, lowest, options) for k in range(FOLDS)]
-        trials.append(Trial(settings, np.array(errors)))
+        errors = np.full(FOLDS, np.inf)
+        for k in range(FOLDS):
+            try:
+                errors[k] = _left_out(machine, motions, k, settings, lowest, options)
+            except CraneError as error:
+                reason = str(error)
+        trials.append(Trial(settings, errors))
         if progress is not None:
             progress((done + 1) / len(grid))
     if not np.isfinite(min(trial.mean for trial in trials)):
         raise InputError(
             "some part of the training is not told by the others whatever the settings, give a "
-            "prior, higher bandwidths or a longer recording"
+            f"prior, higher bandwidths or a longer recording (lastly: {reason})"
         )
     return sorted(trials, key=lambda trial: trial.mean)
 
@@ -94,9 +102,12 @@ def settings_of(trial: Trial, options: Mapping[str, Any]) -> dict[str, Any]:
     known_before = {name: what for name, what in trial.settings.items() if name != _BANDWIDTH}
     out = dict(options)
     if _BANDWIDTH in trial.settings:
-        out["bandwidth"] = float(str(trial.settings[_BANDWIDTH]))
+        out["bandwidth"] = _frequency(trial.settings[_BANDWIDTH])
     if known_before:
-        out["prior"] = dict(out.get("prior") or {}) | known_before
+        before = {} if (given := out.get("prior")) is None else given
+        if not isinstance(before, Mapping | int | float):
+            raise InputError("the prior is numbers of all parameters, give it by name to try some")
+        out["prior"] = by_name(before) | by_name(known_before)
     return out
 
 
@@ -105,9 +116,34 @@ def trials_text(trials: Sequence[Trial]) -> str:
     rows = [["settings", "error", "of the parts left out"]]
     for trial in trials:
         words = ", ".join(f"{name}={value}" for name, value in trial.settings.items())
-        each = " ".join(f"{100 * error:.2f}" for error in trial.errors)
+        each = " ".join("-" if np.isnan(x) else f"{100 * x:.2f}" for x in trial.errors)
         rows.append([words, f"{100 * trial.mean:.2f} %", each])
     return "\n".join(["cross-validation within the training", *aligned(rows, (0, 2))])
+
+
+def _check(
+    machine: Machine, grid: Sequence[Mapping[str, object]], options: Mapping[str, Any]
+) -> None:
+    """See that settings are such as an identification takes, whatever is recorded.
+
+    Raises:
+        InputError: One is not.
+    """
+    model = Model(machine, options.get("terms"))
+    for settings in grid:
+        for name, value in settings.items():
+            if name == _BANDWIDTH:
+                as_number(_frequency(value), "the bandwidth", "Hz", above=0)
+            else:
+                stated(model, by_name({name: value}), np.ones(len(model.names)))
+        settings_of(Trial(settings, np.empty(0)), options)
+
+
+def _frequency(value: object) -> float:
+    try:
+        return float(str(value))
+    except ValueError:
+        raise InputError(f"bandwidth is '{value}', give numbers in Hz") from None
 
 
 def _lowest(
@@ -115,10 +151,7 @@ def _lowest(
 ) -> float | None:
     """The bandwidth by which all are judged; None: that of the first identification."""
     if _BANDWIDTH in tried:
-        try:
-            return min(float(str(value)) for value in tried[_BANDWIDTH])
-        except ValueError:
-            raise InputError(f"bandwidth is {tried[_BANDWIDTH]}, give numbers in Hz") from None
+        return min(map(_frequency, tried[_BANDWIDTH]))
     return options.get("bandwidth") or machine.estimation.bandwidth
 
 
@@ -130,7 +163,11 @@ def _left_out(
     bandwidth: float | None,
     options: Mapping[str, Any],
 ) -> float:
-    """The error of one part of each motion by all the others."""
+    """The error of one part of each motion by all the others, nan where nothing moves in it.
+
+    Raises:
+        CraneError: They do not tell it.
+    """
     inside, outside = [], []
     for motion in motions:
         edges = np.linspace(0, len(motion.time), FOLDS + 1).astype(int)
@@ -144,14 +181,10 @@ def _left_out(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         trial = settings_of(Trial(settings, np.empty(0)), options)
-        try:
-            # of parts the checks know too little; the whole has passed, or will not
-            found = identify(machine, inside, **trial | {"trust": True})
-            cutoff = bandwidth or found.bandwidth
-            judge = Equations(found.model, found.base, outside, cutoff, found.slow)
-            return judge.compare(found.values).stacked
-        except CraneError:
-            return np.nan
+        # of parts the checks know too little; the whole has passed, or will not
+        found = identify(machine, inside, **trial | {"trust": True})
+        judge = Equations(found.model, found.base, outside, bandwidth or found.bandwidth, found.slow)
+        return judge.compare(found.values).stacked if judge.moving.any() else np.nan
 
 
 def _part(motion: Motion, part: slice) -> Motion:

@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, RecordingError, known
 from crane.common.samples import Array, as_number
-from crane.description.estimation import Known
 from crane.identification.estimation.estimators import (
     Prior,
     conditions,
@@ -27,7 +26,7 @@ from crane.identification.mechanics.equations import Equations, Progress
 from crane.identification.mechanics.laws import Frictional
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.possible import possible
-from crane.identification.mechanics.priors import check_told, checked, stated
+from crane.identification.mechanics.priors import by_name, check_told, checked, stated
 from crane.identification.mechanics.reading import smoothed_motion
 from crane.identification.mechanics.result import Identification
 from crane.identification.mechanics.term import Term
@@ -47,7 +46,6 @@ _KNOWN = 0.75  # of the frequency where a smoother passes half: there it passes 
 _TIMES = 3.0  # times the frequency below which 99 % of the velocities are, the filter's least
 _POWER = 0.99
 _FAST = 40.0  # times the frequency below which 99 % of the accelerations are
-_PRIORS = 1e-7, 1e6  # above and up to which a relative standard deviation lies
 _COMPARED = 50  # rows from which on forces are compared with the model's
 _SAMPLES = 500  # at which the speeds of joints are looked at
 _PART = 0.3  # of what is left to do that one pass over a recording is taken for
@@ -194,17 +192,12 @@ def _prior(
     feasible: bool,
 ) -> Prior | None:
     """Means and standard deviations (p,) of all parameters; None where nothing is known."""
-    if given is not None and not isinstance(given, Mapping | int | float):
-        return checked(model, base, given, feasible)
     known = dict(model.machine.estimation.prior)
-    if isinstance(given, Mapping):
-        known |= {
-            name: what if isinstance(what, Known) else Known.read(what)
-            for name, what in given.items()
-        }
-    elif given is not None:
-        share = as_number(given, "the prior's relative standard deviation", "", *_PRIORS)
-        known["*"] = Known(share, relative=True)
+    if given is not None:
+        if not isinstance(given, Mapping | int | float):
+            return checked(model, base, given, feasible)
+        told = by_name(given)  # after what the machine file says, also of the same name
+        known = {name: what for name, what in known.items() if name not in told} | told
     return stated(model, known, sizes) if known else None
 
 

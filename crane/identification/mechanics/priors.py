@@ -9,7 +9,7 @@ from scipy.linalg import qr
 
 from crane.common.errors import InputError
 from crane.common.errors import known as known_names
-from crane.common.samples import Array, as_sample
+from crane.common.samples import Array, as_number, as_sample
 from crane.description.estimation import Known
 from crane.identification.estimation.estimators import Prior
 from crane.identification.mechanics.base import Base
@@ -17,6 +17,22 @@ from crane.identification.mechanics.model import Model
 
 _DEPENDENT = 1e-10  # relative size of a pivot below which columns say the same
 _LISTED = 8
+_SHARES = 1e-7, 1e6  # above and up to which a relative standard deviation lies
+
+
+def by_name(given: float | Mapping[str, object]) -> dict[str, Known]:
+    """What is known by name: a share alone is one of everything.
+
+    Raises:
+        InputError: It is none that can be estimated with.
+    """
+    if isinstance(given, Mapping):
+        return {
+            name: what if isinstance(what, Known) else Known.read(what)
+            for name, what in given.items()
+        }
+    share = as_number(given, "the prior's relative standard deviation", "", *_SHARES)
+    return {"*": Known(share, relative=True)}
 
 
 def stated(model: Model, known: Mapping[str, Known], sizes: Array) -> Prior:
