@@ -9,7 +9,7 @@ import yaml
 from typed import typed
 
 import crane
-from crane.common.errors import CraneError, CraneWarning, InputError
+from crane.common.errors import CraneError, CraneWarning, InputError, RecordingError
 from crane.description import Friction
 from crane.description.estimation import Estimation, Known
 from crane.formats import write_machine
@@ -390,6 +390,22 @@ def test_two_recordings_teach_as_one(arm):
     assert (np.diff(both.training.time) > 0).all()
     np.testing.assert_allclose(both.training.modelled, both.validation.modelled, rtol=1e-12)
     assert both.validation.stacked < 1e-3
+
+
+def test_what_is_learned_does_not_judge_and_is_learned_once(arm):
+    """A part of a recording is the recording; other forces at the same times are not."""
+    one, other = moved(arm, seed=0), moved(arm, seed=1)
+    part = Motion(*(x[400:] for x in (one.time, one.q, one.v, one.a, one.tau)))
+    known = {"prior": {"bodies": "10 %"}, "bandwidth": 5.0}
+    with pytest.raises(RecordingError, match="100% of a recording's samples are in another one"):
+        identify(arm, [one, part], **known)
+    with pytest.raises(RecordingError, match="75% of a recording's samples are in another one"):
+        identify(arm, [part, one], **known)
+    with pytest.warns(CraneWarning, match="100% of a validation's samples were learned from: its"):
+        identify(arm, one, [other, part], **known)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", ".*learned from", CraneWarning)
+        identify(arm, one, other, **known)
 
 
 def test_a_body_without_mass_cannot_be_a_share_of_itself(tmp_path, arm):

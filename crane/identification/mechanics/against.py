@@ -1,5 +1,9 @@
-"""Recorded forces against a model's: wrong units, signs and delays, and fits that do not carry."""
+"""Recorded forces against a model's: wrong units, signs and delays, and fits that do not carry.
 
+And recordings against each other: what is learned twice, or judged by what was learned.
+"""
+
+import itertools
 import math
 import warnings
 from collections.abc import Sequence
@@ -11,11 +15,14 @@ from crane.common.samples import Array
 from crane.identification.mechanics.checks import delay, doubt, shifted
 from crane.identification.mechanics.result import ForceComparison
 from crane.identification.signals.motion import Motion, sampling
+from crane.recordings.recording import Recording
 
 _FACTOR = 30.0  # by which a force may be off from what the model says
 _SHAPE = 0.9  # correlation from which a model is believed on a factor
 _BLOCKS = 10  # of time, whose scatter is the standard error of that factor
 _WORSE = 4.0  # times the training's error, from which a validation is remarked on
+_SHARED = 0.2  # of a recording's samples, from which on it counts as part of another
+_LOOKED = 2000  # samples that are looked for
 _CERTAIN = 0.999  # probability of a delay that is told
 
 
@@ -115,6 +122,43 @@ def tell_validation(training: ForceComparison, validation: ForceComparison) -> N
             "the recordings do not belong together, or too little is told by the first one"
         )
         warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def tell_shared(
+    recordings: Sequence[Recording | Motion],
+    validation: Sequence[Recording | Motion],
+    trust: bool = False,
+) -> None:
+    """Refuse what is learned from twice, and warn of a validation that was learned from.
+
+    Raises:
+        RecordingError: Two of the recordings share instants and forces.
+    """
+    for one, other in itertools.combinations(recordings, 2):
+        if (share := _shared(one, other)) > _SHARED:
+            doubt(
+                f"{share:.0%} of a recording's samples are in another one as well: learned twice "
+                "they make intervals too narrow, give each once",
+                trust,
+            )
+    share = max((_shared(*pair) for pair in itertools.product(recordings, validation)), default=0)
+    if share > _SHARED:
+        text = (
+            f"{share:.0%} of a validation's samples were learned from: its errors say nothing of "
+            "other motions, give one that was not"
+        )
+        warnings.warn(text, CraneWarning, stacklevel=3)
+
+
+def _shared(one: Recording | Motion, other: Recording | Motion) -> float:
+    """Share of the other's samples that one has, at the same time and with the same forces."""
+    some = slice(None, None, max(1, len(other.time) // _LOOKED))
+    time, tau = other.time[some], other.tau[some]
+    if one.tau.shape[1] != tau.shape[1]:
+        return 0.0
+    at = np.minimum(np.searchsorted(one.time, time), len(one.time) - 1)
+    same = (one.time[at] == time) & (one.tau[at] == tau).all(axis=1)
+    return float(np.mean(same))
 
 
 def _scale(y: Array, x: Array, v: Array, a: Array) -> tuple[float, float, float]:

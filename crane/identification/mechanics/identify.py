@@ -17,7 +17,7 @@ from crane.identification.estimation.estimators import (
     least_squares,
     weighted,
 )
-from crane.identification.mechanics.against import check_forces, tell_delays, tell_validation
+from crane.identification.mechanics.against import check_forces, tell_delays, tell_shared, tell_validation
 from crane.identification.mechanics.base import Base, base_parameters
 from crane.identification.mechanics.checks import doubt
 from crane.identification.mechanics.delays import delays
@@ -109,6 +109,7 @@ def identify(
     if feasible and not model.bodies:
         raise InputError("the model has no bodies, so nothing has to be feasible")
     finished, progress = progress, in_parts(progress)
+    tell_shared(_several(recording), _several(validation), trust)
     motions = motions_of(machine, recording, trust, progress)
     rows, told = equations_of(model, motions, bandwidth, slow, progress)
     if model.bodies:
@@ -208,13 +209,19 @@ def motions_of(
     progress: Progress | None,
 ) -> list[Motion]:
     """Recordings with velocities and accelerations; motions as they are."""
-    several = [recorded] if isinstance(recorded, Recording | Motion) else list(recorded)
+    several = _several(recorded)
     if not several:
         raise InputError("no recording is given, give at least one")
     return [
         x if isinstance(x, Motion) else smoothed_motion(machine, x, trust=trust, progress=progress)
         for x in several
     ]
+
+
+def _several(recorded: Recorded | Sequence[Recorded] | None) -> list[Recorded]:
+    if recorded is None:
+        return []
+    return [recorded] if isinstance(recorded, Recording | Motion) else list(recorded)
 
 
 def _check_forces(model: Model, motions: Sequence[Motion], rows: Equations, trust: bool) -> None:
