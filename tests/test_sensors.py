@@ -381,6 +381,31 @@ def test_inclinometers_tell_the_posture(machine, motion, tmp_path, given):
     assert told(machine, tmp_path / "run.csv") == []
 
 
+def test_what_is_not_finite_is_named(machine, motion, tmp_path):
+    """By its column, also where another one is computed from it."""
+    columns, units = motion
+    boom = columns["inclination_lift_boom"].copy()
+    boom[5] = np.nan
+    names = ["time", "inclination_lift_boom", "inclination_tilt_boom", "X_lift_force"]
+    names += ["X_tilt_force", "X_lift", "X_tilt"]
+    for some in (names, names[:-2]):
+        held = {f"{x} [{units[x]}]": columns[x] for x in some} | {"inclination_lift_boom [rad]": boom}
+        np.savez(tmp_path / "run.npz", **held)
+        with pytest.raises(RecordingError, match="'inclination_lift_boom' is nan at sample 5"):
+            crane.read_measured(machine, tmp_path / "run.npz")
+
+
+def test_one_sample_is_compared_and_its_rates_are_not(machine, motion, tmp_path):
+    columns, units = motion
+    names = ["q2", "q2_velocity", "X_lift", "X_tilt", "time", "X_lift_force", "X_tilt_force"]
+    values = np.array([[columns[x][0] + 0.1 * x.startswith("q2") for x in names]])
+    timeseries.write(tmp_path / "run.csv", Table({x: units[x] for x in names}, values, {}))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        (line,) = told(machine, tmp_path / "run.csv")
+    assert "'q2' is +5.73 deg off" in line
+
+
 def test_inclinations_that_do_not_tell(machine, motion, tmp_path):
     """One for two freedoms, and one that no posture has."""
     columns, units = motion
@@ -485,6 +510,9 @@ def test_a_raw_log_is_read_by_the_sensors_of_its_machine(machine, tmp_path):
     path = crane.write_machine(machine.replace(sensors=known), tmp_path / "machine")
     with pytest.warns(CraneWarning, match="'spool_X_lift' \\(no 'spool'\\)"):
         one = read(LIFTING, crane.load(path))
+    del known["time"], known["spool_X_lift"]
+    with pytest.raises(RecordingError, match="yaml: does not say which column of .* is 'time', kn"):
+        read(LIFTING, machine.replace(sensors=known))
     two = read(LIFTING, machine, columns)
     assert one.units == two.units and np.array_equal(one.values, two.values)
     raw = timeseries.arrays(LIFTING)

@@ -110,7 +110,7 @@ class _Pair:
         reading, walk = column(postures.table, name), 0.0
         if self.rate:
             time = column(postures.table, TIME)
-            walk = _noise(reading) * float(np.sqrt((time[-1] - time[0]) * np.mean(np.diff(time))))
+            walk = _noise(reading) * float(time[-1] - time[0]) / float(np.sqrt(len(time)))
             reading = _added_up(time, reading)
         self.measured = reading[postures.chosen]
         self.said = postures.said(self.base)

@@ -92,6 +92,10 @@ def assembled(
     Raises:
         RecordingError: A column cannot be computed, or holds what no recording does.
     """
+    if all(timeseries.heading_of(line.heading)[0] != TIME for line in lines):
+        raise RecordingError(
+            f"{columns}: does not say which column of {path.name} is '{TIME}', {known(arrays)}"
+        )
     found: dict[str, np.ndarray] = {}
     for line in lines:
         try:
@@ -179,7 +183,7 @@ def _evaluated(expression: str, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
         tree = ast.parse(expression, mode="eval")
         with np.errstate(all="ignore"):  # what is not finite is refused with its name
             value = np.asarray(_value(tree.body, arrays), dtype=np.float64)
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
+    except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError):
         raise RecordingError(
             f"'{expression}' cannot be computed, combine columns by + - * / and numbers"
         ) from None

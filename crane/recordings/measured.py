@@ -85,6 +85,8 @@ def completed(
     """
     full = all(x in table.units and x + FORCE in table.units for x in machine.active)
     try:
+        # before anything is computed from them, to name the column as it is in the file
+        check_finite(dict(zip(table.units, table.values.T, strict=True)))
         check_strokes(machine, table)
         told = with_angles(machine, table)
         missing = Missing(machine, table)
@@ -108,8 +110,6 @@ def is_measured(table: Table) -> bool:
 
 def _completed(machine: Machine, table: Table, missing: Missing) -> Table:
     """The table with coordinates, velocities and forces of all active joints."""
-    # before anything is computed from them, to name the column as it is in the file
-    check_finite(dict(zip(table.units, table.values.T, strict=True)))
     check_pressures(machine, table)
     forces: list[Array] = []
     drives: tuple[str, ...] = ()
