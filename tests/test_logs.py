@@ -90,7 +90,10 @@ BROKEN = {
     "no expression": (change("= 5.8", ""), ":8: is no column, write 'name [unit] = expression'"),
     "twice": (change("hold [V]", "q1 [deg]"), ":8: column 'q1 [deg]' is there twice, remove one"),
     "unit twice": (change("hold [V]", "q1 [rad]"), "column 'q1' is there twice"),
-    "no time": (change("time [ms]", "t [s]"), "does not say which column of log.npz is 'time', kno"),
+    "no time": (
+        change("time [ms]", "t [s]"),
+        "does not say which column of log.npz is 'time', kno",
+    ),
     "digits": (change("1e3 * t", "t - 1" + "0" * 400), ":4: 't - 1000"),
     "standing": (
         change("1e3 * t", "0 * t"),

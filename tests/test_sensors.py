@@ -389,7 +389,9 @@ def test_what_is_not_finite_is_named(machine, motion, tmp_path):
     names = ["time", "inclination_lift_boom", "inclination_tilt_boom", "X_lift_force"]
     names += ["X_tilt_force", "X_lift", "X_tilt"]
     for some in (names, names[:-2]):
-        held = {f"{x} [{units[x]}]": columns[x] for x in some} | {"inclination_lift_boom [rad]": boom}
+        held = {f"{x} [{units[x]}]": columns[x] for x in some} | {
+            "inclination_lift_boom [rad]": boom
+        }
         np.savez(tmp_path / "run.npz", **held)
         with pytest.raises(RecordingError, match="'inclination_lift_boom' is nan at sample 5"):
             crane.read_measured(machine, tmp_path / "run.npz")
@@ -511,7 +513,9 @@ def test_a_raw_log_is_read_by_the_sensors_of_its_machine(machine, tmp_path):
     with pytest.warns(CraneWarning, match="'spool_X_lift' \\(no 'spool'\\)"):
         one = read(LIFTING, crane.load(path))
     del known["time"], known["spool_X_lift"]
-    with pytest.raises(RecordingError, match="yaml: does not say which column of .* is 'time', kn"):
+    with pytest.raises(
+        RecordingError, match="yaml: does not say which column of .* is 'time', kn"
+    ):
         read(LIFTING, machine.replace(sensors=known))
     two = read(LIFTING, machine, columns)
     assert one.units == two.units and np.array_equal(one.values, two.values)

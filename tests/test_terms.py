@@ -113,10 +113,22 @@ def test_the_memory_of_rest_is_its_differential_equation(arm):
             "term 'q1.presliding' has 0 numbers, give the distance over which",
         ),
         ({"q1.viscous": (1.0,)}, "term 'q1.viscous' has 1 numbers, it takes none"),
-        ({"q1.presliding": (-1.0,)}, "a number of term 'q1.presliding' is -1.0, give a number above"),
-        ({"q1.stiction": (0.1, 0.0)}, "a number of term 'q1.stiction' is 0.0, give a number above 0"),
-        ({"q*.stiction": (np.nan,)}, "a number of term 'q*.stiction' is nan, give a number above 0"),
-        ({"q1.memory": (np.inf, 1.0)}, "a number of term 'q1.memory' is inf, give a number above 0"),
+        (
+            {"q1.presliding": (-1.0,)},
+            "a number of term 'q1.presliding' is -1.0, give a number above",
+        ),
+        (
+            {"q1.stiction": (0.1, 0.0)},
+            "a number of term 'q1.stiction' is 0.0, give a number above 0",
+        ),
+        (
+            {"q*.stiction": (np.nan,)},
+            "a number of term 'q*.stiction' is nan, give a number above 0",
+        ),
+        (
+            {"q1.memory": (np.inf, 1.0)},
+            "a number of term 'q1.memory' is inf, give a number above 0",
+        ),
         ({"nan*q5+q6.viscous": ()}, "'nan*q5+q6': 'nan' is no factor, write q5+0.5*q6"),
         ({"0*q5+q6.viscous": ()}, "'0*q5+q6': '0' is no factor, write q5+0.5*q6"),
         ({"q5+q5.viscous": ()}, "'q5+q5' names 'q5' twice, give it once with its factor"),
@@ -280,6 +292,43 @@ def test_a_window_is_trained_on_and_the_rest_judges(tmp_path, crank):
     assert data["rotor_inertia"]["crank"] > 0
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--train", "0:9"], "nothing of use lies outside of --train 0:9, so nothing judges"),
+        (
+            ["--train", "0:7.7"],
+            "1 of 1 validations are too short for a low-pass of 10 Hz and judge",
+        ),
+        (
+            ["--train", "0:6", "--slow", "crank=1.03"],
+            "no validation moves faster than what counts",
+        ),
+    ],
+)
+def test_what_judges_nothing_is_told(tmp_path, crank, arguments, message):
+    """And the machine is identified all the same; no report says that it was judged."""
+    done = typed("identify", *crank, *arguments, "--bandwidth", "10", "--prior", "0.3",
+                 "--out", tmp_path / "out")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert message in done.stderr and "validation, moving rows" not in done.stdout
+    assert "<dt>validation</dt>" not in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_a_rest_that_stands_still_does_not_judge(tmp_path, crank):
+    machine, path = crank
+    moving = crane.read_measured(crane.load(machine), path)
+    held = {name: getattr(moving, name).copy() for name in ("q", "v", "tau")}
+    for values in held.values():
+        values[1180:] = values[1180]
+    held["v"][1180:] = 0.0
+    dataclasses.replace(moving, **held).to_csv(tmp_path / "rests.csv")
+    done = typed("identify", machine, tmp_path / "rests.csv", "--train", "0:5.9", "--prior", "0.3",
+                 "--out", tmp_path / "out")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "5.905 to 7.975 s, judges nothing: no joint moves" in done.stderr
+
+
 @pytest.fixture(scope="module")
 def crank(tmp_path_factory):
     """A machine and a recording of it, as arguments."""
@@ -325,8 +374,16 @@ def test_the_prior_that_predicts_is_chosen(arm):
         ({"bandwidth": [np.nan, 5.0]}, {}, "the bandwidth is nan Hz, give a number above 0"),
         ({"bandwidth": [5.0, -5.0]}, {}, "the bandwidth is -5.0 Hz, give a number above 0"),
         ({"bandwidth": ["x"]}, {}, "bandwidth is 'x', give numbers in Hz"),
-        ({"bodies": ["1 %"]}, {"prior": (0, 1)}, "the prior is numbers of all parameters, give it"),
-        ({"bandwidth": [5.0]}, {"method": "x"}, "some part of the training is not told by the oth"),
+        (
+            {"bodies": ["1 %"]},
+            {"prior": (0, 1)},
+            "the prior is numbers of all parameters, give it",
+        ),
+        (
+            {"bandwidth": [5.0]},
+            {"method": "x"},
+            "some part of the training is not told by the oth",
+        ),
     ],
 )
 def test_what_cannot_be_tried(arm, tried, options, message):

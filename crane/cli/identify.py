@@ -1,7 +1,8 @@
 """Commands that find parameters from strokes and forces: identify, payload."""
 
 import dataclasses
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -30,10 +31,11 @@ from crane.cli.shared import (
     status,
     window,
 )
-from crane.common.errors import InputError
+from crane.common.errors import CraneWarning, InputError, RecordingError
 
 if TYPE_CHECKING:
     from crane.description.estimation import Known, Numbers
+    from crane.identification.signals.motion import Motion
     from crane.machine import Machine
     from crane.recordings.recording import Recording
 
@@ -118,7 +120,15 @@ def identify(
         loaded = loaded.replace(estimation=estimation)
     if feasible:
         check_rewritable(loaded)
-    learned, judges = _divided(_read(recording, loaded, columns, span), fitted)
+    learned, outside = _divided(_read(recording, loaded, columns, span), fitted)
+    judges: list[Recording | Motion] = [*_moving(loaded, outside, trust)]
+    if train is not None and not outside:
+        warnings.warn(
+            f"nothing of use lies outside of --train {train}, so nothing judges",
+            CraneWarning,
+            stacklevel=1,
+        )
+    rest = "the rest" if judges else ""
     judges += _read(validation or [], loaded, columns)
     if bandwidth is not None:
         shortest = max(min(float(x.time[-1] - x.time[0]) for x in learned), 1e-3)
@@ -137,7 +147,9 @@ def identify(
     with status("writing the report"):
         named = [", ".join(path.name for path in paths or ()) for paths in (recording, validation)]
         if train is not None:
-            named = [f"{named[0]}, {train} s", ", ".join(filter(None, ["the rest", named[1]]))]
+            named = [f"{named[0]}, {train} s", ", ".join(filter(None, [rest, named[1]]))]
+        if result.validation is None:
+            named[1] = ""
         write_identification(out, result, *named)
     print(f"{result.to_text()}\nwritten to {out}; see {out}/report.html")
 
@@ -235,6 +247,19 @@ def _divided(
         if part.sum() >= _FEWEST
     ]
     return inside, outside
+
+
+def _moving(machine: "Machine", recordings: "list[Recording]", trust: bool) -> "Iterator[Motion]":
+    """Motions of those that can be judged by; of others it is told why they cannot."""
+    from crane.identification.mechanics.reading import smoothed_motion
+
+    for recording in recordings:
+        try:
+            yield smoothed_motion(machine, recording, trust=trust)
+        except RecordingError as error:
+            where = "{:.4g} to {:.4g} s".format(*recording.time[[0, -1]])
+            text = f"what lies outside of --train, {where}, judges nothing: {error}"
+            warnings.warn(text, CraneWarning, stacklevel=1)
 
 
 @app.command()

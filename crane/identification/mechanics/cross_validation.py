@@ -183,7 +183,9 @@ def _left_out(
         trial = settings_of(Trial(settings, np.empty(0)), options)
         # of parts the checks know too little; the whole has passed, or will not
         found = identify(machine, inside, **trial | {"trust": True})
-        judge = Equations(found.model, found.base, outside, bandwidth or found.bandwidth, found.slow)
+        judge = Equations(
+            found.model, found.base, outside, bandwidth or found.bandwidth, found.slow
+        )
         return judge.compare(found.values).stacked if judge.moving.any() else np.nan
 
 

@@ -38,7 +38,7 @@ class _Part:
 
         self.motion, self.step = motion, float(motion.time[1] - motion.time[0])
         duration = float(motion.time[-1] - motion.time[0])
-        if bandwidth * duration < _FEWEST:
+        if not long_enough(motion, bandwidth):
             raise InputError(
                 f"a bandwidth of {bandwidth:g} Hz leaves nothing of {duration:g} s, give at least "
                 f"{_FEWEST / duration:.2g} Hz"
@@ -248,6 +248,11 @@ class Equations:
     def columns(self, T: Array) -> "Columns":
         """W T, the rows that count, for T (r, p)."""
         return Columns(self, T)
+
+
+def long_enough(motion: Motion, bandwidth: float) -> bool:
+    """Whether a low-pass [Hz] leaves anything of a motion."""
+    return bandwidth * float(motion.time[-1] - motion.time[0]) >= _FEWEST
 
 
 def _one_after_the_other(times: Sequence[Array]) -> Array:

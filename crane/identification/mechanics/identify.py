@@ -17,12 +17,17 @@ from crane.identification.estimation.estimators import (
     least_squares,
     weighted,
 )
-from crane.identification.mechanics.against import check_forces, tell_delays, tell_shared, tell_validation
+from crane.identification.mechanics.against import (
+    check_forces,
+    tell_delays,
+    tell_shared,
+    tell_validation,
+)
 from crane.identification.mechanics.base import Base, base_parameters
 from crane.identification.mechanics.checks import doubt
 from crane.identification.mechanics.delays import delays
 from crane.identification.mechanics.determined import advice, magnitudes, sizes_of
-from crane.identification.mechanics.equations import Equations, Progress
+from crane.identification.mechanics.equations import Equations, Progress, long_enough
 from crane.identification.mechanics.laws import Frictional
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.possible import possible
@@ -75,7 +80,8 @@ def identify(
         machine: The machine, whose geometry is taken as known.
         recording: What to learn from, one or several; a `Motion` if velocities and accelerations
             are known.
-        validation: What to be judged by, not learned from, likewise.
+        validation: What to be judged by, not learned from, likewise; told where it is too short
+            for the low-pass or stands still.
         method: "ols", "wls" (rows of each joint by its noise) or "huber" (robust).
         prior: What is known before, about which the estimate is regularised: by name, such as
             {"bodies": "10 %", "q1.viscous": "200 +- 50"}, see `priors.stated`; the share to which
@@ -146,9 +152,14 @@ def identify(
     del rows, columns, motions
     if validation is not None:
         others = motions_of(machine, validation, trust, progress)
-        judge = Equations(model, base, others, bandwidth, limits, progress)
-        judged = judge.compare(selection @ values)
-        tell_validation(training, judged)
+        judging = [motion for motion in others if long_enough(motion, bandwidth)]
+        if judging:
+            judge = Equations(model, base, judging, bandwidth, limits, progress)
+            judged = judge.compare(selection @ values) if judge.moving.any() else None
+        if judged is None or len(judging) < len(others):
+            _tell_short(others, judging, bandwidth)
+        if judged is not None:
+            tell_validation(training, judged)
     if finished is not None:
         finished(1.0)
     found = Identification(
@@ -160,6 +171,18 @@ def identify(
     elif found.doubt:
         warnings.warn(found.doubt, CraneWarning, stacklevel=2)
     return found
+
+
+def _tell_short(others: Sequence[Motion], judging: Sequence[Motion], bandwidth: float) -> None:
+    """Warn of validations that judge nothing."""
+    short = len(others) - len(judging)
+    text = (
+        f"{short} of {len(others)} validations are too short for a low-pass of {bandwidth:g} Hz "
+        "and judge nothing"
+        if short
+        else "no validation moves faster than what counts as standstill, nothing is judged"
+    )
+    warnings.warn(f"{text}, give longer ones that move", CraneWarning, stacklevel=3)
 
 
 def equations_of(
