@@ -11,12 +11,12 @@ from numpy.typing import ArrayLike
 from crane.common.errors import InputError, known
 from crane.common.output import replacing
 from crane.common.samples import Array, Brief, as_count, as_number, as_seed
+from crane.common.tables import aligned
 from crane.dynamics import Dynamics
 from crane.identification.excitation.fourier import Fourier
 from crane.identification.excitation.information import CRITERIA, Information, Quality
 from crane.identification.excitation.limits import QUANTITIES, Limits, by_joint, gear, limits
 from crane.identification.excitation.search import COARSE, Search
-from crane.identification.excitation.text import columns
 from crane.identification.mechanics.base import Base, base_parameters, random_samples
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.term import Samples
@@ -149,7 +149,7 @@ class Excitation(Brief):
             numbers = (nominal[i], before.std[i], after.std[i])
             name = self.base.names[self.base.independent[i]]
             least.append((name, *(f"{x:.3g}" for x in numbers)))
-        return "\n\n".join(columns(rows) for rows in (figures, shares, least))
+        return "\n\n".join("\n".join(aligned(rows)) for rows in (figures, shares, least))
 
 
 def excite(

@@ -9,6 +9,7 @@ import numpy as np
 
 from crane.common.errors import InputError, known
 from crane.common.samples import Array, Brief, as_count, as_number, as_seed
+from crane.common.tables import aligned
 from crane.common.units import quantity
 from crane.control.valves import circuit_of
 from crane.description.sensors import SIGNAL
@@ -16,7 +17,6 @@ from crane.identification.calibration.unknowns import Unknown
 from crane.identification.excitation.exchange import Exchange
 from crane.identification.excitation.information import CRITERIA, Quality
 from crane.identification.excitation.signal_limits import SignalLimits
-from crane.identification.excitation.text import columns
 from crane.identification.excitation.told import Told
 from crane.machine import Machine
 from crane.recordings import timeseries
@@ -108,7 +108,7 @@ class SignalExcitation(Brief):
                 joint, f"{self.left[i]:.0%}", f"{self.doubted[i]:.0%}",
                 quantity(self.pressure[i], "Pa"), f"{self.rate[i]:.3g} V/s",
             ))  # fmt: skip
-        parts = [columns(numbers), columns(strokes)]
+        parts = ["\n".join(aligned(rows)) for rows in (numbers, strokes)]
         if self.pump:
             parts.append(f"largest share of the pump's flow: {self.pump:.0%}")
         if self.vague:

@@ -10,11 +10,11 @@ import numpy as np
 
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.samples import Array, as_number
+from crane.common.tables import aligned
 from crane.identification.mechanics.equations import Equations, Progress
 from crane.identification.mechanics.identify import Recorded, identify, motions_of
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.priors import by_name, stated
-from crane.identification.mechanics.result import aligned
 from crane.identification.signals.motion import Motion
 from crane.machine import Machine
 

@@ -6,10 +6,11 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.samples import Array, Brief
+from crane.common.tables import aligned
 from crane.dynamics import Dynamics
 from crane.identification.mechanics.feasible import body_parameters, pseudo_inertia
 from crane.identification.mechanics.inertias import PER_BODY, inertial_columns
-from crane.identification.mechanics.result import ForceComparison, aligned
+from crane.identification.mechanics.result import ForceComparison
 from crane.identification.mechanics.term import Samples
 from crane.machine import Machine
 

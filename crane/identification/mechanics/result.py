@@ -1,6 +1,6 @@
 """What an identification found, and how well it predicts."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.samples import Array, Brief
+from crane.common.tables import aligned
 from crane.identification.estimation.estimators import Estimate
 from crane.identification.mechanics.base import Base
 from crane.identification.mechanics.determined import weak_directions
@@ -246,21 +247,3 @@ class Identification:
                 lines.append(f"  and {more} more directions")
             lines.append(self.remedy)
         return "\n".join(lines) + "\n"
-
-
-def aligned(rows: Sequence[Sequence[str]], left: Sequence[int] = (0,)) -> list[str]:
-    """Lines of a table whose columns are as wide as what is in them, two blanks between.
-
-    Args:
-        rows: Cells, as many in each row.
-        left: Columns that are aligned left, the others right.
-    """
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for row in rows:
-        cells = [
-            cell.ljust(width) if i in left else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ]
-        lines.append("  ".join(cells).rstrip())
-    return lines
