@@ -454,15 +454,48 @@ def test_what_is_learned_does_not_judge_and_is_learned_once(arm):
     one, other = moved(arm, seed=0), moved(arm, seed=1)
     part = Motion(*(x[400:] for x in (one.time, one.q, one.v, one.a, one.tau)))
     known = {"prior": {"bodies": "10 %"}, "bandwidth": 5.0}
-    with pytest.raises(RecordingError, match="100% of a recording's samples are in another one"):
+    with pytest.raises(
+        RecordingError, match="100% of recording 2's samples are in recording 1 as"
+    ):
         identify(arm, [one, part], **known)
-    with pytest.raises(RecordingError, match="75% of a recording's samples are in another one"):
+    with pytest.raises(RecordingError, match="75% of recording 2's samples are in recording 1 as"):
         identify(arm, [part, one], **known)
     with pytest.warns(CraneWarning, match="100% of a validation's samples were learned from: its"):
         identify(arm, one, [other, part], **known)
     with warnings.catch_warnings():
-        warnings.filterwarnings("error", ".*learned from", CraneWarning)
+        warnings.simplefilter("error", CraneWarning)  # errors of rounding are none, either
         identify(arm, one, other, **known)
+
+
+def test_which_of_several_cannot_serve_is_said(arm):
+    good = moved(arm)
+    recording = crane.Recording(
+        time=TIME[:20], joints=arm.active, q=good.q[:20], v=good.v[:20], tau=-good.tau[:20],
+        units=dict.fromkeys(arm.active, "rad"),
+    )  # fmt: skip
+    known = {"prior": {"bodies": "10 %"}, "bandwidth": 5.0}
+    for given, message in (
+        ((recording,), "20 samples are too few"),
+        (([good, recording],), "recording 2 of 2: 20 samples are too few"),
+        ((good, recording), "validation 1 of 1: 20 samples are too few"),
+    ):
+        with pytest.raises(RecordingError) as caught:
+            identify(arm, *given, **known)
+        assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("slow", "message"),
+    [
+        ([0.1, 0.2], "slow has the shape (2,), give (6,)"),
+        ([0.1] * 5 + [np.nan], "slow is nan at q6"),
+        (-0.1, "slow of 'q1' is -0.1, it must not be negative"),
+    ],
+)
+def test_velocities_of_standstill_that_are_none(arm, slow, message):
+    with pytest.raises(InputError) as caught:
+        identify(arm, moved(arm), slow=slow, bandwidth=5.0)
+    assert str(caught.value).startswith(message)
 
 
 def test_a_body_without_mass_cannot_be_a_share_of_itself(tmp_path, arm):

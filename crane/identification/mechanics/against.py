@@ -21,6 +21,7 @@ _FACTOR = 30.0  # by which a force may be off from what the model says
 _SHAPE = 0.9  # correlation from which a model is believed on a factor
 _BLOCKS = 10  # of time, whose scatter is the standard error of that factor
 _WORSE = 4.0  # times the training's error, from which a validation is remarked on
+_EXACT = 1e-6  # of the forces, an error that is none
 _SHARED = 0.2  # of a recording's samples, from which on it counts as part of another
 _LOOKED = 2000  # samples that are looked for
 _CERTAIN = 0.999  # probability of a delay that is told
@@ -114,7 +115,7 @@ def tell_validation(training: ForceComparison, validation: ForceComparison) -> N
         strict=True,
     )  # fmt: skip
     for joint, fitted, judged, rmse, other in pairs:
-        if judged > _WORSE * fitted and other > _WORSE * rmse:
+        if judged > max(_WORSE * fitted, _EXACT) and other > _WORSE * rmse:
             told.append(f"'{joint}' {judged / fitted:.3g} times ({100 * judged:.3g} %)")
     if told:
         text = (
@@ -134,11 +135,11 @@ def tell_shared(
     Raises:
         RecordingError: Two of the recordings share instants and forces.
     """
-    for one, other in itertools.combinations(recordings, 2):
+    for (i, one), (j, other) in itertools.combinations(enumerate(recordings, start=1), 2):
         if (share := _shared(one, other)) > _SHARED:
             doubt(
-                f"{share:.0%} of a recording's samples are in another one as well: learned twice "
-                "they make intervals too narrow, give each once",
+                f"{share:.0%} of recording {j}'s samples are in recording {i} as well: learned "
+                "twice they make intervals too narrow, give each once",
                 trust,
             )
     share = max((_shared(*pair) for pair in itertools.product(recordings, validation)), default=0)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, RecordingError, known
-from crane.common.samples import Array, as_number
+from crane.common.samples import Array, as_number, as_sample
 from crane.identification.estimation.estimators import (
     Prior,
     conditions,
@@ -151,7 +151,7 @@ def identify(
     speeds = _speeds(model, motions, limits)
     del rows, columns, motions
     if validation is not None:
-        others = motions_of(machine, validation, trust, progress)
+        others = motions_of(machine, validation, trust, progress, "validation")
         judging = [motion for motion in others if long_enough(motion, bandwidth)]
         if judging:
             judge = Equations(model, base, judging, bandwidth, limits, progress)
@@ -230,15 +230,29 @@ def motions_of(
     recorded: Recorded | Sequence[Recorded],
     trust: bool,
     progress: Progress | None,
+    what: str = "",
 ) -> list[Motion]:
-    """Recordings with velocities and accelerations; motions as they are."""
+    """Recordings with velocities and accelerations; motions as they are.
+
+    Raises:
+        InputError: There are none.
+        RecordingError: One cannot serve; the message says which, if there are several.
+    """
     several = _several(recorded)
     if not several:
         raise InputError("no recording is given, give at least one")
-    return [
-        x if isinstance(x, Motion) else smoothed_motion(machine, x, trust=trust, progress=progress)
-        for x in several
-    ]
+    found = []
+    for number, one in enumerate(several, start=1):
+        try:
+            if not isinstance(one, Motion):
+                one = smoothed_motion(machine, one, trust=trust, progress=progress)
+        except RecordingError as error:
+            if not what and len(several) == 1:
+                raise
+            which = f"{what or 'recording'} {number} of {len(several)}"
+            raise RecordingError(f"{which}: {error}") from None
+        found.append(one)
+    return found
 
 
 def _several(recorded: Recorded | Sequence[Recorded] | None) -> list[Recorded]:
@@ -304,7 +318,9 @@ def _slow(machine: Machine, slow: Mapping[str, float] | ArrayLike | None, fastes
             near = _SETTLED * (max(law.stribeck, law.smoothing) if law.stiction else turns)
             out[i] = max(out[i], min(near, _MOVING * fastest[i]))
     if slow is not None and not isinstance(slow, Mapping):
-        return np.broadcast_to(np.asarray(slow, np.float64), out.shape)
+        each = np.full(out.shape, slow) if np.ndim(slow) == 0 else slow
+        each = as_sample(each, len(out), "slow", machine.active)
+        slow = dict(zip(machine.active, each.tolist(), strict=True))
     for name, value in (*machine.estimation.slow.items(), *(slow or {}).items()):
         joints = fnmatch.filter(machine.active, name)
         if not joints and name not in machine.locks:
