@@ -1,6 +1,7 @@
 """Terms of a model and what is known before, by name: in the machine file and in calls."""
 
 import dataclasses
+import re
 import warnings
 
 import numpy as np
@@ -465,6 +466,21 @@ def test_what_is_learned_does_not_judge_and_is_learned_once(arm):
     with warnings.catch_warnings():
         warnings.simplefilter("error", CraneWarning)  # errors of rounding are none, either
         identify(arm, one, other, **known)
+
+
+def test_times_in_another_unit_are_refused(arm):
+    """Milliseconds that are said to be seconds are no harm to forces, but to velocities."""
+    good = moved(arm)
+    recording = crane.Recording(
+        time=1e-3 * TIME, joints=arm.active, q=good.q, v=1e3 * good.v, tau=good.tau,
+        units=dict.fromkeys(arm.active, "rad"),
+    )  # fmt: skip
+    with pytest.raises(RecordingError) as caught:
+        identify(arm, recording)
+    assert re.match(
+        r"'q1' moves at \S+ rad/s on the whole, its limit is 5.01 rad/s: ", str(caught.value)
+    )
+    assert "look at the unit of the time; if the recording is right" in str(caught.value)
 
 
 def test_which_of_several_cannot_serve_is_said(arm):

@@ -20,9 +20,10 @@ from crane.identification.signals.motion import Derivatives, Motion, differentia
 from crane.identification.signals.outliers import outliers, repaired
 from crane.machine import Machine
 from crane.recordings.measured import moved_locks
-from crane.recordings.recording import FORCE, Recording
+from crane.recordings.recording import FORCE, VELOCITY_UNITS, Recording
 
 _MOVES = 3.0  # standard deviations of a joint's velocity, above which it moves
+_TOO_FAST = 30.0  # times its limit, at which no joint moves
 _HUM = 10.0  # times the frequency of the motion, above which a line in a spectrum is hum
 
 
@@ -67,6 +68,7 @@ def smoothed_motion(
     tell_hum(time, dict(zip(names, columns.T, strict=True)), lowest)
     found = differentiate(time, columns[:, :n], derivatives, cutoff, progress)
     v, a = np.where(_moves(found), (found.v, found.a), 0.0)
+    _check_speeds(machine, v, trust)
     _tell_still(machine, found, v)
     return Motion(time, found.q, v, a, columns[:, n:], _passed(found))
 
@@ -103,6 +105,21 @@ def _check(machine: Machine, time: Array, columns: Array, v: Array, trust: bool)
     bounded = limits if np.isfinite(limits).all() else None
     units = {joint: machine.unit(joint) for joint in machine.active}
     check(time, q, tau, machine.active, units, recorded, bounded, trust=trust)
+
+
+def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:
+    """Doubt velocities (N, n) that the machine's joints are far from having."""
+    limits = machine.model.velocityLimit[machine.closure.active]
+    for joint, speed, limit in zip(
+        machine.active, np.sqrt(np.mean(v**2, axis=0)), limits, strict=True
+    ):
+        if 0 < limit < speed / _TOO_FAST:
+            unit = VELOCITY_UNITS[machine.unit(joint)]
+            doubt(
+                f"'{joint}' moves at {speed:.3g} {unit} on the whole, its limit is {limit:.3g} "
+                f"{unit}: look at the unit of the time",
+                trust,
+            )
 
 
 def _passed(found: Derivatives) -> float:
