@@ -14,6 +14,7 @@ from crane.common.errors import CraneError, CraneWarning, InputError, RecordingE
 from crane.description import Friction
 from crane.description.estimation import Estimation, Known
 from crane.formats import write_machine
+from crane.identification.mechanics.against import tell_shared
 from crane.identification.mechanics.cross_validation import (
     FOLDS,
     cross_validate,
@@ -481,6 +482,15 @@ def test_times_in_another_unit_are_refused(arm):
         r"'q1' moves at \S+ rad/s on the whole, its limit is 5.01 rad/s: ", str(caught.value)
     )
     assert "look at the unit of the time; if the recording is right" in str(caught.value)
+
+
+def test_rests_that_are_alike_are_no_shared_samples(arm):
+    one, other = moved(arm, seed=0), moved(arm, seed=1)
+    for motion in (one, other):
+        motion.tau[:640] = 1.0
+    tell_shared([one, other], [], False)
+    with pytest.raises(RecordingError, match="100% of recording 2's samples are in recording 1"):
+        tell_shared([one, one], [], False)
 
 
 def test_which_of_several_cannot_serve_is_said(arm):

@@ -152,14 +152,18 @@ def tell_shared(
 
 
 def _shared(one: Recording | Motion, other: Recording | Motion) -> float:
-    """Share of the other's samples that one has, at the same time and with the same forces."""
+    """Share of the other's samples that one has, at the same time and with the same forces.
+
+    Of those whose forces change: simulations that begin at rest begin alike.
+    """
     some = slice(None, None, max(1, len(other.time) // _LOOKED))
     time, tau = other.time[some], other.tau[some]
     if one.tau.shape[1] != tau.shape[1]:
         return 0.0
     at = np.minimum(np.searchsorted(one.time, time), len(one.time) - 1)
     same = (one.time[at] == time) & (one.tau[at] == tau).all(axis=1)
-    return float(np.mean(same))
+    changing = (tau[1:] != tau[:-1]).any(axis=1)
+    return float(np.mean(same[1:][changing])) if changing.any() else 0.0
 
 
 def _scale(y: Array, x: Array, v: Array, a: Array) -> tuple[float, float, float]:
