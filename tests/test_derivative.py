@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from crane.codegen import Program, Tape
-from crane.codegen.derivative import derivatives
+from crane.codegen.derivative import against, derivatives
 from crane.codegen.factors import eliminated, loaded, stored, substituted
 from crane.codegen.scalar import apply, maximum, minimum, where_positive, with_sign_of
 
@@ -54,6 +54,42 @@ def test_derivatives_are_central_differences():
         np.testing.assert_allclose(found, np.column_stack(rows), rtol=2e-7, atol=2e-8)
         checked += 1
     assert checked > 100
+
+
+def test_one_pass_back_is_the_transpose():
+    """Of the same derivatives, to rounding, at kinks too, where one of two sides counts."""
+    tape = Tape()
+    variables, weights = tape.loads(0, 0, 3), tape.loads(1, 0, 6)
+    outputs = formulas(*variables)
+    jacobian = derivatives(outputs, variables)
+    slope = compiled(1, [entry for row in jacobian for entry in row])
+    gradient = compiled(2, against(outputs, weights, variables))
+    rng = np.random.default_rng(6)
+    for point in [*rng.uniform(-2, 2, (100, 3)), np.array([0.5, 0.2, 0.4]), np.full(3, 0.1)]:
+        w = rng.normal(size=6)
+        rows = slope(point).reshape(6, 3)
+        size = np.abs(w) @ np.abs(rows)
+        assert (np.abs(gradient(point, w) - w @ rows) <= 1e-13 * size).all()
+
+
+def test_one_pass_back_takes_few_operations():
+    """However many variables there are; forwards it is one pass each."""
+    tape = Tape()
+    variables = tape.loads(0, 0, 40)
+    total = 0.0
+    for i, x in enumerate(variables):
+        total = apply("sin", total + x * variables[i - 1])
+    before = len(tape.operations)
+    against([total], [1.0], variables)
+    assert len(tape.operations) - before < 6 * before
+
+
+def test_what_no_output_depends_on_has_no_gradient():
+    tape = Tape()
+    x, y = tape.loads(0, 0, 2)
+    assert against([y * y, 3.0], [1.0, 1.0], [x]) == [0.0]
+    assert against([3.0], [1.0], [x]) == [0.0] and against([x], [2.0], []) == []
+    assert against([x, x], [2.0, 3.0], [x]) == [5.0]
 
 
 def test_formulas_are_the_same_in_floats():
