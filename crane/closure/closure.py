@@ -1,5 +1,6 @@
 """Closing the loops: q = f(q_A), v = gamma v_A, a = gamma a_A + drift."""
 
+import copy
 import dataclasses
 import threading
 from collections.abc import Collection, Sequence
@@ -13,11 +14,13 @@ from crane.closure.branch import Branch
 from crane.closure.choice import Choice, condition, proposals, scales
 from crane.closure.compiled import Cursor, FastClosure
 from crane.closure.equations import LoopEquations
+from crane.closure.exactness import CLOSED, Exact, Rounded
 from crane.closure.following import followed
 from crane.closure.home import Sought, settle
 from crane.closure.structure import Structure
+from crane.closure.traced import geometry_of
 from crane.codegen import TooLongError, carefully
-from crane.common.errors import BranchEdgeError, InputError, WrongBranchError
+from crane.common.errors import BranchEdgeError, InputError, MechanismError, WrongBranchError
 from crane.common.samples import Array, as_samples, per_sample, solve
 from crane.description import Coupling, LoopSpec
 
@@ -127,6 +130,40 @@ class Closure:
             f"Closure of {loops}: {len(self.passive)} passive joints from "
             f"{', '.join(self.active_names)}"
         )
+
+    def near(
+        self, model: pin.Model, loops: Sequence[LoopSpec], couplings: Sequence[Coupling]
+    ) -> "Closure":
+        """The closure of a tree whose numbers differ little, by its structure and on its branch.
+
+        A look at a machine beside this one: it has no machine code of its own.
+
+        Args:
+            model: The tree.
+            loops: Its loops.
+            couplings: Its couplings.
+
+        Raises:
+            MechanismError: The loops do not close there, or lock up.
+        """
+        equations = LoopEquations(model, loops, couplings)
+        if _alike(equations, self.equations):
+            return self
+        other = copy.copy(self)
+        other.model, other.equations, other._local = model, equations, threading.local()
+        other.size, other.units = equations.size, equations.units
+        other.pace = float(np.sqrt(other.size))
+        other.__dict__["_made"] = None
+        other._branch = Branch(
+            equations, self.structure, self._names, self.active, self.passive, self._span
+        )
+        other.home = other._branch.home.q.copy()
+        other.home.flags.writeable = False
+        exact = (Exact if self.structure.surplus.allowed <= CLOSED else Rounded)(equations)
+        rows = self.structure.rows, self.structure.redundant
+        if not exact.is_closed(other.home) or exact.surplus(other.home, *rows, self.active)[0]:
+            raise MechanismError("the loops do not close there, or lock up")
+        return other
 
     @cached_property
     def _made(self) -> FastClosure | None:
@@ -436,3 +473,12 @@ class Closure:
             raise self._branch.edge(jacobian, q[self.active]) from None
         self._branch.check_edge(jacobian, solved, q[self.active])
         return solved
+
+
+def _alike(one: LoopEquations, other: LoopEquations) -> bool:
+    """Whether joints, limits and loops of two trees of one structure are at the same places."""
+    pairs = [
+        [x.factors, x.offsets, x.coordinates.lower, x.coordinates.upper, geometry_of(x).numbers]
+        for x in (one, other)
+    ]
+    return all(np.array_equal(x, y) for x, y in zip(*pairs, strict=True))

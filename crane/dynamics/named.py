@@ -11,12 +11,10 @@ from crane.formats.loading import Variants
 from crane.machine import Machine
 
 SMALL = 0.1  # what counts as large of a number that is 0
-_SHARE, _STEP = 1e-3, 3e-3  # of a number
+_SHARE = 1e-3  # of a number
 _STRAIGHT = 1e-11  # second difference of what is straight, as a share of the first
-# f'(0) h from f(0), f(h), ... f(8 h), of order 8
-_FORWARD = np.array(
-    [-761 / 280, 8.0, -14.0, 56 / 3, -35 / 2, 56 / 5, -14 / 3, 8 / 7, -1 / 8], dtype=np.float64
-)
+# f'(0) h from f(0), f(h), ... f(5 h), of order 5
+_FORWARD = np.array([-137 / 60, 5.0, -5.0, 10 / 3, -5 / 4, 1 / 5], dtype=np.float64)
 
 
 class Named:
@@ -24,7 +22,7 @@ class Named:
 
     Constants are elementary functions of one number: itself, its inverse, sine and cosine of an
     angle. Where they are straight, their difference is the derivative to rounding; elsewhere it is
-    the one-sided difference of order 8, to about 1e-11.
+    the one-sided difference of order 5, to about 1e-11.
 
     Args:
         machine: The machine, as it was loaded.
@@ -33,6 +31,11 @@ class Named:
     def __init__(self, machine: Machine):
         self._variants = Variants(machine)
         self._values = self._variants.values
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all numbers."""
+        return tuple(self._values)
 
     def value(self, name: str) -> float:
         """A number.
@@ -50,26 +53,39 @@ class Named:
         Raises:
             InputError: An unknown name, or a number that no machine can be made with beside it.
         """
-        for name in names:
-            self.value(name)
-        return np.array([self._slope(name, constants) for name in names])
+        here = self.here(constants)
+        return np.array([self.slope(name, constants, here) for name in names])
 
-    def _slope(self, name: str, constants: Callable[[Machine], Array]) -> Array:
-        value = self._values[name]
+    def here(self, constants: Callable[[Machine], Array]) -> Array:
+        """Constants (m,) of the machine itself."""
+        return constants(self._variants.near({}))
+
+    def slope(self, name: str, constants: Callable[[Machine], Array], here: Array) -> Array:
+        """Derivatives (m,) by one number, given `here`; see `slopes`."""
+        value = self.value(name)
         unit = value if value else SMALL
 
-        def at(share: float) -> Array:
+        def at(steps: int) -> Array:
             try:
-                return constants(self._variants.machine({name: value + share * unit}))
+                found = constants(self._variants.near({name: value + steps * _SHARE * unit}))
             except CraneError as error:
                 raise InputError(f"'{name}' cannot be varied about {value:g}: {error}") from error
+            if len(found) != len(here):
+                raise InputError(
+                    f"'{name}' cannot be varied about {value:g}, where the machine has other "
+                    "equations: give it another value"
+                )
+            return found
 
-        here, near, far = at(0.0), at(_SHARE), at(2.0 * _SHARE)
+        near = at(1)
+        if (near == here).all():
+            return np.zeros_like(here)
+        far = at(2)
         first = far - here
         if (
             np.abs(far - 2.0 * near + here) <= _STRAIGHT * np.abs(first) + 4e-16 * np.abs(here)
         ).all():
             return first / (2.0 * _SHARE * unit)
-        rows = [here, *(at(i * _STEP) for i in range(1, len(_FORWARD)))]
-        slope: Array = _FORWARD @ np.array(rows) / (_STEP * unit)
+        rows = [here, near, far, *map(at, range(3, len(_FORWARD)))]
+        slope: Array = _FORWARD @ np.array(rows) / (_SHARE * unit)
         return slope

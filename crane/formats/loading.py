@@ -7,6 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
+import pinocchio as pin
+
+from crane.closure import Closure
 from crane.common.counted import few_warnings
 from crane.common.errors import DescriptionError, InputError
 from crane.common.packages import giving, package_folders, values_by_name
@@ -95,10 +98,20 @@ class Variants:
 
     def machine(self, changes: Mapping[str, float]) -> Machine:
         """The machine with some of its numbers changed, see `load`."""
+        return self._with(changes, None)
+
+    def near(self, changes: Mapping[str, float]) -> Machine:
+        """The machine with numbers changed so little that its loops are the same.
+
+        A look at its numbers: see `Closure.near`.
+        """
+        return self._with(changes, self._machine.closure)
+
+    def _with(self, changes: Mapping[str, float], near: Closure | None) -> Machine:
         was, every = self._machine, {**self._machine.changes, **changes}
         chosen = was.chosen.get("active"), was.chosen.get("free")
         with few_warnings(), self._giving():
-            made = _assembled(self._unchanged, every, was.locks, *chosen, was.floats)
+            made = _assembled(self._unchanged, every, was.locks, *chosen, was.floats, near)
         return replace(made, packages=was.packages, arguments=was.arguments)
 
     def _giving(self) -> AbstractContextManager[object]:
@@ -137,6 +150,7 @@ def _assembled(
     active: Sequence[str] | None,
     free: Sequence[str] | None,
     floating: bool,
+    near: Closure | None = None,
 ) -> Machine:
     said = {"active": active, "free": free}
     if changes:
@@ -144,10 +158,9 @@ def _assembled(
     if lock:
         spec = locked(spec, lock)
     model = assemble(spec)
-    guess = home_guess(spec, model)
-    closure = closed(spec, model, guess)
-    warn_of_home(spec, closure)
-    warn_of_assemblies(spec, closure, guess)
+    closure = (
+        _closed(spec, model) if near is None else near.near(model, spec.loops, spec.couplings)
+    )
     check_masses(spec, model, closure)
     check_elements(spec, closure)
     coordinates = closure.equations.coordinates
@@ -185,6 +198,14 @@ def _assembled(
         motors=motors(spec, closure.active_names),
         locks=MappingProxyType({name: float(value) for name, value in (lock or {}).items()}),
     )
+
+
+def _closed(spec: MachineSpec, model: pin.Model) -> Closure:
+    guess = home_guess(spec, model)
+    closure = closed(spec, model, guess)
+    warn_of_home(spec, closure)
+    warn_of_assemblies(spec, closure, guess)
+    return closure
 
 
 def _names(given: object, what: str) -> Sequence[str] | None:
