@@ -121,6 +121,10 @@ class ControlledStepper(Stepper):
         self.tolerance = np.ascontiguousarray(tolerance)
         self._lengths, self._breaks = np.zeros(6), np.append(breaks_of(control), np.inf)
 
+    def forget(self) -> None:
+        """Begin with a short step, whatever was integrated before."""
+        self._lengths[0] = 0.0
+
     def run(
         self, first: float, state: Array, offset: float, step: float, rows: Array
     ) -> tuple[int, float]:

@@ -52,6 +52,7 @@ class ControlledSteps(Switching):
         period = self._period(step)
         first = times[0] if len(times) else self._next
         self.done = self.reached = 0
+        self._fast.forget()
         self._begin(first + self.offset, state)
         while self.done < len(times) or self.offset < 0:
             self._next = now = first + step * self.done
