@@ -21,9 +21,10 @@ from crane.simulation.readings import read_off
 from crane.simulation.recorded import recorded
 from crane.simulation.replays import Inputs, inputs_of
 from crane.simulation.run import simulate, start_of
-from crane.simulation.sensitivity.follow import Motion, follow
+from crane.simulation.sensitivity.follow import follow
+from crane.simulation.sensitivity.rate import frames_of
 from crane.simulation.sensitivity.setup import Setup, setup_of
-from crane.simulation.sensitivity.tangent import frames_of
+from crane.simulation.sensitivity.track import Motion
 
 _NUDGE = 1e-5  # of an unknown's scale, for differences of the numbers of a simulation
 _FEWEST = 20  # instants of a recording

@@ -1,7 +1,7 @@
 """How a simulated motion depends on numbers of the machine and on its start."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from crane.common.errors import CraneWarning, InputError, known
 from crane.common.samples import Array
 from crane.common.units import reading
-from crane.control import Command, Controller, TracedController, ValveDrive, reference_of
+from crane.control import Command, Controller
 from crane.description.sensors import (
     FORCE,
     FORCE_UNITS,
@@ -19,23 +19,17 @@ from crane.description.sensors import (
     VELOCITY,
     VELOCITY_UNITS,
 )
-from crane.dynamics import Dynamics
-from crane.dynamics.named import SMALL, Named
-from crane.formats import load
 from crane.machine import Machine
 from crane.recordings import timeseries
 from crane.recordings.recording import Recording
 from crane.recordings.timeseries import Table
-from crane.simulation.recorded import recorded
-from crane.simulation.run import Force, Progress, as_controller, count_steps, start_of
-from crane.simulation.sensitivity.follow import Motion, follow
-from crane.simulation.sensitivity.setup import Setup, setup_of
-from crane.simulation.sensitivity.tangent import frames_of
+from crane.simulation.run import Force, Progress
+from crane.simulation.sensitivity.asked import Asked
+from crane.simulation.sensitivity.directions import START
+from crane.simulation.sensitivity.follow import follow
+from crane.simulation.sensitivity.setup import Setup
 
-START = "start."
 NOTHING = 1e-9  # of an output, in the unit that it is read in
-_NUDGE = 1e-4  # rad, machine's size, per `Closure.pace`, of starts
-_CENTRAL = ((1, 8.0 / 12.0), (-1, -8.0 / 12.0), (2, -1.0 / 12.0), (-2, 1.0 / 12.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,106 +160,25 @@ def sensitivities(
         InputError: Unknown names, a machine that floats, or one without formulas.
         SimulationError: The motion comes to a dead centre; else as `simulate`.
     """
-    if not isinstance(machine, Machine):
-        machine = load(machine)
     if not by:
         raise InputError("no number is named, give `by` such as ['payload.mass']")
-    control = as_controller(controller, machine)
-    count = count_steps(control, duration, step)
-    reference = reference_of(control)
-    start = start_of(machine, initial, reference)
-    programmed = isinstance(control, ValveDrive) and control.period
-    if programmed or not isinstance(control, TracedController):
-        raise InputError("a controller in Python has no formulas, write it as a crane.control.Law")
-    dynamics = Dynamics(machine)
-    outputs = _usual(machine) if outputs is None else list(outputs)
-    starts = [name for name in by if name.startswith(START)]
-    numbers = [name for name in by if name not in starts]
-    named = Named(machine) if numbers else None
-    links = [link for link, _ in frames_of(machine, outputs)]
-
-    def at(which: Machine, initial: tuple[Array, Array], times: Array) -> Setup:
-        own = control.on(which) if isinstance(control, ValveDrive) else control
-        kept = dynamics if which is machine else Dynamics(which)
-        return setup_of(kept, own, initial, links, times)
+    asked = Asked.of(machine, controller, initial, duration, step, outputs, method, tolerance)
+    directions = asked.directions
+    values = np.array([directions.value(name) for name in by])
+    sizes = np.array([directions.size(name) for name in by])
 
     def setup(times: Array) -> tuple[Setup, Setup]:
-        base = at(machine, start, times)
-        found = {name: _started(name, machine, lambda x: at(machine, x, times), start)
-                 for name in starts}  # fmt: skip
-        if named is not None:
-            sizes = np.cumsum([part.size for part in base])[:-1]
-            every = named.slopes(
-                numbers,
-                lambda which: np.concatenate([x.ravel() for x in at(which, start, times)]),
-            )
-            for name, flat in zip(numbers, every, strict=True):
-                parts = zip(np.split(flat, sizes), base, strict=True)
-                found[name] = Setup(*(part.reshape(like.shape) for part, like in parts))
-        return base, Setup(*(np.array(x) for x in zip(*(found[x] for x in by), strict=True)))
+        every = directions.by(list(dict.fromkeys(by)), times)
+        parts = zip(*(every[name] for name in by), strict=True)
+        return directions.base(times), Setup(*map(np.array, parts))
 
-    motion = Motion(dynamics, control, start, count, step, method, tolerance)
-    values = np.array([_value(name, machine, named, start) for name in by])
-    sizes = np.array(
-        [
-            abs(value) if value and name in numbers else SMALL
-            for name, value in zip(by, values, strict=True)
-        ]
-    )
-    followed = follow(motion, outputs, setup, sizes, progress=progress)
+    followed = follow(asked.motion, asked.outputs, setup, sizes, progress=progress)
     for note in followed.notes:
         warnings.warn(note, CraneWarning, stacklevel=2)
     return Sensitivities(
-        recorded(machine, control, followed.time, followed.parts, ""),
-        tuple(outputs),
+        asked.recorded(followed.time, followed.parts),
+        asked.outputs,
         tuple(by),
         values,
         followed.slopes,
     )
-
-
-def _usual(machine: Machine) -> list[str]:
-    joints = machine.hydraulics.joints if machine.hydraulics is not None else ()
-    return [*machine.active, *(f"pressure_{joint}_{side}" for joint in joints for side in "ab")]
-
-
-def _begins(name: str, machine: Machine) -> tuple[int, int]:
-    """Which part of the start a name is of, and which joint.
-
-    Raises:
-        InputError: It is of none.
-    """
-    joint = name.removeprefix(START)
-    part = int(joint.endswith(VELOCITY) and joint not in machine.active)
-    joint = joint.removesuffix(VELOCITY) if part else joint
-    if joint not in machine.active:
-        raise InputError(
-            f"'{name}' is no start of an active joint, {known(machine.active, joint)}"
-        )
-    return part, machine.active.index(joint)
-
-
-def _started(
-    name: str,
-    machine: Machine,
-    setup: Callable[[tuple[Array, Array]], Setup],
-    start: tuple[Array, Array],
-) -> Setup:
-    """How the numbers change with a coordinate or velocity at the start."""
-    part, i = _begins(name, machine)
-    closure = machine.closure
-    nudge = _NUDGE * closure.units[closure.active][i] / (closure.pace if part else 1.0)
-    total: list[Array] = []
-    for side, weight in _CENTRAL:
-        moved = start[0].copy(), start[1].copy()
-        moved[part][i] += side * nudge
-        more = [weight / nudge * x for x in setup(moved)]
-        total = [x + y for x, y in zip(total, more, strict=True)] if total else more
-    return Setup(*total)
-
-
-def _value(name: str, machine: Machine, named: Named | None, start: tuple[Array, Array]) -> float:
-    if named is None or name.startswith(START):
-        part, i = _begins(name, machine)
-        return float(start[part][i])
-    return named.value(name)

@@ -5,9 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from crane.closure.traced import geometry_of
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.dynamics import Dynamics
+from crane.machine import Machine
 
 FRAME = 6  # numbers of a frame
 
@@ -43,6 +45,7 @@ def setup_of(
     initial: tuple[Array, Array],
     frames: Sequence[str],
     times: Array,
+    variant: Machine | None = None,
 ) -> Setup:
     """The numbers of a simulation.
 
@@ -52,23 +55,30 @@ def setup_of(
         initial: q_A and v_A at first.
         frames: Links that are observed.
         times: (N,) [s].
+        variant: A machine of the same structure whose numbers are asked for, if not the machine's
+            own, with the controller on it.
     """
-    machine = dynamics.machine
+    machine = dynamics.machine if variant is None else variant
+    constants = dynamics.constants(machine)
+    geometry, numbers = np.split(constants, [len(dynamics.machine.closure.fast.geometry.numbers)])
+    # what residuals are measured by is no part of the motion
+    geometry[-1] = dynamics.machine.closure.fast.geometry.numbers[-1]
     q = machine.closure.solve(initial[0], guess=machine.home)
     own = np.zeros(0)
     if hasattr(control, "start_at"):
-        own = control.start_at(dynamics, q)
+        # nothing is worth compiling for one posture
+        own = control.start_at(Dynamics(machine, backend="pinocchio"), q)
     if isinstance(control, ValveDrive):
         own = own[: control.circuit.stiff]
     places = [np.zeros(0)]
+    turns = geometry_of(machine.closure.equations).turns
     for link in frames:
         frame = machine.model.frames[machine.frame(link)]
-        body = machine.coordinates.bodies[int(frame.parentJoint)]
-        turn = machine.closure.fast.geometry.turns[body].T
+        turn = turns[machine.coordinates.bodies[int(frame.parentJoint)]].T
         places += [turn @ frame.placement.translation, turn @ frame.placement.rotation[:, 0]]
     return Setup(
-        machine.closure.fast.geometry.numbers,
-        np.where(np.isnan(dynamics.pattern), 0.0, dynamics.numbers),
+        geometry,
+        np.where(np.isnan(dynamics.pattern), 0.0, numbers),
         np.asarray(control.settings, dtype=np.float64),
         np.concatenate(places),
         control.references(times),
