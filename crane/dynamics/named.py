@@ -13,8 +13,8 @@ from crane.machine import Machine
 SMALL = 0.1  # what counts as large of a number that is 0
 _SHARE = 1e-3  # of a number
 _STRAIGHT = 1e-11  # second difference of what is straight, as a share of the first
-# f'(0) h from f(0), f(h), ... f(5 h), of order 5
-_FORWARD = np.array([-137 / 60, 5.0, -5.0, 10 / 3, -5 / 4, 1 / 5], dtype=np.float64)
+# f'(0) h from f(h) - f(0), ... f(5 h) - f(0), of order 5
+_FORWARD = np.array([5.0, -5.0, 10 / 3, -5 / 4, 1 / 5], dtype=np.float64)
 
 
 class Named:
@@ -86,6 +86,6 @@ class Named:
             np.abs(far - 2.0 * near + here) <= _STRAIGHT * np.abs(first) + 4e-16 * np.abs(here)
         ).all():
             return first / (2.0 * _SHARE * unit)
-        rows = [here, near, far, *map(at, range(3, len(_FORWARD)))]
-        slope: Array = _FORWARD @ np.array(rows) / (_SHARE * unit)
+        rows = [near, far, *map(at, range(3, len(_FORWARD) + 1))]
+        slope: Array = _FORWARD @ (np.array(rows) - here) / (_SHARE * unit)
         return slope

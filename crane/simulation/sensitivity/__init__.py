@@ -1,5 +1,6 @@
 """Sensitivities of a simulation."""
 
+from crane.simulation.sensitivity.functional import Gradient, gradient
 from crane.simulation.sensitivity.named import Sensitivities, sensitivities
 
-__all__ = ["Sensitivities", "sensitivities"]
+__all__ = ["Gradient", "Sensitivities", "gradient", "sensitivities"]

@@ -111,13 +111,14 @@ class Directions:
         part, i = _begins(name, machine)
         closure = machine.closure
         nudge = _NUDGE * closure.units[closure.active][i] / (closure.pace if part else 1.0)
-        total: list[Array] = []
+        start = np.zeros(0)
         for side, weight in _CENTRAL:
             moved = self._start[0].copy(), self._start[1].copy()
             moved[part][i] += side * nudge
-            more = [weight / nudge * x for x in self._at(machine, moved, times)]
-            total = [x + y for x, y in zip(total, more, strict=True)] if total else more
-        return Setup(*total)
+            more = weight / nudge * self._at(machine, moved, times).start
+            start = start + more if start.size else more
+        base = self.base(times)  # nothing else of it depends on where a motion starts
+        return Setup(*(np.broadcast_to(0.0, x.shape) for x in base))._replace(start=start)
 
 
 def _begins(name: str, machine: Machine) -> tuple[int, int]:

@@ -73,13 +73,6 @@ class Nodes(NamedTuple):
         share, one = self.share[:, None], values[..., self.before, :]
         return np.ascontiguousarray((1.0 - share) * one + share * values[..., behind, :])
 
-    def give(self, weights: Array, to: Array) -> None:
-        """The transpose of `between`: add weights (2 n + 1, ...) to those (2 N + 1, ...)."""
-        behind = np.minimum(self.before + 1, len(to) - 1)
-        share = self.share.reshape(-1, *np.ones(weights.ndim - 1, dtype=int))
-        np.add.at(to, self.before, (1.0 - share) * weights)
-        np.add.at(to, behind, share * weights)
-
 
 class Stretch(NamedTuple):
     """Recorded steps between two instants; none from an instant to itself, where things switch.

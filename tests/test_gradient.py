@@ -1,0 +1,272 @@
+"""Gradients of sums over simulations: sensitivities, closed forms, differences."""
+
+import numpy as np
+import pytest
+from test_sensitivities import DAMPING, HYDRAULIC, MASS, STIFFNESS, Ramp, block
+from work import at_most
+
+import crane
+from crane.common.errors import CraneError
+from crane.formats.loading import Variants
+from crane.simulation.sensitivity import adjoint, follow
+from crane.simulation.sensitivity.asked import Asked
+from crane.simulation.sensitivity.functional import _changes
+from crane.simulation.sensitivity.setup import Setup
+from crane.simulation.sensitivity.track import Track
+
+ORDER_8 = ((1, 4 / 5), (2, -1 / 5), (3, 4 / 105), (4, -1 / 280))
+
+
+def last(output=0):
+    """J is an output at the last instant."""
+
+    def of(time, y):
+        weights = np.zeros_like(y)
+        weights[-1, output] = 1.0
+        return y[-1, output], weights
+
+    return of
+
+
+def squares(time, y):
+    return 0.5 * (y**2).sum(), y
+
+
+def test_a_damped_spring_as_its_closed_form(tmp_path):
+    spring = f"forces: [{{joint: x, stiffness: {STIFFNESS}, damping: {DAMPING}}}]"
+    machine = block(tmp_path, spring=spring)
+    by = ("start.x", "start.x_velocity", "block.mass", "spring.x.stiffness", "spring.x.damping")
+    start = [0.3], [0.1]
+    found = crane.gradient(
+        machine, None, start, 5.0, 1e-3, of=squares, by=by, outputs=("x", "x_velocity"),
+        tolerance=1e-12,
+    )  # fmt: skip
+
+    def total(x0, v0, m, k, d):
+        roots = np.roots(np.array([m, d, k], dtype=complex))
+        weights = np.linalg.solve(np.array([[1, 1], roots]), np.array([x0, v0], dtype=complex))
+        waves = weights * np.exp(np.outer(found.recording.time, roots))
+        return (
+            0.5 * (waves.sum(1).real ** 2).sum() + 0.5 * ((waves * roots).sum(1).real ** 2).sum()
+        )
+
+    at = np.array([0.3, 0.1, MASS, STIFFNESS, DAMPING])
+    assert found.total == pytest.approx(total(*at), rel=1e-9)
+    for i, name in enumerate(by):
+        h = 3e-3 * at[i] * np.eye(5)[i]
+        true = sum(w * (total(*(at + j * h)) - total(*(at - j * h))) for j, w in ORDER_8)
+        assert found.of(name) == pytest.approx(true / (3e-3 * at[i]), rel=1e-8), name
+    assert found.values == pytest.approx(at)
+
+
+def test_behind_a_stop_everything_depends_on_when_it_stopped(tmp_path):
+    """A block swings on a spring until friction F holds it, at (-1)^n (x0 - 2 n F / k)."""
+    coulomb, x0 = 1.7, 0.3
+    spring = f"forces: [{{joint: x, stiffness: {STIFFNESS}}}]"
+    machine = block(tmp_path, f"{{x: {{coulomb: {coulomb}}}}}", spring)
+    by = ("start.x", "friction.x.coulomb", "spring.x.stiffness", "block.mass")
+    found = crane.gradient(machine, None, [x0], 4.0, 2e-3, of=last(), by=by, outputs=("x",))
+    n = round((x0 * STIFFNESS / coulomb - 1.0) / 2.0 + 0.4999)
+    true = (-1) ** n * np.array([1.0, -2 * n / STIFFNESS, 2 * n * coulomb / STIFFNESS**2, 0.0])
+    assert found.slopes == pytest.approx(true, abs=1e-8)
+
+
+def test_behind_a_start_everything_depends_on_when_it_started(tmp_path):
+    """A growing force c t moves a block from t = F / c on: x = c (t - F / c)^3 / (6 m)."""
+    coulomb = 2.0
+    machine = block(tmp_path, f"{{x: {{coulomb: {coulomb}}}}}")
+    found = crane.gradient(
+        machine, Ramp(machine), [0.0], 2.0, 2e-3, of=last(),
+        by=("friction.x.coulomb", "block.mass"), outputs=("x",),
+    )  # fmt: skip
+    since = 2.0 - coulomb / 3.0
+    true = [-(since**2) / (2 * MASS), -3.0 * since**3 / (6 * MASS**2)]
+    assert found.slopes == pytest.approx(true, abs=1e-9)
+
+
+def forwarder():
+    machine = crane.load("mini_forwarder")
+    controller = crane.ComputedTorque(machine, crane.task_trajectory(machine, "lift"))
+    by = ("link3.mass", "friction.X1.viscous", "link3_G.x", "start.X1", "link7.inertia.xx")
+    outputs = ("X1", "q2", "X1_force", "tip_z", "kinetic")
+    return machine, controller, None, 0.6, by, outputs
+
+
+def hydraulic():
+    """Valves that open, soft oil, joints that stick, a cylinder that meets its end stop."""
+    changes = {"payload.mass": 150.0, "X_lift.upper": 0.31}
+    machine = crane.load("patu655", changes=changes, lock={"X_ext": 0.1, "slew": 0.0})
+    levers = {}
+    for joint, share in (("X_lift", 1.0), ("X_tilt", -0.5)):
+        valve = machine.hydraulics.valves[joint]
+        ways = share * np.array([0.0, 0.0, 1.0, 1.0, -0.5])
+        levers[joint] = valve.neutral + ways * (valve.full - valve.neutral)
+    signals = crane.Signals(machine, [0, 0.1, 0.3, 0.6, 0.8], levers)
+    by = (*HYDRAULIC, "start.X_lift", "friction.X_tilt.coulomb", "tilt_boom.com.x",
+          "end_stop.X_lift.stiffness")  # fmt: skip
+    outputs = ("X_lift", "X_tilt_velocity", "pressure_X_lift_a", "inclination_lift_boom")
+    return machine, signals, [0.3, 0.3], 0.8, by, outputs
+
+
+def both(machine, controller, initial, duration, by, outputs, accuracy):
+    """Sums of random weights of what `follow` gives, and the gradients of these."""
+    asked = Asked.of(machine, controller, initial, duration, 1e-3, outputs, None, None)
+    track, several = Track(asked.motion, None), 2
+    directions = asked.directions.by(by, track.time)
+    base = asked.directions.base(track.time)
+    sizes = {name: asked.directions.size(name) for name in by}
+    stacked = Setup(*map(np.array, zip(*directions.values(), strict=True)))
+    forward = follow.follow(
+        asked.motion, outputs, lambda _: (base, stacked), np.array(list(sizes.values())), accuracy
+    ).slopes
+    weights = np.random.default_rng(0).normal(size=(several, *forward.shape[:2]))
+    gatherer = adjoint.Gatherer(track, outputs, base, _changes(directions, sizes), accuracy)
+    found = gatherer.run(weights)
+    back = sum(
+        getattr(found, part) @ getattr(stacked, part).T
+        for part in Setup._fields if part != "references"
+    )  # fmt: skip
+    assert not stacked.references.any()
+    parts = np.einsum("Kik,ikp->Kip", weights, forward)
+    return back, parts.sum(1), np.abs(parts).max(axis=1), len(track.chart.sticking.switches)
+
+
+@pytest.mark.parametrize("made", [forwarder, hydraulic])
+@pytest.mark.parametrize("parted", [False, True])
+def test_it_is_the_transpose_of_sensitivities(made, parted, monkeypatch):
+    """To rounding, where both take the same steps: none in parts, or each."""
+    case, accuracy = list(made()), np.inf
+    if parted:
+        monkeypatch.setattr(follow, "DEEPEST", 1)
+        monkeypatch.setattr(adjoint, "DEEPEST", 1)
+        case[3], accuracy = 0.1, 0.0
+    back, forward, size, switches = both(*case, accuracy)
+    assert (np.abs(back - forward) <= 1e-10 * size).all(), np.abs(back - forward) / size
+    assert parted or made is forwarder or switches > 2
+
+
+@pytest.mark.parametrize("made", [forwarder, hydraulic])
+def test_its_own_choice_of_steps_is_as_good(made):
+    back, forward, size, _ = both(*made(), follow.ACCURACY)
+    assert (np.abs(back - forward) <= follow.ACCURACY * size).all(), np.abs(back - forward) / size
+
+
+def test_differences_of_order_8_agree():
+    machine = crane.load("mini_forwarder", changes={
+        f"friction.{joint}.{key}": 0.0
+        for joint in crane.load("mini_forwarder").joints for key in ("coulomb", "stiction")
+    })  # fmt: skip
+    controller = crane.ComputedTorque(machine, crane.task_trajectory(machine, "lift"))
+    variants, outputs = Variants(machine), ("X1", "tip_z", "q2_velocity")
+    by = ("link3.mass", "link3_G.x", "friction.X1.viscous", "link5.mass")
+    found = crane.gradient(
+        machine, controller, None, 0.5, 1e-3, of=squares, by=by, outputs=outputs, tolerance=1e-12
+    )
+
+    def total(name, value):
+        other = variants.machine({name: value})
+        columns = crane.simulate(other, controller, None, 0.5, 1e-3, tolerance=1e-12).columns()
+        q = np.column_stack([columns[joint] for joint in other.joints])
+        v = np.column_stack([columns[joint + "_velocity"] for joint in other.active])
+        rows = other.closure.gamma(q)[:, other.joints.index("q2")]
+        y = np.column_stack([columns["X1"], columns["tip_z"], (rows * v).sum(1)])
+        return squares(None, y)[0]
+
+    for name in by:
+        value = variants.values[name]
+        h = 1e-2 * (abs(value) or 0.1)
+        ways = [(w, total(name, value + j * h) - total(name, value - j * h)) for j, w in ORDER_8]
+        true = sum(w * way for w, way in ways) / h
+        noise = 1e-10 * found.total / h  # of simulations to 1e-12
+        assert found.of(name) == pytest.approx(true, rel=1e-7, abs=noise), name
+
+
+def test_all_numbers_that_matter_are_found():
+    machine, controller, initial, _, _, _ = forwarder()
+    found = crane.gradient(machine, controller, initial, 0.1, of=last(), outputs=("X1_force",))
+    assert len(found.by) > 100
+    some = list(found.by[::20])
+    fewer = crane.sensitivities(
+        machine, controller, initial, 0.1, by=some, outputs=("X1_force",)
+    ).slopes[-1, 0]
+    sizes = np.maximum(np.abs(fewer), 1e-9 * np.abs(found.slopes).max())
+    assert (np.abs([found.of(name) for name in some] - fewer) <= 1e-6 * sizes).all()
+    text = found.to_text()
+    assert f"20 of {len(found.by)} numbers" in text and "1 % does to J" in text
+
+
+def test_it_takes_no_more_for_more_numbers():
+    """The way back, counted in lines."""
+    machine, controller, initial, _, _, outputs = forwarder()
+    asked = Asked.of(machine, controller, initial, 0.05, 1e-3, outputs, None, None)
+    track = Track(asked.motion, None)
+    base, names = asked.directions.base(track.time), ["link3.mass", "link7.mass"]
+    names += [f"link{i}.com.{axis}" for i in (3, 4, 5, 6, 7) for axis in "xyz"]
+    every = asked.directions.by(names, track.time)
+    work = []
+    for count in (2, len(names)):
+        some = {name: every[name] for name in names[:count]}
+        changes = _changes(some, {name: asked.directions.size(name) for name in some})
+        gatherer = adjoint.Gatherer(track, outputs, base, changes)
+        with at_most(10**7) as counted:
+            gatherer.run(np.ones((1, 51, len(outputs))))
+        work.append(counted.lines)
+    assert work[1] <= 1.05 * work[0]
+
+
+def test_several_at_once_are_each_by_itself(tmp_path):
+    spring = f"forces: [{{joint: x, stiffness: {STIFFNESS}}}]"
+    machine = block(tmp_path, f"{{x: {{coulomb: {1.7}}}}}", spring)
+    given = {"by": ("start.x", "friction.x.coulomb"), "outputs": ("x", "x_velocity")}
+    weights = np.random.default_rng(3).normal(size=(3, 1001, 2))
+    found = crane.gradient(machine, None, [0.3], 2.0, 2e-3, of=weights, **given)
+    assert found.total.shape == (3,) and found.slopes.shape == (3, 2)
+    for i, one in enumerate(weights):
+        alone = crane.gradient(machine, None, [0.3], 2.0, 2e-3, of=one, **given)
+        assert alone.total == pytest.approx(found.total[i])
+        assert alone.slopes == pytest.approx(found.slopes[i], rel=1e-6)
+    assert "J3" in found.to_text()
+
+
+@pytest.mark.parametrize("name", ["mini_forwarder", "patu655"])
+def test_a_machine_beside_another_has_the_numbers_of_one_that_is_loaded(name):
+    machine = crane.load(name)
+    dynamics, variants = crane.Dynamics(machine), Variants(machine)
+    random, refused = np.random.default_rng(5), 0
+    for number in random.permutation(list(variants.values))[:40].tolist():
+        value = variants.values[number]
+        changes, found = {number: value + 5e-3 * (abs(value) or 0.1)}, []
+        for made in (variants.machine, variants.near):
+            try:
+                other = made(changes)
+            except CraneError:
+                found.append(None)
+                refused += 1
+            else:
+                q = other.closure.solve(machine.home[machine.closure.active], machine.home)
+                found.append(np.concatenate([dynamics.constants(other), q]))
+        assert (found[0] is None) == (found[1] is None), number
+        if found[0] is not None:
+            assert found[0] == pytest.approx(found[1], rel=1e-12, abs=1e-12), number
+    assert refused
+
+
+def test_what_has_no_gradient_is_refused(tmp_path):
+    machine = block(tmp_path)
+    start, by = ([0.0], [1.0]), ["block.mass"]
+    weights = np.ones((101, 1))
+    for options, text in (
+        ({"of": np.ones((100, 1)), "by": by}, r"have the shape \(100, 1\), give \(101, 1\)"),
+        ({"of": weights * np.nan, "by": by}, "not finite"),
+        ({"of": lambda t, y: (0.0, y[0]), "by": by}, r"have the shape \(1,\)"),
+        ({"of": weights, "by": ["mass"]}, "'mass'"),
+        ({"of": weights, "by": []}, "no number is named"),
+        ({"of": weights, "by": by, "outputs": ["y"]}, "'y' is no output of 'block'"),
+    ):
+        with pytest.raises(CraneError, match=text):
+            crane.gradient(machine, None, start, 0.1, **options)
+    found = crane.gradient(machine, None, start, 0.1, of=weights, by=by)
+    with pytest.raises(CraneError, match="'block.mas' is not among them"):
+        found.of("block.mas")
+    with pytest.raises(CraneError, match="where the machine has other equations"):
+        crane.sensitivities("patu655", duration=0.1, by=["cylinder.X_lift.stiffness"])
