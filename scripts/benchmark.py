@@ -14,6 +14,7 @@ from pathlib import Path
 from derivatives import derivatives
 from engines import work_precision
 from evaluations import agree, forward_dynamics, one_step, task
+from gradients import gradients
 from hydraulic_crane import hydraulic_crane
 from results import conditions, put
 from stacks import stacks, threads
@@ -45,6 +46,7 @@ def main() -> None:
         ("Stacks", lambda: stacks(mini, few)),
         ("Threads", lambda: threads(mini, few)),
         ("A crane on its valves", lambda: hydraulic_crane(few)),
+        ("Gradients of a motion", gradients),
         ("Starting", lambda: starts(few)),
         ("Work and precision", lambda: work_precision(bare, few, picture)),
     ):
