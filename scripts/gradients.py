@@ -9,7 +9,7 @@ from measuring import table
 import crane
 
 _OUTPUTS = ("X_lift", "X_tilt", "pressure_X_lift_a", "tip_z")
-_MANY = 100  # numbers forwards, more of which take minutes to compile
+_MANY = 200  # numbers forwards, more of which take long
 
 
 def gradients() -> str:
@@ -36,7 +36,7 @@ def gradients() -> str:
 
     every = list(back(None).by)
     rows = []
-    for count in (6, 50, len(every)):
+    for count in (6, 50, 200, len(every)):
         some = every[:: len(every) // count][:count]
         took = spent(lambda some=some: back(some))
         ahead = spent(lambda some=some: forwards(some)) if count <= _MANY else 0.0

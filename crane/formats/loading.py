@@ -1,6 +1,7 @@
 """From a description to a machine."""
 
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -11,7 +12,7 @@ import pinocchio as pin
 
 from crane.closure import Closure
 from crane.common.counted import few_warnings
-from crane.common.errors import DescriptionError, InputError
+from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.packages import giving, package_folders, values_by_name
 from crane.description import MachineSpec, changed, driven, locked, parameters
 from crane.description.floating import floated
@@ -103,9 +104,11 @@ class Variants:
     def near(self, changes: Mapping[str, float]) -> Machine:
         """The machine with numbers changed so little that its loops are the same.
 
-        A look at its numbers: see `Closure.near`.
+        A look at its numbers, of which nothing is told: see `Closure.near`.
         """
-        return self._with(changes, self._machine.closure)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CraneWarning)
+            return self._with(changes, self._machine.closure)
 
     def _with(self, changes: Mapping[str, float], near: Closure | None) -> Machine:
         was, every = self._machine, {**self._machine.changes, **changes}
