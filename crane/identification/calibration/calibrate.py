@@ -121,10 +121,13 @@ def calibrate(
     z = search.run()
     found = _result(problem, search, z, before, units)
     taken = {name for x in unknowns for name in (x.name, *dict(x.members))}
-    others = [x for x in candidates(machine, cases, numbers) if x.name not in taken]
-    bounds = {x.name: (x.start, x.low, x.high) for x in others}
-    more = asked(bounds) if bounds else []
-    extras = [replace(x, scale=other.deviation) for x, other in zip(more, others, strict=True)]
+    proposed = {x.name: x for x in candidates(machine, cases, numbers)}
+    more = asked({x.name: (x.start, x.low, x.high) for x in proposed.values()})
+    extras = [
+        replace(x, scale=proposed[x.name].deviation)
+        for x in more
+        if not taken & {x.name, *dict(x.members)}
+    ]
     found = replace(found, lacking=tuple(search.lacking(extras, z)))
     known = dict(machine.sensors) | dict(cases[0].known)
     return replace(found, machine=_sensing(found.machine, known, columns, found.changes))

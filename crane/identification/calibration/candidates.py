@@ -105,11 +105,14 @@ def _of_valve(
         yield _scaled(f"{name}.c*", 1.0, 0.3, 2.5)
     else:
         for one in orifices:
-            yield _scaled(one, numbers[one], 0.3, 2.5)
+            if numbers[one]:
+                yield _scaled(one, numbers[one], 0.3, 2.5)
     if valve.bandwidth:
-        yield Candidate(f"{name}.bandwidth", valve.bandwidth, valve.bandwidth, _SLOW, _FAST)
+        low, high = min(valve.bandwidth, _SLOW), max(valve.bandwidth, _FAST)
+        yield Candidate(f"{name}.bandwidth", valve.bandwidth, valve.bandwidth, low, high)
     delay = f"{SENSOR}{SIGNAL}{joint}.delay"
-    yield Candidate(delay, numbers.get(delay, 0.0), _LATE, 0.0, _LATEST)
+    late = numbers.get(delay, 0.0)
+    yield Candidate(delay, late, _LATE, 0.0, max(late, _LATEST))
 
 
 def _of_cylinder(

@@ -157,12 +157,17 @@ class Search:
         if not others:
             return []
         whole = Problem(problem.machine, [*problem.unknowns, *others], problem.cases)
+        whole.smooth, whole.slopes = problem.smooth, problem.slopes
         count, more = len(problem.unknowns), len(others)
         there = np.concatenate([z[:count], np.zeros(more), z[count:]])
         rows = []
-        for case in self._trained:
-            wider = next(x for x in whole.cases if x.name == case.name)
-            _, slopes = whole.linearized(wider, there, set(range(count)))
+        for case, wider in zip(problem.cases, whole.cases, strict=True):
+            if not case.train.any():
+                continue
+            try:
+                _, slopes = whole.linearized(wider, there, set(range(count)))
+            except CraneError:  # a hint is not worth what was found
+                return []
             own = (slopes * self._weights(case)[:, :, None])[case.train]
             rows.append(own.reshape(-1, whole.size)[:, count : count + more])
         return lacking(others, self.jacobian, np.vstack(rows), self.residual, self.prior)

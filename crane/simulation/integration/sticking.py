@@ -71,7 +71,7 @@ class Sticking:
         moving: Whether anything moves.
         settled: Whether all this has been found.
         undetermined: Whether forces at rest were, of joints that hold the same.
-        switches: What has happened, the start first.
+        switches: What has happened, the start first, of who asks for it by an empty list.
     """
 
     def __init__(self, machine: Machine, columns: tuple[int, ...], limits: Array):
@@ -82,7 +82,7 @@ class Sticking:
         self.slip = np.zeros(len(columns))
         self.held = np.zeros(len(columns), dtype=bool)
         self.moving, self.settled, self.undetermined = True, False, False
-        self.switches: list[Switch] = []
+        self.switches: list[Switch] | None = None
 
     @property
     def notes(self) -> list[str]:
@@ -98,9 +98,10 @@ class Sticking:
         ]
 
     def note(self, time: float, state: Array) -> None:
-        """Remember what has changed at a time [s] and a state."""
-        now = Switch(time, state.copy(), self.slip.copy(), self.held.astype(float), self.moving)
-        self.switches.append(now)
+        """Remember what has changed at a time [s] and a state, if asked to."""
+        if self.switches is not None:
+            now = Switch(time, state.copy(), self.slip.copy(), self.held.astype(float), self.moving)
+            self.switches.append(now)
 
     def tell(self, dynamics: Dynamics) -> None:
         """Make the present modes those of a machine's dynamics."""

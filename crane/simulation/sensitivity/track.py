@@ -154,6 +154,7 @@ class Track:
             )
         if machine.coordinates.floating:
             raise InputError(f"'{machine.name}' floats, sensitivities are of machines that stand")
+        self.chart.sticking.switches = []
         made = (dynamics, control, motion.initial, 2 * count, 0.5 * step, motion.method)
         time, parts, self.notes = integrate(*made, progress, motion.tolerance, self.chart)
         if len(time) <= 2 * count:
@@ -166,7 +167,8 @@ class Track:
         self._states = self.rows[:, : self.layout.start("tau")]
         make = integration_of(dynamics, control, self.own, motion.method, motion.tolerance)
         self._way = make(self.chart)
-        self._switches = [*self.chart.sticking.switches]
+        self._switches: list[Switch] = self.chart.sticking.switches
+        self.chart.sticking.switches = None  # parts that are simulated anew are no news
         seen, closure = self.chart.seen, machine.closure
         minimal = np.hstack([parts.q[:, seen], parts.v_a, parts.own[:, : self.stiff]])
         units = np.concatenate([closure.units[seen], closure.units[seen] / closure.pace])
@@ -224,7 +226,10 @@ class Track:
         kept = sticking.slip.copy(), sticking.held.copy(), sticking.moving
         rows = np.empty((2 * FINER, len(self._way.last(begins, state))))
         self._way.offset = 0.0
-        self._way.run(times[:-1], state, times[1] - times[0], rows)
+        if self._way.run(times[:-1], state, times[1] - times[0], rows) < len(rows):
+            raise SimulationError(
+                f"at t = {begins:.4g} s the motion jumps and cannot be followed, shorten the step"
+            )
         sticking.slip[:], sticking.held[:], sticking.moving = kept
         sticking.tell(self.chart.dynamics)
         return Nodes(times, np.vstack([rows[:, : len(state)], last]), *self._placed(times))
