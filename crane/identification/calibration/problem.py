@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,10 @@ from crane.dynamics import Dynamics
 from crane.formats.loading import Variants
 from crane.identification.calibration.unknowns import FITTED, Unknown
 from crane.machine import Machine
-from crane.recordings.reading import Span, corrected
+from crane.recordings.reading import ALWAYS, Span, corrected
 from crane.recordings.timeseries import TIME, Table, column
 from crane.simulation.readings import read_off
-from crane.simulation.recorded import recorded
+from crane.simulation.recorded import recorded as recording_of
 from crane.simulation.replays import Inputs, inputs_of
 from crane.simulation.run import simulate, start_of
 from crane.simulation.sensitivity.follow import follow
@@ -26,11 +26,12 @@ from crane.simulation.sensitivity.rate import frames_of
 from crane.simulation.sensitivity.setup import Setup, setup_of
 from crane.simulation.sensitivity.track import Motion
 
+ROUGH = 1e-4  # error of derivatives
 _NUDGE = 1e-5  # of an unknown's scale, for differences of the numbers of a simulation
 _FEWEST = 20  # instants of a recording
 _SMOOTH = {"rad": 5e-3, "m": 2e-3}  # [rad/s], [m/s] over which friction changes its sign
 _SHARPEST, _FINEST = 1e-2, 2e-3  # [s] of a step of a simulation, and with derivatives, at most
-_ROUGH = 1e-4  # error of derivatives
+_KEPT = 100  # machines with numbers that were asked for last
 # What starts may be off by, one standard deviation, where nothing measures them: rad, m, rates.
 _PLACE, _PACE = {"rad": 5e-3, "m": 5e-3}, {"rad": 0.01, "m": 5e-3}
 _SURE = 2.0  # noises of a sensor that the start is off by, which is the mean of several samples
@@ -49,8 +50,11 @@ class Case:
         measured: (N, k) their readings.
         known: What was known of the recording's sensors.
         train: (N,) which instants are fitted, true or false.
-        first: Where its start is among all unknowns.
+        table: As it was read.
         starts: (s,) standard deviations of the start's deviations: q_A, v_A, pressures A and B.
+        first: Where its start is among all unknowns.
+        signals: Of valves in the whole recording that this is a part of, with their times: what
+            comes late began before.
     """
 
     name: str
@@ -60,8 +64,30 @@ class Case:
     measured: Array
     known: Mapping[str, Sensor]
     train: NDArray[np.bool_]
+    table: Table
+    starts: Array
     first: int = 0
-    starts: Array = field(default_factory=lambda: np.zeros(0))
+    signals: tuple[Array, Mapping[str, Array]] | None = None
+
+    def parts(self, machine: Machine, length: float) -> list["Case"]:
+        """Parts of what is fitted [s], each of which starts where it was measured.
+
+        The way from one to the next is left open: this is multiple shooting whose gaps weigh
+        nothing, for a search that is far from its end (Bock 1981).
+        """
+        time = self.inputs.time
+        fitted = np.flatnonzero(self.train)
+        span = time[fitted[-1]] - time[fitted[0]]
+        count = int(min(span / length, len(fitted) / _FEWEST))
+        if count < 2:
+            return []
+        found = []
+        for some in np.array_split(fitted, count):
+            table = Table(self.table.units, self.table.values[some], self.table.notes)
+            part = case_of(machine, self.name, table, self.known, self.sensors, ALWAYS)
+            signals = time - time[some[0]], self.inputs.signals
+            found.append(replace(part, signals=signals))
+        return found
 
 
 def case_of(
@@ -114,7 +140,7 @@ def case_of(
         ]
     for joint in inputs.pressures:
         starts += [near(f"pressure_{joint}_{side}", "Pa", 0.0) for side in "ab"]
-    return Case(name, inputs, clock, sensors, measured, known, train, starts=np.array(starts))
+    return Case(name, inputs, clock, sensors, measured, known, train, table, np.array(starts))
 
 
 def noise_of(x: Array) -> float:
@@ -135,6 +161,7 @@ class Problem:
             where and when something sticks depends on everything before, and what a small change
             does then tells little of larger ones.
         slopes: Share by which derivatives are smoothed at least.
+        rough: Error of derivatives.
     """
 
     def __init__(self, machine: Machine, unknowns: Sequence[Unknown], cases: Sequence[Case]):
@@ -146,6 +173,8 @@ class Problem:
             count += len(case.starts)
         self.size, self.runs = count, 0
         self.smooth = self.slopes = 0.0
+        self.rough = ROUGH
+        self._made: dict[tuple[float, ...], Machine] = {}
 
     def values(self, z: Array) -> dict[str, float]:
         """Of the unknowns, by name."""
@@ -170,6 +199,14 @@ class Problem:
     def variant(self, z: Array, smooth: float) -> Machine:
         """The machine with these numbers, to be simulated, its friction smoothed by a share."""
         changes = {x: value for x, value in self.changes(z).items() if not x.startswith(SENSOR)}
+        key = smooth, *changes.values()
+        if key not in self._made:
+            if len(self._made) >= _KEPT:
+                self._made.clear()
+            self._made[key] = self._varied(changes, smooth)
+        return self._made[key]
+
+    def _varied(self, changes: Mapping[str, float], smooth: float) -> Machine:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             made = self._variants.machine(changes) if changes else self.machine
@@ -216,9 +253,11 @@ class Problem:
             place = np.clip(np.array(places) + moved[:n], low, high)
             initial = place, initial[1] + moved[n : 2 * n]
             moved = moved[2 * n :]
-        for joint, x in inputs.signals.items():
+        whole, recorded = case.signals or (inputs.time, inputs.signals)
+        some = slice(begun := int(np.searchsorted(whole, 0.0)), begun + len(inputs.time))
+        for joint, x in recorded.items():
             name = SIGNAL + joint
-            signals[joint] = self._sensor(case, name, values).quantity(name, inputs.time, x)
+            signals[joint] = self._sensor(case, name, values).quantity(name, whole, x)[some]
         pairs = moved.reshape(-1, 2)
         pressures = {
             joint: (
@@ -320,8 +359,8 @@ class Problem:
         motion = Motion(dynamics, drive, initial, steps, step)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = follow(motion, case.sensors, setup, np.ones(len(moving)), _ROUGH)
-            run = recorded(machine, drive, found.time, found.parts, "")
+            found = follow(motion, case.sensors, setup, np.ones(len(moving)), self.rough)
+            run = recording_of(machine, drive, found.time, found.parts, "")
         curve = CubicSpline(found.time, read_off(machine, run, case.sensors))
         here, slopes = self._sensed(case, curve, z)
         out = np.zeros((*here.shape, self.size))

@@ -1,5 +1,6 @@
 """The search for a calibration: Levenberg and Marquardt's method within bounds."""
 
+import warnings
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from crane.common.errors import CraneError
 from crane.common.samples import Array
 from crane.identification.calibration.lacking import Lacking, lacking
-from crane.identification.calibration.problem import Case, Problem, noise_of
+from crane.identification.calibration.problem import ROUGH, Case, Problem, noise_of
 from crane.identification.calibration.unknowns import Unknown
 
 Progress = Callable[[float], None]
@@ -20,7 +21,10 @@ _STEPS = 40  # of Gauss-Newton between them
 _SETTLED, _BEGUN = 1e-4, 1e-2  # change of the cost, as a share, that ends them
 _EXACT, _NOTHING = 1e-6, 1e-9  # of a channel's largest value, and of one that is zero [SI]
 _FLOOR = 0.2  # of a channel's variation, that no channel may be off by for nothing
-_GROWN, _SHRUNK, _STIFFEST = 10.0, 0.2, 1e8  # of Levenberg's damping
+_DAMPED, _CAREFUL = 1e-3, 1.0  # Levenberg's damping at first, and far from the end
+_GROWN, _SHRUNK, _STIFFEST = 10.0, 0.2, 1e8  # of it
+_PART = 2.0  # [s] of recordings that are begun with
+_CRUDE = 1e-2  # error of derivatives far from the end
 _BLOCKS = 8, 40  # least and most blocks of a covariance
 
 
@@ -34,17 +38,16 @@ class Search:
         blocks: (M,) block of each row.
     """
 
-    def __init__(self, problem: Problem, progress: Progress | None):
+    def __init__(self, problem: Problem, progress: Progress | None, done: int = 0):
         self._problem, self._progress = problem, progress
         unknowns = problem.unknowns
         rest = problem.size - len(unknowns)
         self.low = np.array([(x.low - x.start) / x.scale for x in unknowns] + [-np.inf] * rest)
         self.high = np.array([(x.high - x.start) / x.scale for x in unknowns] + [np.inf] * rest)
-        self.prior = np.array([0.0] * len(unknowns) + [1.0] * rest)
-        self._stage = max((x.stage for x in unknowns), default=0)
+        self.prior = np.array([x.prior for x in unknowns] + [1.0] * rest)
         self.sizes: dict[str, float] = {}
         self.jacobian = self.residual = self.blocks = np.zeros(0)
-        self._done = 0
+        self._done = done
 
     def run(self) -> Array:
         """The unknowns."""
@@ -55,8 +58,9 @@ class Search:
         self.sizes = dict(most)
         z = np.zeros(problem.size)
         sticks = any(law.sticks for law in problem.machine.friction.values())
-        problem.smooth = float(sticks)
+        problem.smooth, problem.rough = float(sticks), _CRUDE
         z = self._begun(z)
+        problem.rough = ROUGH
         for i in range(_ROUNDS):
             z = self._minimum(z)
             left = self._left([problem.residuals(case, z) for case in self._trained])
@@ -74,16 +78,27 @@ class Search:
         return z
 
     def _begun(self, z: Array) -> Array:
-        """The better one of two minima: of all numbers at once, and of stage after stage.
+        """The better one of two minima: from the file's numbers, and from those of short parts.
 
-        Where something rings, one phase more or less is a minimum, too.
+        Over long motions, one swing more or less is a minimum, too, and so is what never moves.
         """
-        stages = sorted({x.stage for x in self._problem.unknowns})
-        found = [self._minimum(z, _BEGUN)]
-        if len(stages) > 1:
-            for self._stage in stages:
-                z = self._minimum(z, _BEGUN)
-            found.append(z)
+        problem, count = self._problem, len(self._problem.unknowns)
+        found = [self._minimum(z, _BEGUN, _CAREFUL)]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            parts = [x for case in self._trained for x in case.parts(problem.machine, _PART)]
+        if parts:
+            short = Problem(problem.machine, problem.unknowns, parts)
+            short.smooth, short.rough = problem.smooth, problem.rough
+            search = Search(short, self._progress, self._done)
+            search.sizes = self.sizes
+            there = search._minimum(np.zeros(short.size), _BEGUN, _CAREFUL)
+            self._done = search._done
+            problem.runs += short.runs
+            z = z.copy()
+            z[:count] = there[:count]
+            if np.isfinite(self._cost(z)):
+                found.append(self._minimum(z, _BEGUN, _CAREFUL))
         return min(found, key=self._cost)
 
     @property
@@ -140,8 +155,7 @@ class Search:
     def _linearize(self, z: Array) -> None:
         rows, left, blocks = [], [], []
         for number, case in enumerate(self._trained):
-            fixed = {i for i, x in enumerate(self._problem.unknowns) if x.stage > self._stage}
-            residual, slopes = self._problem.linearized(case, z, fixed)
+            residual, slopes = self._problem.linearized(case, z)
             weights = self._weights(case)
             some = case.train
             rows.append((slopes * weights[:, :, None])[some].reshape(-1, self._problem.size))
@@ -172,9 +186,9 @@ class Search:
             rows.append(own.reshape(-1, whole.size)[:, count : count + more])
         return lacking(others, self.jacobian, np.vstack(rows), self.residual, self.prior)
 
-    def _minimum(self, z: Array, settled: float = _SETTLED) -> Array:
+    def _minimum(self, z: Array, settled: float = _SETTLED, damping: float = _DAMPED) -> Array:
         """The nearest minimum for the present weights."""
-        damping, cost = 1e-3, self._cost(z)
+        cost = self._cost(z)
         if not np.isfinite(cost):  # say why
             for case in self._trained:
                 self._problem.residuals(case, z)

@@ -9,9 +9,6 @@ from crane.description.changes import unknown_parameter
 from crane.description.sensors import SENSOR
 from crane.description.spec import MachineSpec
 
-_LAST = 1  # stage of what rings
-_ELASTIC = ("oil.*", "cylinder.*.stiffness", "cylinder.*.damping", "cylinder.*.gas_*",
-            "cylinder.*.hose_*", "cylinder.*.leakage*")  # fmt: skip
 FITTED = {"zero": 0.0, "scale": 1.0, "delay": 0.0}
 _SIZES = {
     "rad": 0.02,
@@ -43,8 +40,8 @@ class Unknown:
         scale: How much counts as 1.
         members: Numbers of the machine that it changes, with what they are at first.
         sensor: Column of the sensor, "" of a number of the machine.
-        stage: From which stage of the search on it is fitted: what rings last, for what it is
-            measured by depends on all else.
+        prior: One over the standard deviation of what is known of it before, in its scale; 0 if
+            nothing is.
     """
 
     name: str
@@ -54,7 +51,7 @@ class Unknown:
     scale: float
     members: tuple[tuple[str, float], ...] = ()
     sensor: str = ""
-    stage: int = 0
+    prior: float = 0.0
 
     def changes(self, value: float) -> dict[str, float]:
         """Numbers of the machine at a value."""
@@ -162,6 +159,4 @@ def _made(
     most = float("inf") if high is None else float(high)
     if not least < most or not least <= start <= most:
         raise InputError(f"'{name}': {start:g} does not lie within {least:g} to {most:g}")
-    elastic = any(fnmatch.fnmatch(name, pattern) for pattern in _ELASTIC)
-    stage = _LAST if elastic else 0
-    return Unknown(name, float(start), least, most, scale, members, sensor, stage=stage)
+    return Unknown(name, float(start), least, most, scale, members, sensor)
