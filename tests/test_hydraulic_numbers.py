@@ -51,6 +51,9 @@ def told(folder, **numbers):
         ({"cylinder": {"area_a": -1e-3}}, "give at least 0"),
         ({"oil": {"bulk_modulus": 0}}, "bulk_modulus of the oil is 0, it must be positive"),
         ({"valve": COMPENSATED | {"flow": 0}}, "'flow' is 0, give the flow at full stroke"),
+        ({"valve": COMPENSATED | {"margin": 0}}, "'margin' is 0, give the pressure drop"),
+        ({"valve": COMPENSATED | {"c1": 4e-7}}, "'flow' stands beside 'c1', keep one of them"),
+        ({"valve": ORIFICE | {"margin": 7e5}}, "'margin' is for valves of type 'compensated'"),
         ({"valve": COMPENSATED | {"dead_band": 11.43}}, "looks like percent, write 0.1143"),
     ],
 )  # fmt: skip

@@ -45,9 +45,9 @@ _Way = tuple[str | int, ...]
 _TENSOR = ("xx", "xy", "xz", "yy", "yz", "zz")
 
 
-def _numbers(spec: MachineSpec) -> Iterator[tuple[str, Link | Joint, _Way]]:
-    """Names of the tree's numbers, with the link or joint that has them, and where."""
-    for link in spec.tree.links.values():
+def tree_numbers(tree: Tree, chains: Iterable[Chain]) -> Iterator[tuple[str, Link | Joint, _Way]]:
+    """Names of a tree's numbers, with the link or joint that has them, and where."""
+    for link in tree.links.values():
         if link.inertial is None:
             continue
         yield f"{link.name}.mass", link, ("inertial", "mass")
@@ -55,8 +55,8 @@ def _numbers(spec: MachineSpec) -> Iterator[tuple[str, Link | Joint, _Way]]:
             yield f"{link.name}.com.{axis}", link, ("inertial", "com", i)
         for i, key in enumerate(_TENSOR):
             yield f"{link.name}.inertia.{key}", link, ("inertial", "tensor", i)
-    attached = {chain.attachment for chain in spec.chains if chain.parent is not None}
-    for joint in spec.tree.joints.values():
+    attached = {chain.attachment for chain in chains if chain.parent is not None}
+    for joint in tree.joints.values():
         if joint.name in attached:
             continue  # whose place stands in no file
         for i, (axis, turn) in enumerate(zip("xyz", _TURNS, strict=True)):
@@ -69,7 +69,8 @@ def _numbers(spec: MachineSpec) -> Iterator[tuple[str, Link | Joint, _Way]]:
             yield f"{joint.name}.rotor_inertia", joint, ("rotor_inertia",)
 
 
-def _number(part: Any, way: _Way) -> float:
+def number_at(part: Any, way: _Way) -> float:
+    """The number of a link or a joint where `tree_numbers` says that it stands."""
     for at in way:
         part = part[at] if isinstance(at, int) else getattr(part, at)
     return float(part)
@@ -97,7 +98,8 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
     tip, or the load that the machine file names, scaled to that mass; of its sensors
     `sensor.QUANTITY.zero`, `.scale`, `.delay`, `.noise`, which may be set of any quantity.
     """
-    found = {name: _number(part, way) for name, part, way in _numbers(spec)}
+    every = tree_numbers(spec.tree, spec.chains)
+    found = {name: number_at(part, way) for name, part, way in every}
     for joint in (joint.name for joint in spec.tree.moving):
         friction = spec.friction.get(joint, Friction())
         for field in dataclasses.fields(Friction):
@@ -105,34 +107,43 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
     for joint, gains in spec.control.items():
         for field in dataclasses.fields(gains):
             found[f"control.{joint}.{field.name}"] = getattr(gains, field.name)
-    for head, (_, _, item) in _elements(spec).items():
+    for head, (_, _, item) in elements(**_lists(spec)).items():
         for field in dataclasses.fields(item):
             if field.name not in ("joint", "between"):
                 found[f"{head}.{field.name}"] = getattr(item, field.name)
     if spec.hydraulics is not None:
-        for head, part in _parts(spec.hydraulics).items():
+        for head, part in circuit_parts(spec.hydraulics).items():
             found |= {f"{head}.{name}": getattr(part, name) for name in number_names(type(part))}
     if spec.tip is not None:
         found[PAYLOAD] = 0.0
     return found | named_numbers(spec.sensors)
 
 
-def _elements(spec: MachineSpec) -> dict[str, tuple[str, int, Element | EndStop]]:
+def elements(
+    **lists: Sequence[Element | EndStop],
+) -> dict[str, tuple[str, int, Element | EndStop]]:
     """Springs, gas springs, ropes and end stops by the names that their numbers begin with.
 
     With the field of the description and the place in it that they have.
+
+    Args:
+        lists: By those fields: forces, gas_springs, ropes, end_stops.
     """
     found: dict[str, tuple[str, int, Element | EndStop]] = {}
     for head, field in (
         ("spring", "forces"), ("gas_spring", "gas_springs"), ("rope", "ropes"),
         ("end_stop", "end_stops"),
     ):  # fmt: skip
-        for i, item in enumerate(getattr(spec, field)):
+        for i, item in enumerate(lists[field]):
             between = getattr(item, "between", None)
             name = f"{head}.{'-'.join(between) if between else item.joint}"
             count = sum(other == name or other.startswith(f"{name}#") for other in found)
             found[f"{name}#{count + 1}" if count else name] = field, i, item
     return found
+
+
+def _lists(spec: MachineSpec) -> dict[str, Sequence[Any]]:
+    return {field: getattr(spec, field) for field in _LISTS}
 
 
 def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
@@ -146,11 +157,11 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
         InputError: Unknown name, or a value that cannot be.
     """
     names = parameters(spec)
-    numbers = {name: (part, way) for name, part, way in _numbers(spec)}
+    numbers = {name: (part, way) for name, part, way in tree_numbers(spec.tree, spec.chains)}
     tree, chains = spec.tree, spec.chains
     friction, control = dict(spec.friction), dict(spec.control)
-    circuit = _parts(spec.hydraulics) if spec.hydraulics else {}
-    elements = _elements(spec)
+    circuit = circuit_parts(spec.hydraulics) if spec.hydraulics else {}
+    acting = elements(**_lists(spec))
     replaced: dict[str, dict[str, float]] = {}
     renewed: dict[str, dict[str, float]] = {}
     off: dict[str, float] = {}
@@ -171,7 +182,7 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
             off[name] = value
         elif head == "friction":
             _set(friction, rest, value, Friction)
-        elif (part := name.rpartition(".")[0]) in elements:
+        elif (part := name.rpartition(".")[0]) in acting:
             renewed.setdefault(part, {})[name.rpartition(".")[2]] = value
         elif part in circuit:
             replaced.setdefault(part, {})[name.rpartition(".")[2]] = value
@@ -183,9 +194,9 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
             tree = tree.replacing(_changed(now, way, value, name))
     for part, values in replaced.items():
         circuit[part] = dataclasses.replace(circuit[part], **values)
-    lists: dict[str, list[Any]] = {field: list(getattr(spec, field)) for field in _LISTS}
+    lists: dict[str, list[Any]] = {field: list(items) for field, items in _lists(spec).items()}
     for part, values in renewed.items():
-        field, i, _ = elements[part]
+        field, i, _ = acting[part]
         lists[field][i] = dataclasses.replace(lists[field][i], **values)
     hydraulics = _circuit(circuit) if circuit else None
     for part, values in replaced.items():
@@ -244,7 +255,7 @@ def _warn_of_units(spec: MachineSpec, part: str, values: Mapping[str, float]) ->
             warnings.warn(what, CraneWarning, stacklevel=2)
 
 
-def _parts(hydraulics: Hydraulics) -> dict[str, Any]:
+def circuit_parts(hydraulics: Hydraulics) -> dict[str, Any]:
     """The parts of a circuit by the names that their numbers begin with."""
     return (
         {"supply": hydraulics.supply, "oil": hydraulics.oil}

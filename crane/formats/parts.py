@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import math
+import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from lxml import etree
 
-from crane.common.errors import CraneWarning
+from crane.common.errors import CraneWarning, one_line
 from crane.description import Coupling
 from crane.description.tree import NO_LIMIT, Joint, Limits, Link, Tree
 from crane.formats.opening import robots
@@ -136,12 +137,23 @@ def linear(coupling: Coupling) -> tuple[list[str], list[float], float]:
     return joints, slopes, coupling.offset / factors[0] + 0.0
 
 
-def finished(robot: etree._Element, comment: str) -> bytes:
-    """A file of an element, indented, with a comment in the first line."""
+def finished(
+    robot: etree._Element, comment: str, notes: Sequence[tuple[etree._Element, str]] = ()
+) -> bytes:
+    """A file of an element, indented, with a comment in the first line, and beside elements."""
     etree.indent(robot)
-    words = comment.replace("--", "- -").strip(" -")
-    head = f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {" ".join(words.split())} -->\n'
+    for element, note in notes:
+        beside = etree.Comment(f" {_within(note)} ")
+        parent = element.getparent()
+        parent.insert(parent.index(element) + 1, beside)
+        beside.tail, element.tail = element.tail, "  "
+    head = f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {_within(comment)} -->\n'
     return head.encode() + etree.tostring(robot, encoding="utf-8") + b"\n"
+
+
+def _within(comment: str) -> str:
+    """Words that may stand in a comment."""
+    return re.sub("-(?=-)", "- ", " ".join(one_line(comment).split())).strip(" -")
 
 
 def origin_of(machine: Machine) -> str:

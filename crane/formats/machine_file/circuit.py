@@ -32,10 +32,8 @@ Part = TypeVar("Part", Oil, Supply, Counterbalance, Cylinder, Valve, PDGains)
 
 _TOGETHER = ("tank", "relief")  # looked at with other parts
 _KINDS = ("orifice", "compensated")
-_OF_KIND = {  # keys that only one kind of valve has
-    "c1": "orifice", "c2": "orifice", "c3": "orifice", "c4": "orifice",
-    "flow": "compensated", "margin": "compensated", "meter_out": "compensated",
-}  # fmt: skip
+_COMPENSATED = ("flow", "margin", "meter_out")  # what only these have
+_EDGES = ("c1", "c2", "c3", "c4")
 
 
 def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) -> Hydraulics | None:
@@ -192,18 +190,23 @@ def _valve(item: Section, joint: str) -> Valve:
     kind = item.text("type")
     if kind not in _KINDS:
         raise item.fail("type", f"valve type '{kind}' is unknown, {known(_KINDS, kind)}")
-    for name, other in _OF_KIND.items():
-        if other != kind and name in item:
-            raise item.fail(name, f"'{name}' is for valves of type '{other}', remove it")
+    for name in _COMPENSATED:
+        if kind == "orifice" and name in item:
+            raise item.fail(name, f"'{name}' is for valves of type 'compensated', remove it")
     if kind == "orifice":
         return _part(item, Valve, joint=joint)
-    flow, margin = item.number("flow", minimum=0.0), item.number("margin", minimum=0.0)
-    for name, value, what in (
-        ("flow", flow, "the flow at full stroke"),
-        ("margin", margin, "the pressure drop that is kept"),
-    ):
-        if value == 0:
-            raise item.fail(name, f"'{name}' is 0, give {what}")
+    margin = item.number("margin", minimum=0.0)
+    if margin == 0:
+        raise item.fail("margin", "'margin' is 0, give the pressure drop that is kept")
+    edges = [name for name in _EDGES if name in item]
+    if edges:
+        for name in ("flow", "meter_out"):
+            if name in item:
+                raise item.fail(name, f"'{name}' stands beside '{edges[0]}', keep one of them")
+        return _part(item, Valve, joint=joint)
+    flow = item.number("flow", minimum=0.0)
+    if flow == 0:
+        raise item.fail("flow", "'flow' is 0, give the flow at full stroke")
     inlet = flow / math.sqrt(margin)
     outlet = item.number("meter_out", inlet, minimum=0.0)
     _warn_of_unit(item, "flow", flow)

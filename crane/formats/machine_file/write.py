@@ -9,12 +9,14 @@ from typing import Any
 
 from lxml import etree
 
-from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
+from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, one_line
 from crane.common.output import file_name, staging
 from crane.description import Task
 from crane.description.sensors import unit_of
 from crane.formats.machine_file.estimation import estimation_data
+from crane.formats.machine_file.places import InFile, InURDF, places
 from crane.formats.machine_file.read import read
+from crane.formats.machine_file.text import Way, yaml_text
 from crane.formats.parts import (
     add_joint,
     add_link,
@@ -30,12 +32,16 @@ from crane.hydraulics.components import HOLDING, number_names
 from crane.machine import Machine
 
 
-def write_machine(machine: Machine, folder: str | Path) -> Path:
+def write_machine(
+    machine: Machine, folder: str | Path, notes: Mapping[str, str] | None = None
+) -> Path:
     """Write a machine as a machine file, with one URDF per sub-chain beside it.
 
     Args:
         machine: The machine, as it is: with its changes, locks and payload.
         folder: Created where there is none; files of the same names are replaced.
+        notes: What is to be said of numbers, by their names, see `crane.description.parameters`:
+            comments in the lines where these stand, or at the head of the machine file.
 
     Returns:
         The machine file.
@@ -46,6 +52,7 @@ def write_machine(machine: Machine, folder: str | Path) -> Path:
     """
     file = f"{file_name(machine.name)}.yaml"
     draft = Draft(machine)
+    draft.note(notes or {})
     originals = {machine.path, *(chain.urdf for chain in machine.chains)}
     for written in draft.files(file):
         if (place := (Path(folder) / written).resolve()) in originals:
@@ -73,10 +80,13 @@ class Draft:
     """
 
     def __init__(self, machine: Machine, folder: str = ""):
-        self._chains = _Chains(machine)
+        self._machine, self._chains = machine, _Chains(machine)
         self._folder, self._comment = folder, origin_of(machine)
         self.data = _content(machine)
         self.robots: dict[str, etree._Element] = {}
+        self._lines: dict[Way, str] = {}
+        self._beside: dict[str, list[tuple[etree._Element, str]]] = {}
+        self._head: list[str] = []
         for name in self._chains.names:
             parent = {"parent": self._chains.parents[name]} if name in self._chains.parents else {}
             self.add_chain(name, self._chains.robot(name), parent)
@@ -84,6 +94,47 @@ class Draft:
         self._load = None if load is None else (load.name, load.read_bytes())
         if self._load is not None:
             self.data["payload"] = {"urdf": self._inside(self._load[0])}
+
+    def note(self, notes: Mapping[str, str]) -> None:
+        """Put words beside numbers; at the head where they do not stand in a line as they are."""
+        where, changes = places(self._machine), self._machine.changes
+        beside: dict[etree._Element, str] = {}
+        for name, words in notes.items():
+            place = where.get(name)
+            value = changes.get(name, None if place is None else place.value)
+            if place is not None and place.value == value:
+                if isinstance(place, InFile) and self._put(place.way, place.value):
+                    self._lines[place.way] = words
+                    continue
+                if isinstance(place, InURDF) and (element := self._element(place)) is not None:
+                    named = f"{name}: {words}"
+                    beside[element] = "; ".join(filter(None, (beside.get(element), named)))
+                    continue
+            self._head.append(f"{name}{'' if value is None else f' = {value!r}'}: {words}")
+        for element, words in beside.items():
+            chain = element.getroottree().getroot().get("name")
+            self._beside.setdefault(chain, []).append((element, words))
+
+    def _put(self, way: Way, value: float) -> bool:
+        """Write a number that is as by default, too; whether there is a place for it."""
+        parent: Any = self.data
+        for key in way[:-1]:
+            if not isinstance(key, int) and key not in parent:
+                return False
+            parent = parent[key]
+        circuit = self._machine.hydraulics
+        if circuit is not None and way[:2] == ("hydraulics", "valves") and way[-1] not in parent:
+            edges = _valve(circuit.valves[str(way[2])], by_flow=False)
+            parent.clear()
+            parent.update(edges)
+        return bool(parent.setdefault(way[-1], value) == value)
+
+    def _element(self, place: InURDF) -> etree._Element | None:
+        """Of a URDF, None where it has none of that name."""
+        for owner in self.robot_of(place.link).iterfind(place.kind):
+            if owner.get("name") == place.owner:
+                return owner.find(place.path)
+        return None
 
     def add_chain(self, name: str, robot: etree._Element, more: Mapping[str, str]) -> None:
         """Append a sub-chain; `more` is what its entry says beside its name and file."""
@@ -104,12 +155,14 @@ class Draft:
         """Write all into a folder, the machine file by this name."""
         (folder / self._folder).mkdir(exist_ok=True)
         for chain in self.data["chains"]:
-            content = finished(self.robots[chain["name"]], self._comment)
+            name = chain["name"]
+            content = finished(self.robots[name], self._comment, self._beside.get(name, ()))
             (folder / chain["urdf"]).write_bytes(content)
         if self._load is not None:
             (folder / self.data["payload"]["urdf"]).write_bytes(self._load[1])
         kept = {key: value for key, value in self.data.items() if value not in (None, [], {})}
-        (folder / file).write_text(_yaml(kept), encoding="utf-8")
+        head = "".join(f"# {one_line(line)}\n" for line in self._head)
+        (folder / file).write_text(head + yaml_text(kept, self._lines), encoding="utf-8")
 
     def _inside(self, file: str) -> str:
         return f"{self._folder}/{file}" if self._folder else file
@@ -249,23 +302,29 @@ def _cylinder(cylinder: Cylinder) -> dict[str, Any]:
     return _all_numbers(cylinder) | {key: _all_numbers(valve) for key, valve in fitted.items()}
 
 
-def _valve(valve: Valve) -> dict[str, Any]:
+def _valve(valve: Valve, by_flow: bool = True) -> dict[str, Any]:
     edges = ("c1", "c2", "c3", "c4")
     rest = {
         name: getattr(valve, name)
         for name in number_names(Valve)
         if name not in (*edges, "margin")
     }
+    every = {name: getattr(valve, name) for name in edges}
     if not valve.margin:
-        return {"type": "orifice", **{name: getattr(valve, name) for name in edges}, **rest}
+        return {"type": "orifice", **every, **rest}
+    flow = _flow(valve) if by_flow else None
+    given = every if flow is None else {"flow": flow, "meter_out": valve.c2}
+    return {"type": "compensated", "margin": valve.margin, **given, **rest}
+
+
+def _flow(valve: Valve) -> float | None:
+    """The flow at full stroke that a compensated valve is read from to the last bit, if one is."""
     if (valve.c1, valve.c2) != (valve.c4, valve.c3):
-        raise InputError(
-            f"the compensated valve of '{valve.joint}' has other numbers for either direction, "
-            "for which a machine file has no place"
-        )
-    flow = valve.c1 * math.sqrt(valve.margin)
-    given = {"flow": flow, "margin": valve.margin, "meter_out": valve.c2}
-    return {"type": "compensated", **given, **rest}
+        return None
+    root = math.sqrt(valve.margin)
+    near = valve.c1 * root
+    around = (near, math.nextafter(near, 0.0), math.nextafter(near, math.inf))
+    return next((flow for flow in around if flow / root == valve.c1), None)
 
 
 def _payload(machine: Machine) -> Path | None:
@@ -279,13 +338,3 @@ def _payload(machine: Machine) -> Path | None:
     except CraneError:  # its files are gone
         return None
     return None if load is None else load.chain.urdf
-
-
-def _yaml(data: Mapping[str, Any]) -> str:
-    import yaml
-
-    return str(
-        yaml.safe_dump(
-            dict(data), sort_keys=False, allow_unicode=True, width=100, default_flow_style=None
-        )
-    )
