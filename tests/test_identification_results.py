@@ -95,6 +95,9 @@ def test_the_written_machine_is_the_identified_one(mini, found, tmp_path):
     written = crane.load(file)
     same_forces(found, written, *random_states(mini))
     assert "identified by wls, feasible" in written.source
+    noted = re.findall(r"^ +(\w+): (\S+)  # identified ±(\S+), 95 %", file.read_text(), re.M)
+    told = dict(zip(found.names, found.values.tolist(), strict=True))
+    assert len(noted) > 3 and {float(value) for _, value, _ in noted} <= set(told.values())
     assert written.tasks == mini.tasks and written.end_stops == mini.end_stops
     assert abs(written.model.inertias[1].mass - mini.model.inertias[1].mass) > 1e-6
 

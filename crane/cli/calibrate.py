@@ -57,7 +57,9 @@ def calibrate(
     lock: Lock = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FOLDER", help="Folder for machine, report and picture."),
+        typer.Option(
+            "--out", metavar="FOLDER", help="Folder for machine, page, report and picture."
+        ),
     ] = None,
     force: Force = False,
 ) -> None:
@@ -80,7 +82,7 @@ def calibrate(
     text = found.to_text()
     if out is not None:
         write_calibration(out, found)
-        text += f"\nwritten to {out}"
+        text += f"\nwritten to {out}; see {out}/report.html"
     print(text)
 
 

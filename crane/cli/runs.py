@@ -149,21 +149,24 @@ def write_workspace(folder: Path, space: "Workspace") -> str:
 
 
 def write_calibration(folder: Path, found: "Calibration") -> None:
-    """Write report, picture and the fitted machine into a folder, created where there is none.
+    """Write report, page, picture and the fitted machine into a folder.
 
-    A machine that no machine file can say is left out with a warning: the report has its `--set`.
+    The folder is created where there is none. A machine that no machine file can say
+    is left out with a warning: the report has its `--set`.
 
     Raises:
         OutputError: The folder or a file cannot be written.
     """
     from crane.formats import write_machine
+    from crane.view.page.calibration import write_calibration_report
     from crane.view.plots.calibration import plot_calibration
 
     with staging(folder) as part:
+        write_calibration_report(found, part / "report.html")
         (part / "calibration.md").write_text(found.to_text() + "\n", encoding="utf-8")
         plot_calibration(found, part / "calibration.png")
         try:
-            write_machine(found.machine, part / "machine")
+            write_machine(found.machine, part / "machine", found.notes)
         except InputError as error:
             text = f"the machine is not written, take the --set options of the report: {error}"
             warnings.warn(text, CraneWarning, stacklevel=2)

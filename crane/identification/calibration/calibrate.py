@@ -8,6 +8,7 @@ import numpy as np
 
 from crane.common.errors import InputError, RecordingError, at
 from crane.common.samples import Array
+from crane.description.number_units import number_unit
 from crane.description.sensors import (
     SENSOR,
     SIGNAL,
@@ -19,9 +20,11 @@ from crane.description.sensors import (
 from crane.formats import load
 from crane.formats.loading import Variants
 from crane.identification.calibration.candidates import candidates
+from crane.identification.calibration.ends import Found, found_by
 from crane.identification.calibration.problem import Case, Problem, case_of
 from crane.identification.calibration.result import Calibration, Channel, Fitted
 from crane.identification.calibration.search import Progress, Search
+from crane.identification.calibration.states import states
 from crane.identification.calibration.unknowns import Unknown, unknowns_of
 from crane.machine import Machine
 from crane.recordings.logs import lines_of
@@ -118,8 +121,9 @@ def calibrate(
     problem = Problem(machine, unknowns, cases)
     search = Search(problem, progress)
     before = [problem.residuals(case, np.zeros(problem.size)) for case in problem.cases]
-    z = search.run()
-    found = _result(problem, search, z, before, units)
+    end = found_by(search, len(unknowns))
+    z = end.z
+    found = _result(problem, search, end, before, units)
     taken = {name for x in unknowns for name in (x.name, *dict(x.members))}
     proposed = {x.name: x for x in candidates(machine, cases, numbers)}
     more = asked({x.name: (x.start, x.low, x.high) for x in proposed.values()})
@@ -182,26 +186,22 @@ def _case(
 def _result(
     problem: Problem,
     search: Search,
-    z: Array,
+    end: Found,
     before: list[Array],
     units: Mapping[str, str],
 ) -> Calibration:
-    from scipy.stats import t as student
-
-    unknowns = problem.unknowns
-    covariance, count = search.covariance(z)
+    unknowns, z, covariance = problem.unknowns, end.z, end.covariance
     deviations = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    factor = float(student.ppf(0.975, max(count - 1, 1)))
     values = problem.values(z)
     fitted = []
     for i, unknown in enumerate(unknowns):
-        width = factor * float(deviations[i]) * unknown.scale
-        value = values[unknown.name]
+        value, scale = values[unknown.name], unknown.scale
         bound = z[i] <= search.low[i] + 1e-9 or z[i] >= search.high[i] - 1e-9
         size = max(abs(value), abs(unknown.start)) if not unknown.sensor else np.inf
         fitted.append(Fitted(
-            unknown.name, unknown.start, value, width, bool(bound),
-            bool(not bound and width / factor > _VAGUE * size),
+            unknown.name, unknown.start, value, float(end.widths[i]) * scale, bool(bound),
+            bool(not bound and deviations[i] * scale > _VAGUE * size),
+            number_unit(problem.machine.tree, unknown.name), unknown.members, end.ends[i],
         ))  # fmt: skip
     after = [problem.residuals(case, z) for case in problem.cases]
     seen = [
@@ -213,7 +213,17 @@ def _result(
     return Calibration(
         problem.fitted(z), tuple(fitted), tuple(seen), problem.changes(z),
         tuple(_coupled(unknowns, covariance)), problem.runs,
+        correlation=_correlation(covariance, len(unknowns)), states=states(problem, z),
+        lowest=end.lowest,
     )  # fmt: skip
+
+
+def _correlation(covariance: Array, count: int) -> Array:
+    """(n, n) of the first n, 0 of what is known exactly."""
+    deviations = np.sqrt(np.maximum(np.diag(covariance)[:count], 0.0))
+    ones = np.where(deviations > 0, deviations, np.inf)
+    found: Array = covariance[:count, :count] / np.outer(ones, ones)
+    return found
 
 
 def _coupled(unknowns: Sequence[Unknown], covariance: Array) -> list[tuple[str, str, float]]:

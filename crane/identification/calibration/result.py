@@ -1,15 +1,24 @@
 """What a calibration found, how well it is known, and how well the machine follows now."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from crane.common.samples import Array, Brief
 from crane.common.units import reading
+from crane.identification.calibration.ends import Ends
 from crane.identification.calibration.lacking import Lacking
+from crane.identification.calibration.problem import noise_of
+from crane.identification.calibration.together import together
 from crane.machine import Machine
+
+_NORMAL = 0.6745  # median of the size of what has a normal distribution, in deviations
+HIGHER = (
+    "There is a lower minimum near these numbers, which the search did not reach: calibrate again "
+    "from them, with fewer numbers."
+)
 
 
 @dataclass(frozen=True)
@@ -23,6 +32,9 @@ class Fitted:
         interval: Half of its interval of 95 %, as if there were no bounds.
         bound: Whether it is on a bound.
         vague: Whether the recordings do not tell it.
+        unit: Its SI unit, "" of a common factor.
+        members: Numbers of the machine and its sensors that it changed, as they were.
+        ends: What the simulation says of the interval's ends.
     """
 
     name: str
@@ -31,6 +43,41 @@ class Fitted:
     interval: float
     bound: bool
     vague: bool
+    unit: str = ""
+    members: tuple[tuple[str, float], ...] = ()
+    ends: Ends = Ends()
+
+    @property
+    def shared(self) -> bool:
+        """Whether it is a common factor of several numbers."""
+        return "*" in self.name
+
+    @property
+    def before(self) -> float:
+        """What the machine had, 1 of a common factor."""
+        return 1.0 if self.shared or not self.members else self.members[0][1]
+
+    @property
+    def moved(self) -> bool:
+        """Whether what the machine had is outside of the interval of what is told."""
+        return not self.vague and abs(self.value - self.before) > self.interval
+
+    @property
+    def remark(self) -> str:
+        """What is to be known beside the interval."""
+        told = "on its bound" if self.bound else "not told by the recordings" * self.vague
+        return ", ".join(filter(None, (told, self.ends.farther)))
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """Words for each number of the machine, as comments of a file have them."""
+        found, remark = f"±{self.interval:.2g}, 95 %", self.remark and f", {self.remark}"
+        if not self.shared:
+            return {name: f"fitted {found}{remark} (was {was:.6g})" for name, was in self.members}
+        how = f"{self.value:.5g} {found}{remark}"
+        return {
+            name: f"fitted by {self.name} = {how} (was {was:.6g})" for name, was in self.members
+        }
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -57,6 +104,15 @@ class Channel(Brief):
     before: Array
     after: Array
 
+    @property
+    def noise(self) -> float:
+        """Standard deviation of its noise, by the median of its third differences.
+
+        By their mean square where half of them are zero, the readings having few digits.
+        """
+        size = float(np.median(np.abs(np.diff(self.measured, 3)))) / _NORMAL / np.sqrt(20.0)
+        return size or noise_of(self.measured)
+
     def rms(self, simulated: Array, train: bool) -> float:
         """Root mean square of simulated less measured, over what was fitted or held out."""
         some = self.train if train else np.logical_not(self.train)
@@ -76,6 +132,9 @@ class Calibration:
         coupled: Pairs of names that the recordings tell apart badly, with their correlation.
         runs: Simulations it took.
         lacking: Numbers that were not fitted and would help.
+        correlation: (n, n) of the numbers.
+        states: By recording, velocities and chamber pressures of the drives of the fitted machine.
+        lowest: Whether no lower minimum was seen at the ends of the intervals.
     """
 
     machine: Machine
@@ -85,6 +144,20 @@ class Calibration:
     coupled: tuple[tuple[str, str, float], ...]
     runs: int
     lacking: tuple[Lacking, ...] = ()
+    correlation: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    states: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
+    lowest: bool = True
+
+    @property
+    def notes(self) -> dict[str, str]:
+        """What is to be said of the fitted numbers beside them, by name."""
+        return {name: text for one in self.fitted for name, text in one.notes.items()}
+
+    @property
+    def directions(self) -> list[dict[str, float]]:
+        """What the recordings cannot tell apart, see `together`."""
+        ends = [one.interval for one in self.fitted]
+        return together([one.name for one in self.fitted], self.correlation, np.array(ends))
 
     @property
     def values(self) -> dict[str, float]:
@@ -96,6 +169,11 @@ class Calibration:
         """What the command line takes for the same machine."""
         return " ".join(f"--set {name}={value:.8g}" for name, value in self.changes.items())
 
+    def words(self, direction: Mapping[str, float]) -> str:
+        """A direction in words: numbers that may change together."""
+        units = {one.name: one.unit for one in self.fitted}
+        return ", ".join(f"{x} by {by:+.2g} {units[x]}".rstrip() for x, by in direction.items())
+
     def to_text(self) -> str:
         """A report, Markdown."""
         lines = [
@@ -103,12 +181,18 @@ class Calibration:
             "| --- | ---: | ---: | ---: | --- |",
         ]
         for one in self.fitted:
-            note = "on its bound" if one.bound else "not told by the recordings" * one.vague
             width = f"± {one.interval:.2g}"
-            lines.append(f"| {one.name} | {one.start:.5g} | {one.value:.5g} | {width} | {note} |")
+            lines.append(
+                f"| {one.name} | {one.start:.5g} | {one.value:.5g} | {width} | {one.remark} |"
+            )
+        if not self.lowest:
+            lines += ["", HIGHER]
         if self.coupled:
             lines += ["", "Told apart badly, of which a combination alone is known:", ""]
             lines += [f"- {a} and {b} (correlation {r:+.3f})" for a, b, r in self.coupled]
+        if self.directions:
+            lines += ["", "What changes together without the recordings telling it:", ""]
+            lines += [f"- {self.words(direction)}" for direction in self.directions]
         if self.lacking:
             lines += ["", "What would take away more of what is left, if it were fitted, too:", ""]
             lines += [

@@ -49,17 +49,17 @@ class Search:
         self.jacobian = self.residual = self.blocks = np.zeros(0)
         self._done = done
 
-    def run(self) -> Array:
-        """The unknowns."""
+    def run(self, start: Array | None = None) -> Array:
+        """The unknowns, from another start if one is given, which is near them."""
         problem = self._problem
         noise = self._noise()
         spread = self._spread()
         most = {name: max(noise[name], _FLOOR * spread[name]) for name in noise}
         self.sizes = dict(most)
-        z = np.zeros(problem.size)
+        z = np.zeros(problem.size) if start is None else start
         sticks = any(law.sticks for law in problem.machine.friction.values())
-        problem.smooth, problem.rough = float(sticks), _CRUDE
-        z = self._begun(z)
+        problem.smooth, problem.rough, problem.slopes = float(sticks), _CRUDE, 0.0
+        z = self._begun(z) if start is None else z
         problem.rough = ROUGH
         for i in range(_ROUNDS):
             z = self._minimum(z)
@@ -140,6 +140,20 @@ class Search:
     def _weights(self, case: Case) -> Array:
         """(N, k) one over the channels' sizes, 0 of what is held out."""
         return case.train[:, None] / np.array([self.sizes[name] for name in case.sensors])
+
+    def left(self, z: Array) -> Array:
+        """(M,) weighted residuals.
+
+        Raises:
+            CraneError: The machine cannot be, or its simulation fails.
+        """
+        every = [
+            self._problem.residuals(case, z, fitted=True) * self._weights(case)
+            for case in self._trained
+        ]
+        return np.concatenate([
+            left[case.train].ravel() for left, case in zip(every, self._trained, strict=True)
+        ])  # fmt: skip
 
     def _cost(self, z: Array) -> float:
         """Half the sum of squares, infinite where the machine cannot be."""

@@ -16,6 +16,7 @@ from crane.common.output import replacing, staging
 from crane.description import Chain, Friction, MachineSpec, locked
 from crane.dynamics import Dynamics
 from crane.formats import load, read
+from crane.formats.machine_file.text import Way, yaml_text
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base import random_samples
 from crane.identification.mechanics.division import divided
@@ -217,10 +218,23 @@ def _content(
     for key in ("loops", "forces", "gas_springs", "ropes", "end_stops", "rotor_inertia"):
         if not data.get(key):
             data.pop(key, None)
-    text = yaml.safe_dump(
-        data, sort_keys=False, allow_unicode=True, width=100, default_flow_style=None
-    )
-    return str(text), more
+    return yaml_text(data, _notes(result, data)), more
+
+
+def _notes(result: Identification, data: Mapping[str, Any]) -> dict[Way, str]:
+    """How well friction and rotor inertias are known that the recording tells by themselves."""
+    found: dict[Way, str] = {}
+    half = 0.5 * np.diff(result.interval(), axis=1)[:, 0]
+    for i, (name, group) in enumerate(zip(result.names, result.base.groups, strict=True)):
+        owner, _, kind = name.rpartition(".")
+        way = (kind, owner) if kind == "rotor_inertia" else ("friction", owner, kind)
+        place: Any = data
+        for key in way[:-1]:
+            place = place.get(key, {})
+        if group == name and np.isclose(place.get(way[-1], np.nan), result.values[i], rtol=1e-9):
+            mark = result.marks[i] and f", {result.marks[i]}"
+            found[way] = f"identified ±{half[i]:.2g}, 95 %{mark}"
+    return found
 
 
 def _values(result: Identification, kind: str) -> dict[str, float]:

@@ -1,20 +1,17 @@
 """An identification as one self-contained page: what was found, and how well it predicts."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 
-from crane.common.errors import OutputError
-from crane.common.output import replacing
 from crane.identification.estimation.estimators import essential
 from crane.identification.mechanics.result import Identification
 from crane.recordings.recording import FORCE_UNITS
 from crane.recordings.summary import title
-from crane.view.page.build import SUFFIXES
+from crane.view.page.document import facts, table, write_document
 from crane.view.plots.identification import image_tag, matrix_figure, spectrum_figure, time_figure
 from crane.view.plots.recording import RECORDED, STYLE
 
@@ -22,30 +19,6 @@ _LONG_WORDS = 70  # letters of a group that are shown at once
 _MOST_PAIRS = 10
 _CORRELATED = 0.9
 _VALIDATION = "#2a9d6f"
-_CSS = """
-:root { color: #26292e; background: #fff; font: 15px/1.5 system-ui, "Segoe UI", sans-serif; }
-body { max-width: 74rem; margin: 0 auto; padding: 1.5rem clamp(.8rem, 3vw, 2rem) 4rem; }
-h1 { font-size: 1.6rem; line-height: 1.25; margin: .5rem 0 1.2rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.15rem; margin: 2.6rem 0 .6rem; padding-top: .9rem; border-top: 1px solid #ddd; }
-h3 { font-size: 1rem; margin: 1.4rem 0 .3rem; }
-p { max-width: 46rem; margin: .4rem 0 .8rem; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: .2rem 1.4rem; margin: 0; }
-dt { color: #646a73; } dd { margin: 0; overflow-wrap: anywhere; }
-.scroll { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .87rem; }
-th { text-align: left; font-weight: 600; border-bottom: 1.5px solid #9aa0a8; color: #444a52; }
-th, td { padding: .22rem .9rem .22rem 0; vertical-align: top; white-space: nowrap; }
-td { border-bottom: 1px solid #eceef0; }
-th.n, td.n { text-align: right; }
-th:first-child, td:first-child { position: sticky; left: 0; background: #fff; }
-td.words { white-space: normal; min-width: 20rem; overflow-wrap: anywhere; }
-tr.weak td { color: #8a9099; }
-summary { cursor: pointer; } code { font-size: .93em; }
-.figures { display: grid; gap: 1rem 1.5rem;
-           grid-template-columns: repeat(auto-fit, minmax(min(100%, 27rem), 1fr)); }
-img { width: 100%; height: auto; display: block; }
-.matrix { margin-top: 1.5rem; min-width: 36rem; max-width: 56rem; }
-"""
 
 
 def write_report(
@@ -68,9 +41,6 @@ def write_report(
     Raises:
         OutputError: The file's suffix is not .html or .htm, or it cannot be written.
     """
-    if Path(path).suffix.lower() not in SUFFIXES:
-        raise OutputError(f"{path}: a page is for a browser, end the name in .html")
-    heading = escape(title(result.machine.name, "identification"))
     with mpl.rc_context(STYLE):
         parts = [
             _summary(result, recording, validation),
@@ -81,15 +51,7 @@ def write_report(
             "<h2>Correlations</h2>", _correlations(result),
             "<h2>Not told</h2>", _unobservable(result),
         ]  # fmt: skip
-    text = (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{heading}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n"
-        f"<h1>{heading}</h1>\n" + "\n".join(parts) + "\n</body>\n</html>\n"
-    )
-    with replacing(path) as part:
-        part.write_text(text, encoding="utf-8")
-    return Path(path)
+    return write_document(path, title(result.machine.name, "identification"), parts)
 
 
 def _summary(result: Identification, recording: str, validation: str) -> str:
@@ -124,8 +86,7 @@ def _summary(result: Identification, recording: str, validation: str) -> str:
         ),
         ("unexplained", _stacked(result)),
     ]
-    items = (f"<dt>{name}</dt><dd>{escape(text)}</dd>" for name, text in rows if text)
-    return f"<dl>{''.join(items)}</dl>"
+    return facts(rows)
 
 
 def _stacked(result: Identification) -> str:
@@ -133,22 +94,6 @@ def _stacked(result: Identification) -> str:
     if result.validation is not None:
         parts.append(f"{100 * result.validation.stacked:.3g} % in validation")
     return ", ".join(parts)
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]], classes: Iterable[str] = ()) -> str:
-    """Cells are HTML; those of columns whose head ends in * are text, the others numbers."""
-    kind = ["" if name.endswith("*") else ' class="n"' for name in head]
-    top = "".join(f"<th{k}>{name.rstrip('*')}</th>" for k, name in zip(kind, head, strict=True))
-    marks = iter(classes)
-    body = []
-    for row in rows:
-        mark = next(marks, "")
-        cells = "".join(
-            cell if cell.startswith("<td") else f"<td{k}>{cell}</td>"
-            for k, cell in zip(kind, row, strict=True)
-        )
-        body.append(f'<tr class="{mark}">{cells}</tr>' if mark else f"<tr>{cells}</tr>")
-    return f'<div class="scroll"><table><tr>{top}</tr>{"".join(body)}</table></div>'
 
 
 def _unit(result: Identification, joint: str) -> str:
@@ -173,7 +118,7 @@ def _fit(result: Identification) -> str:
     words += "ratio to that of the measured force, and the square of this ratio."
     if result.validation is not None:
         head += ["validation: RMS error", "relative", "squared"]
-    return f"<p>{words}</p>{_table(head, rows)}"
+    return f"<p>{words}</p>{table(head, rows)}"
 
 
 def _forces(result: Identification) -> str:
@@ -228,7 +173,7 @@ def _parameters(result: Identification) -> str:
     head = [
         "parameter*", "value", "from", "to", "rel. std", "description", "marks*", "together with*",
     ]  # fmt: skip
-    return doubt + text + _table(head, rows, classes)
+    return doubt + text + table(head, rows, classes)
 
 
 def _percent(part: float, whole: float) -> str:
@@ -262,7 +207,7 @@ def _bodies(result: Identification) -> str:
         rows.append(row)
     head = ["body*", "mass [kg]", "centre [mm]", "described mass", "described centre"]
     words = "Values of all parameters, of which forces tell the base parameters above; the "
-    return f"<p>{words}description says the rest.</p>{_table(head, rows)}"
+    return f"<p>{words}description says the rest.</p>{table(head, rows)}"
 
 
 def _correlations(result: Identification) -> str:
@@ -277,9 +222,9 @@ def _correlations(result: Identification) -> str:
     ]  # fmt: skip
     words = f"<p>{len(strong)} pairs of estimates are correlated by more than {_CORRELATED:g}"
     words += ": motions that separate them would tell both better." if strong else "."
-    table = _table(["one*", "other*", "correlation"], rows) if rows else ""
+    listed = table(["one*", "other*", "correlation"], rows) if rows else ""
     image = image_tag(matrix_figure(R, result.names), "correlation matrix")
-    return f'{words}</p>{table}<div class="scroll"><div class="matrix">{image}</div></div>'
+    return f'{words}</p>{listed}<div class="scroll"><div class="matrix">{image}</div></div>'
 
 
 def _unobservable(result: Identification) -> str:

@@ -4,15 +4,16 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from crane.common.units import reading
-from crane.identification.calibration.result import Calibration
+from crane.identification.calibration.result import Calibration, Channel
 from crane.recordings.summary import title
 from crane.view.plots.recording import DASHED, INK, RECORDED, STYLE, write_figure
 from crane.view.plots.text import plain
 
-_HELD_OUT = "#f1efe8"
+HELD_OUT = "#f1efe8"
 _MOST = 18  # panels
 
 
@@ -40,19 +41,9 @@ def calibration_figure(found: Calibration) -> Figure:
         several = len({sensor.recording for sensor in sensors}) > 1
         for i, sensor in enumerate(sensors):
             axes = figure.add_subplot(rows, columns, i + 1)
-            every = np.concatenate([sensor.measured, sensor.after])
-            unit, scale = reading(sensor.unit, float(np.ptp(every)))
-            for values, style in (
-                (sensor.measured, {"color": INK, "linewidth": 0.9, "label": "measured"}),
-                (sensor.before, DASHED | {"linewidth": 0.9, "label": "before"}),
-                (sensor.after, {"color": RECORDED, "linewidth": 1.1, "label": "fitted"}),
-            ):
-                axes.plot(sensor.time, scale * values, **style)
-            low, high = scale * every.min(), scale * every.max()
-            room = 0.15 * (high - low) or 1.0
-            axes.set_ylim(low - room, high + room)
-            for start, end in _spans(sensor.time, np.logical_not(sensor.train)):
-                axes.axvspan(start, end, color=_HELD_OUT, zorder=-1)
+            unit = lines_of(axes, sensor)
+            for start, end in spans(sensor.time, np.logical_not(sensor.train)):
+                axes.axvspan(start, end, color=HELD_OUT, zorder=-1)
             name = f"{sensor.recording}: {sensor.name}" if several else sensor.name
             axes.set_title(plain(f"{name} [{unit}]"), fontsize=8.5)
             if i >= len(sensors) - columns:
@@ -64,7 +55,26 @@ def calibration_figure(found: Calibration) -> Figure:
     return figure
 
 
-def _spans(time: "np.ndarray", mask: "np.ndarray") -> list[tuple[float, float]]:
+def lines_of(axes: Axes, sensor: Channel) -> str:
+    """Draw a channel measured, before and fitted; the unit it is read in.
+
+    The axis holds what was measured and what is fitted, whatever was before.
+    """
+    every = np.concatenate([sensor.measured, sensor.after])
+    unit, scale = reading(sensor.unit, float(np.ptp(every)))
+    for values, style in (
+        (sensor.measured, {"color": INK, "linewidth": 0.9, "label": "measured"}),
+        (sensor.before, DASHED | {"linewidth": 0.9, "label": "before"}),
+        (sensor.after, {"color": RECORDED, "linewidth": 1.1, "label": "fitted"}),
+    ):
+        axes.plot(sensor.time, scale * values, **style)
+    low, high = scale * every.min(), scale * every.max()
+    room = 0.15 * (high - low) or 1.0
+    axes.set_ylim(low - room, high + room)
+    return unit
+
+
+def spans(time: "np.ndarray", mask: "np.ndarray") -> list[tuple[float, float]]:
     """Stretches of time over which something holds."""
     edges = np.diff(np.concatenate([[0], mask.astype(int), [0]]))
     starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
