@@ -17,7 +17,10 @@ class Fake:
         self.low, self.high = (np.broadcast_to(x, 2).astype(float) for x in (low, high))
         self.prior, self.starts = np.array(prior), []
 
-    def run(self, start=None):
+    def run(self):
+        return self.onward(None)
+
+    def onward(self, start):
         self.starts.append(start)
         z = np.array(self._minima(start), dtype=float)
         columns = [self.left(z + 1e-20j * e).imag / 1e-20 for e in np.eye(2)]
@@ -100,6 +103,13 @@ def test_numbers_that_go_together():
     assert together(names[:1], np.eye(1), ends[:1]) == []
     mild = np.array([[1.0, 0.6, 0.0], [0.6, 1.0, 0.0], [0.0, 0.0, 1.0]])
     assert together(names, mild, ends) == []
+    # three of which two tell the third, no pair of which is close: R = I in two dimensions
+    s = np.sqrt(0.5)
+    R = np.array([[1.0, 0.0, s], [0.0, 1.0, s], [s, s, 1.0]])
+    R += 0.02 * (np.eye(3) - R)
+    (direction,) = together(names, R, ends)
+    assert set(direction) == set(names) and direction["zero"] == pytest.approx(0.1)
+    assert direction["mass"] == pytest.approx(230.0 * s, rel=0.05)
 
 
 def test_what_is_left_goes_with_what_it_is_made_of():

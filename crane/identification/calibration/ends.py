@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from crane.common.errors import CraneError
 from crane.common.samples import Array
 
-_LOWER = 1e-3  # share of the cost, that another minimum is lower
-_AGAIN = 2  # searches from there
+_LOWER = 1e-2  # share of the cost, by which another minimum is lower
+_AGAIN = 2  # times that the search goes on from there
 _BENT, _FARTHER = 0.8, 0.6  # of what the cost should have risen by, as a root
 _ONWARD = 3.0  # widths, where another minimum is looked for beyond an end
 
@@ -35,8 +35,11 @@ class Minimum(Protocol):
     jacobian: Array
     residual: Array
 
-    def run(self, start: Array | None = None) -> Array:
-        """The unknowns, from another start if one is given."""
+    def run(self) -> Array:
+        """The unknowns."""
+
+    def onward(self, z: Array) -> Array:
+        """The unknowns of the nearest minimum."""
 
     def left(self, z: Array) -> Array:
         """(M,) weighted residuals."""
@@ -100,7 +103,7 @@ def found_by(search: Minimum, count: int) -> Found:
         ends, lower = try_ends(search, z, widths)
         if lower is None or last:
             break
-        z = search.run(lower)
+        z = search.onward(lower)
     return Found(z, covariance, widths, ends, lower is None)
 
 

@@ -16,8 +16,8 @@ from crane.machine import Machine
 
 _NORMAL = 0.6745  # median of the size of what has a normal distribution, in deviations
 HIGHER = (
-    "There is a lower minimum near these numbers, which the search did not reach: calibrate again "
-    "from them, with fewer numbers."
+    "Near these numbers the machine follows better still, where the search did not end: calibrate "
+    "again from there, or fit fewer numbers."
 )
 
 
@@ -60,7 +60,7 @@ class Fitted:
     @property
     def moved(self) -> bool:
         """Whether what the machine had is outside of the interval of what is told."""
-        return not self.vague and abs(self.value - self.before) > self.interval
+        return not (self.vague or self.bound) and abs(self.value - self.before) > self.interval
 
     @property
     def remark(self) -> str:

@@ -49,29 +49,47 @@ class Search:
         self.jacobian = self.residual = self.blocks = np.zeros(0)
         self._done = done
 
-    def run(self, start: Array | None = None) -> Array:
-        """The unknowns, from another start if one is given, which is near them."""
+    def run(self) -> Array:
+        """The unknowns."""
         problem = self._problem
-        noise = self._noise()
-        spread = self._spread()
-        most = {name: max(noise[name], _FLOOR * spread[name]) for name in noise}
-        self.sizes = dict(most)
-        z = np.zeros(problem.size) if start is None else start
+        self.sizes = self._most()
+        z = np.zeros(problem.size)
         sticks = any(law.sticks for law in problem.machine.friction.values())
-        problem.smooth, problem.rough, problem.slopes = float(sticks), _CRUDE, 0.0
-        z = self._begun(z) if start is None else z
+        problem.smooth, problem.rough = float(sticks), _CRUDE
+        z = self._begun(z)
         problem.rough = ROUGH
         for i in range(_ROUNDS):
             z = self._minimum(z)
-            left = self._left([problem.residuals(case, z) for case in self._trained])
-            fresh = {name: min(max(noise[name], left[name]), most[name]) for name in left}
+            fresh = self._fresh(z)
             moved = max(abs(np.log(fresh[name] / self.sizes[name])) for name in fresh)
             self.sizes = fresh
             if moved < 0.05 and (i or not sticks):
                 break
         for problem.smooth, problem.slopes in _SHARPER if sticks else ():
             z = self._minimum(z)
-        problem.slopes = _TOLD
+        return self._ended(z)
+
+    def onward(self, z: Array) -> Array:
+        """The unknowns of the minimum that is nearest to others, with its own weights."""
+        self._problem.slopes = _SHARPER[-1][1]
+        z = self._minimum(z)
+        self.sizes = self._fresh(z)
+        return self._ended(self._minimum(z))
+
+    def _most(self) -> dict[str, float]:
+        """The largest size of each channel, by its variation and its noise."""
+        noise, spread = self._noise(), self._spread()
+        return {name: max(noise[name], _FLOOR * spread[name]) for name in noise}
+
+    def _fresh(self, z: Array) -> dict[str, float]:
+        """Sizes of the channels by what is left of them."""
+        noise, most = self._noise(), self._most()
+        left = self._left([self._problem.residuals(case, z) for case in self._trained])
+        return {name: min(max(noise[name], left[name]), most[name]) for name in left}
+
+    def _ended(self, z: Array) -> Array:
+        """The same, linearized for how well all is known."""
+        self._problem.slopes = _TOLD
         self._linearize(z)
         if self._progress is not None:
             self._progress(1.0)

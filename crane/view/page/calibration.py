@@ -96,7 +96,8 @@ def _numbers(found: Calibration) -> str:
     head = ["number*", "unit*", "start", "fitted", "95 %", "in the file", "remark*"]
     if not any(row[5] for row in rows):
         head, rows = head[:5] + head[6:], [row[:5] + row[6:] for row in rows]
-    return words + table(head, rows, classes)
+    doubt = "" if found.lowest else f"<p><b>{HIGHER}</b></p>"
+    return doubt + words + table(head, rows, classes)
 
 
 def _remark(one: Fitted) -> str:
@@ -121,9 +122,9 @@ def _channels(found: Calibration) -> str:
             for simulated in (channel.before, channel.after)
         ]
         cells = ["" if np.isnan(x) else f"{x:.3g}" for x in (*values, scale * channel.noise)]
-        name = escape(_name(found, channel))
-        rows.append([f"<code>{name}</code>", escape(unit), *cells])
-        figures.append(image_tag(channel_figure(channel), f"{channel.name} over time"))
+        name = _name(found, channel)
+        rows.append([f"<code>{escape(name)}</code>", escape(unit), *cells])
+        figures.append(image_tag(channel_figure(channel, name), f"{name} over time"))
     head = ["channel*", "unit*", "before", "fitted", "held out, before", "held out", "noise"]
     words = (
         "<p>Root mean square of simulated less measured, over what was fitted and what was held "
@@ -183,8 +184,6 @@ def _coupled(found: Calibration) -> str:
             "<p>These changes, made together, the recordings do not tell; they end where the "
             f"intervals do:</p><ul>{items}</ul>"
         )
-    if not found.lowest:
-        parts.insert(0, f"<p><b>{HIGHER}</b></p>")
     if not parts:
         parts.append("<p>The recordings tell all of them apart.</p>")
     if len(found.fitted) > _FEW:

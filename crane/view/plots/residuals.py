@@ -18,8 +18,8 @@ _CLOUD, _MEAN = "#9db8d6", str(DASHED["color"])
 _MOVES = {-1: "back", 0: "rest", 1: "out"}
 
 
-def channel_figure(channel: Channel) -> Figure:
-    """A channel over time: measured, before and fitted; below what the fitted one leaves."""
+def channel_figure(channel: Channel, name: str) -> Figure:
+    """A channel, called so, over time: measured, before and fitted; below what the fitted one leaves."""
     figure = Figure(figsize=(5.8, 3.3))
     grid = {"height_ratios": (2.2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
     upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})
@@ -36,7 +36,7 @@ def channel_figure(channel: Channel) -> Figure:
     lower.set_ylabel(f"left [{small}]")
     lower.set_xlabel("time [s]")
     upper.margins(x=0.0)
-    upper.set_title(plain(channel.name), loc="left", fontsize=8.5)
+    upper.set_title(plain(name), loc="left", fontsize=8.5)
     upper.legend(loc="lower right", bbox_to_anchor=(1.0, 0.99), ncols=3, borderpad=0, fontsize=8)
     return figure
 
