@@ -327,11 +327,12 @@ def test_the_page_says_what_was_found(fitted, tmp_path):
     assert "the file&#x27;s is off by" in page and "0 to 4 s, the rest is held out" in page
     for channel in found.sensors:
         assert f"{channel.name}</code></td><td>" in page
-        assert channel.rms(channel.after, True) == pytest.approx(channel.noise, rel=0.15)
+        noise = 2e-4 if channel.name == "x" else 2e4
+        assert channel.noise == pytest.approx(noise, rel=0.25)
 
 
 def test_what_is_left_tells_what_is_missing(fitted):
-    """Of the machine before the fit, whose load is too light, pressures are off when it moves."""
+    """Nothing of the fitted one; of one whose pressure is 1 bar off, whichever way it goes."""
     machine, _, found = fitted
     by_name = {one.name: one for one in left_over(found)}
     assert list(by_name) == ["x", "pressure_x_a", "pressure_x_b"]
@@ -342,9 +343,11 @@ def test_what_is_left_tells_what_is_missing(fitted):
     x = found.sensors[0]
     rate = np.gradient(x.after, x.time)[x.train]
     assert np.std(rate - one.motion["speed"]) < 0.05 * np.std(rate)
-    off = [replace(x, after=x.before) for x in found.sensors]
+    side = np.sign(np.round(found.states["run.csv"]["x_velocity"], 3))
+    off = [replace(x, after=x.after + 1e5 * side * (x.unit == "Pa")) for x in found.sensors]
     worse = {one.name: one for one in left_over(replace(found, sensors=tuple(off)))}
-    assert worse["pressure_x_a"].shares["direction"] > 0.2
+    shares = worse["pressure_x_a"].shares
+    assert shares["direction"] > 0.9 > shares["pressure"] and max(worse["x"].shares.values()) < 0.1
 
 
 @pytest.mark.slow

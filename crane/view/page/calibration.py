@@ -128,8 +128,7 @@ def _channels(found: Calibration) -> str:
     head = ["channel*", "unit*", "before", "fitted", "held out, before", "held out", "noise"]
     words = (
         "<p>Root mean square of simulated less measured, over what was fitted and what was held "
-        "out, and the noise of the sensor by the differences of its samples: nothing follows "
-        "better than that.</p>"
+        "out; last about what the sensor's noise is, by the differences of its samples.</p>"
     )
     below = "<p>What was held out stands on a darker ground. Below what the fitted one leaves.</p>"
     return f'{words}{table(head, rows)}{below}<div class="figures">{"".join(figures)}</div>'

@@ -19,7 +19,7 @@ _MOVES = {-1: "back", 0: "rest", 1: "out"}
 
 
 def channel_figure(channel: Channel, name: str) -> Figure:
-    """A channel, called so, over time: measured, before and fitted; below what the fitted one leaves."""
+    """A channel over time, measured, before and fitted; below what the fitted one leaves."""
     figure = Figure(figsize=(5.8, 3.3))
     grid = {"height_ratios": (2.2, 1), "left": 0.14, "right": 0.985, "top": 0.9, "bottom": 0.13}
     upper, lower = figure.subplots(2, 1, sharex=True, gridspec_kw={**grid, "hspace": 0.12})
