@@ -44,7 +44,7 @@ def test_ends_of_a_quadratic_are_as_derivatives_say():
         ends, lower = try_ends(search, z, np.array(widths))
         np.testing.assert_allclose(ends, 1.0, rtol=1e-9)
         assert lower is None
-        assert not any(one.farther for one in ends)
+        assert not any(one.remark for one in ends)
 
 
 def test_the_other_numbers_keep_their_bounds():
@@ -67,11 +67,12 @@ def test_an_interval_that_reaches_farther_is_told():
     search = Fake(left, lambda _: (0.0, 0.0))
     (ends, other), lower = try_ends(search, search.run(), np.array([0.8, 0.1]))
     assert ends.high == pytest.approx(1 / 1.8) and ends.low == pytest.approx(1 / 0.2)
-    assert ends.farther == "reaches farther up" and lower is None
+    assert ends.remark == "reaches farther up" and lower is None
     assert other == pytest.approx((1.0, 1.0))
     one = Fitted("a", 1.0, 1.0, 0.8, False, True, ends=ends)
     assert one.remark == "not told by the recordings, reaches farther up"
-    assert Ends().farther == ""
+    assert Ends().remark == "" and Ends(0.9, 2.0).remark == ""
+    assert Ends(1.0, 4.0).remark == "derivatives do not hold over its interval"
 
 
 def test_the_search_goes_on_where_the_cost_is_lower():

@@ -23,6 +23,7 @@ from crane.common.samples import Array
 _LOWER = 1e-2  # share of the cost, by which another minimum is lower
 _AGAIN = 2  # times that the search goes on from there
 _BENT, _FARTHER = 0.8, 0.6  # of what the cost should have risen by, as a root
+_STEEP = 3.0  # likewise, of numbers that bend with others
 _ONWARD = 3.0  # widths, where another minimum is looked for beyond an end
 
 
@@ -61,10 +62,13 @@ class Ends(NamedTuple):
     high: float = np.nan
 
     @property
-    def farther(self) -> str:
-        """In words, where the interval reaches farther than derivatives say."""
+    def remark(self) -> str:
+        """In words, where derivatives do not say how far the interval reaches."""
         sides = [side for side, rise in (("down", self.low), ("up", self.high)) if rise < _FARTHER]
-        return f"reaches farther {' and '.join(sides)}" if sides else ""
+        if sides:
+            return f"reaches farther {' and '.join(sides)}"
+        bent = self.low > _STEEP or self.high > _STEEP
+        return "derivatives do not hold over its interval" if bent else ""
 
 
 @dataclass(frozen=True, eq=False)

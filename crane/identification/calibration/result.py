@@ -66,7 +66,7 @@ class Fitted:
     def remark(self) -> str:
         """What is to be known beside the interval."""
         told = "on its bound" if self.bound else "not told by the recordings" * self.vague
-        return ", ".join(filter(None, (told, self.ends.farther)))
+        return ", ".join(filter(None, (told, self.ends.remark)))
 
     @property
     def notes(self) -> dict[str, str]:
