@@ -33,6 +33,7 @@ from crane.recordings.recording import IDEAL, SENSORS
 from crane.recordings.timeseries import Table, heading_of
 from crane.simulation.readings import sensors_of
 
+AUTO = "auto"  # what is fitted if nobody says what
 _COUPLED = 0.95  # correlation of two numbers of which the data know a combination alone
 _VAGUE = 0.5  # standard deviation, of a number's size, that says nothing
 
@@ -104,8 +105,10 @@ def calibrate(
     ]
     if not any(case.train.any() for case in cases):
         raise InputError(f"no instant lies within {train[0]:g} to {train[1]:g} s")
+    given = {name: None for name in fit} if not isinstance(fit, Mapping) else dict(fit)
+    auto = given.pop(AUTO, ...) is None
     for path, table in zip((*paths, *validation), tables, strict=True):
-        _check_readings(path, table, fit)
+        _check_readings(path, table, given)
     variants = Variants(machine)
     numbers = variants.values | named_numbers(cases[0].known)
     units = {
@@ -117,22 +120,21 @@ def calibrate(
     def asked(which: Mapping[str, object] | Sequence[str]) -> list[Unknown]:
         return unknowns_of(which, variants.spec, numbers, units)
 
-    unknowns = asked(fit)
-    problem = Problem(machine, unknowns, cases)
-    search = Search(problem, progress)
-    before = [problem.residuals(case, np.zeros(problem.size)) for case in problem.cases]
-    end = found_by(search, len(unknowns))
-    z = end.z
-    found = _result(problem, search, end, before, units)
+    unknowns = [] if auto and not given else asked(given)
     taken = {name for x in unknowns for name in (x.name, *dict(x.members))}
     proposed = {x.name: x for x in candidates(machine, cases, numbers)}
-    more = asked({x.name: (x.start, x.low, x.high) for x in proposed.values()})
     extras = [
-        replace(x, scale=proposed[x.name].deviation)
-        for x in more
+        replace(x, scale=proposed[x.name].deviation, prior=1.0)
+        for x in asked({x.name: (x.start, x.low, x.high) for x in proposed.values()})
         if not taken & {x.name, *dict(x.members)}
     ]
-    found = replace(found, lacking=tuple(search.lacking(extras, z)))
+    problem = Problem(machine, [*unknowns, *extras] if auto else unknowns, cases)
+    search = Search(problem, progress)
+    before = [problem.residuals(case, np.zeros(problem.size)) for case in problem.cases]
+    end = found_by(search, len(problem.unknowns))
+    found = _result(problem, search, end, before, units)
+    if not auto:
+        found = replace(found, lacking=tuple(search.lacking(extras, end.z)))
     known = dict(machine.sensors) | dict(cases[0].known)
     return replace(found, machine=_sensing(found.machine, known, columns, found.changes))
 
