@@ -17,6 +17,7 @@ _TILTED = 0.05  # [rad] that inclinometers are mounted off
 _PRESSED = 2e5  # [Pa] that pressure sensors are off
 _GAS = 5e-3  # of a chamber's volume
 _LEAKED = 1e-2  # of a valve's full flow at the supply's pressure
+_OPEN = {1: ("c1", "c2"), -1: ("c3", "c4")}  # orifices, by way
 _BRAKED = 1e-2  # of a cylinder's force at the supply's pressure
 
 
@@ -58,7 +59,7 @@ def candidates(
     for joint in hydraulics.joints:
         ways = _ways(joint, hydraulics, cases)
         if ways:
-            found += _of_valve(joint, hydraulics, numbers, ways > 1)
+            found += _of_valve(joint, hydraulics, numbers, ways)
             found += _of_cylinder(joint, machine, hydraulics, numbers)
     if numbers.get("payload.mass", 0.0):
         found.append(_scaled("payload.mass", numbers["payload.mass"], 0.5, 3.0))
@@ -71,42 +72,40 @@ def _scaled(name: str, start: float, share: float, most: float) -> Candidate:
     return Candidate(name, start, share * start, start / most, start * most)
 
 
-def _ways(joint: str, hydraulics: Hydraulics, cases: Sequence[Case]) -> int:
-    """In how many ways a valve is opened."""
+def _ways(joint: str, hydraulics: Hydraulics, cases: Sequence[Case]) -> set[int]:
+    """In which ways a valve is opened, 1 and -1."""
     valve = hydraulics.valves[joint]
     signals = [case.inputs.signals[joint] for case in cases if joint in case.inputs.signals]
     if not signals:
-        return 0
+        return set()
     u = (np.concatenate(signals) - valve.neutral) / (valve.full - valve.neutral)
-    return int(u.max() > _MOVED) + int(u.min() < -_MOVED)
+    return {way for way, most in ((1, u.max()), (-1, -u.min())) if most > _MOVED}
 
 
 def _of_sensor(name: str, numbers: Mapping[str, float]) -> Iterator[Candidate]:
     zero, delay = (f"{SENSOR}{name}.{what}" for what in ("zero", "delay"))
     if name.startswith(INCLINATION):
         yield Candidate(zero, numbers.get(zero, 0.0), _TILTED)
-    elif name.startswith("pressure_"):
+    if name.startswith("pressure_"):  # which hardly are late
         yield Candidate(zero, numbers.get(zero, 0.0), _PRESSED)
-    yield Candidate(delay, numbers.get(delay, 0.0), _LATE, 0.0)
+    else:
+        yield Candidate(delay, numbers.get(delay, 0.0), _LATE, 0.0, _LATEST)
 
 
 def _of_valve(
-    joint: str, hydraulics: Hydraulics, numbers: Mapping[str, float], both: bool
+    joint: str, hydraulics: Hydraulics, numbers: Mapping[str, float], ways: set[int]
 ) -> Iterator[Candidate]:
     valve, name = hydraulics.valves[joint], f"valve.{joint}"
     stroke = abs(valve.full - valve.neutral)
     drift, dead = 0.02 * stroke, valve.dead_band
-    if both:  # else neutral and dead band cannot be told apart
+    if len(ways) == 2:  # else neutral and dead band cannot be told apart
         least, most = valve.neutral - 3.0 * drift, valve.neutral + 3.0 * drift
         yield Candidate(f"{name}.neutral", valve.neutral, drift, least, most)
     yield Candidate(f"{name}.dead_band", dead, 0.05, max(dead - 0.15, 0.0), dead + 0.15)
-    orifices = [f"{name}.c{i}" for i in range(1, 5)]
-    if valve.margin and len({numbers[x] for x in orifices}) == 1:
-        yield _scaled(f"{name}.c*", 1.0, 0.3, 2.5)
-    else:
-        for one in orifices:
-            if numbers[one]:
-                yield _scaled(one, numbers[one], 0.3, 2.5)
+    for orifice in (x for way in sorted(ways, reverse=True) for x in _OPEN[way]):
+        one = f"{name}.{orifice}"
+        if numbers[one]:
+            yield _scaled(one, numbers[one], 0.3, 2.5)
     if valve.bandwidth:
         low, high = min(valve.bandwidth, _SLOW), max(valve.bandwidth, _FAST)
         yield Candidate(f"{name}.bandwidth", valve.bandwidth, valve.bandwidth, low, high)
@@ -140,8 +139,14 @@ def _of_cylinder(
             name = f"cylinder.{joint}.{what}_{side}"
             start = numbers[name]
             yield Candidate(name, start, max(start, size), 0.0)
+    oil = hydraulics.oil.bulk_modulus
+    spring = sum(
+        oil * area**2 / volume
+        for area, volume in zip((cylinder.area_a, cylinder.area_b), volumes, strict=True)
+    )
     name = f"cylinder.{joint}.stiffness"
-    if start := numbers[name]:
-        yield _scaled(name, start, 1.0, 20.0)
+    yield _scaled(name, numbers[name] or spring, 1.0, 20.0)
+    name = f"cylinder.{joint}.damping"
+    yield _scaled(name, numbers[name], 1.0, 20.0)
     name = f"cylinder.{joint}.leakage"
     yield Candidate(name, numbers[name], max(numbers[name], leak), 0.0)
