@@ -138,11 +138,17 @@ class Search:
         }
 
     def _spread(self) -> dict[str, float]:
-        found: dict[str, list[Array]] = {}
+        """Of each channel, the largest variation of those in its unit.
+
+        How far a model is off depends on what moves, not on which channel does.
+        """
+        found: dict[str, float] = {}
+        units: dict[str, str] = {}
         for case in self._trained:
             for name, x in zip(case.sensors, case.measured[case.train].T, strict=True):
-                found.setdefault(name, []).append(x - x.mean())
-        return {name: max(float(np.std(np.concatenate(x))), 1e-12) for name, x in found.items()}
+                units[name] = case.table.units[name]
+                found[units[name]] = max(found.get(units[name], 1e-12), float(np.std(x)))
+        return {name: found[unit] for name, unit in units.items()}
 
     def _left(self, residuals: list[Array]) -> dict[str, float]:
         """Root mean square of each channel over what is fitted."""
