@@ -137,6 +137,7 @@ class Track:
         layout: Of a row.
         notes: What is to be said of the motion.
         largest: (m,) of the minimal state, at least what a machine moves by; 1 of what stays 0.
+        switches: What started and stopped, the start first.
         rest: Whether some joint is at rest.
 
     Raises:
@@ -167,7 +168,7 @@ class Track:
         self._states = self.rows[:, : self.layout.start("tau")]
         make = integration_of(dynamics, control, self.own, motion.method, motion.tolerance)
         self._way = make(self.chart)
-        self._switches: list[Switch] = self.chart.sticking.switches
+        self.switches: list[Switch] = self.chart.sticking.switches
         self.chart.sticking.switches = None  # parts that are simulated anew are no news
         seen, closure = self.chart.seen, machine.closure
         minimal = np.hstack([parts.q[:, seen], parts.v_a, parts.own[:, : self.stiff]])
@@ -180,7 +181,7 @@ class Track:
         """What the motion consists of, in its order."""
         out: list[Stretch | Part | Jump] = []
         count, mode, first = len(self.time) // 2, 0, 0
-        switches = self._switches[1:]
+        switches = self.switches[1:]
         while first < count:
             last = min(first + _CHUNK, count)
             if mode < len(switches):
@@ -207,8 +208,8 @@ class Track:
     def adopt(self, mode: int) -> None:
         """Joints do what they do behind one of the switches, the start being the first."""
         sticking = self.chart.sticking
-        if self._switches:
-            switch = self._switches[mode]
+        if self.switches:
+            switch = self.switches[mode]
             sticking.slip[:], sticking.held[:] = switch.slip, switch.held
             sticking.moving = switch.moving
             sticking.tell(self.chart.dynamics)
