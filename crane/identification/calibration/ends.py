@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from crane.common.errors import CraneError
 from crane.common.samples import Array
 
-_LOWER = 1e-2  # share of the cost, by which another minimum is lower
+_LOWER = 5e-2  # share of the cost, by which another minimum is lower
 _AGAIN = 2  # times that the search goes on from there
 _BENT, _FARTHER = 0.8, 0.6  # of what the cost should have risen by, as a root
 _STEEP = 3.0  # likewise, of numbers that bend with others
