@@ -41,7 +41,8 @@ def calibrate(
         list[str],
         typer.Option(
             metavar="NAME[=START,LOW~HIGH]",
-            help="A number to fit, as payload.mass, friction.*.viscous, sensor.q2.zero.",
+            help="A number to fit, as payload.mass, friction.*.viscous, sensor.q2.zero; auto: all "
+            "that the recordings tell.",
         ),
     ],
     train: Train = None,

@@ -19,6 +19,7 @@ from crane.description.sensors import (
 )
 from crane.formats import load
 from crane.formats.loading import Variants
+from crane.identification.calibration.automatic import told
 from crane.identification.calibration.candidates import candidates
 from crane.identification.calibration.ends import Found, found_by
 from crane.identification.calibration.problem import Case, Problem, case_of
@@ -69,7 +70,9 @@ def calibrate(
         recordings: Of measured valve signals, CSV or npz.
         fit: Numbers by name: None, a start, or (start, low, high). Names are those of
             `crane.description.parameters`; with `*` a common factor of all that match;
-            `sensor.COLUMN.zero`, `.scale` and `.delay` of what was measured.
+            `sensor.COLUMN.zero`, `.scale` and `.delay` of what was measured. "auto" adds all
+            that the recordings may tell, with what is usually known of it before, and keeps what
+            they do tell.
         train: From when to when [s], by the files' own clocks, recordings are fitted; the rest
             is held out.
         validation: Recordings that are held out whole.
@@ -105,8 +108,10 @@ def calibrate(
     ]
     if not any(case.train.any() for case in cases):
         raise InputError(f"no instant lies within {train[0]:g} to {train[1]:g} s")
-    given = {name: None for name in fit} if not isinstance(fit, Mapping) else dict(fit)
-    auto = given.pop(AUTO, ...) is None
+    given = dict(fit) if isinstance(fit, Mapping) else dict.fromkeys(fit)
+    auto = AUTO in given
+    if given.pop(AUTO, None) is not None:
+        raise InputError(f"'{AUTO}' chooses numbers by itself, give it no start")
     for path, table in zip((*paths, *validation), tables, strict=True):
         _check_readings(path, table, given)
     variants = Variants(machine)
@@ -128,11 +133,13 @@ def calibrate(
         for x in asked({x.name: (x.start, x.low, x.high) for x in proposed.values()})
         if not taken & {x.name, *dict(x.members)}
     ]
-    problem = Problem(machine, [*unknowns, *extras] if auto else unknowns, cases)
-    search = Search(problem, progress)
+    problem = Problem(machine, unknowns, cases)
     before = [problem.residuals(case, np.zeros(problem.size)) for case in problem.cases]
+    search, left = Search(problem, progress), []
+    if auto:
+        problem, search, left = told(Problem(machine, [*unknowns, *extras], cases), progress)
     end = found_by(search, len(problem.unknowns))
-    found = _result(problem, search, end, before, units)
+    found = replace(_result(problem, search, end, before, units), left=tuple(left))
     if not auto:
         found = replace(found, lacking=tuple(search.lacking(extras, end.z)))
     known = dict(machine.sensors) | dict(cases[0].known)

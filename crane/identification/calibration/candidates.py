@@ -18,7 +18,7 @@ _PRESSED = 2e5  # [Pa] that pressure sensors are off
 _GAS = 5e-3  # of a chamber's volume
 _LEAKED = 1e-2  # of a valve's full flow at the supply's pressure
 _OPEN = {1: ("c1", "c2"), -1: ("c3", "c4")}  # orifices, by way
-_BRAKED = 1e-2  # of a cylinder's force at the supply's pressure
+_BRAKED = 2e-2  # of a cylinder's force at the supply's pressure
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,9 @@ def _of_cylinder(
     )
     leak = _LEAKED * valve.c1 / np.sqrt(pressure)
     for side, volume in zip("ab", volumes, strict=True):
-        for what, size in (("gas", _GAS * volume), ("leakage", leak), ("hose", 0.5 * volume)):
+        hose = f"cylinder.{joint}.hose_{side}"
+        yield _scaled(hose, numbers[hose], 0.5, 3.0)
+        for what, size in (("gas", _GAS * volume), ("leakage", leak)):
             name = f"cylinder.{joint}.{what}_{side}"
             start = numbers[name]
             yield Candidate(name, start, max(start, size), 0.0)

@@ -14,6 +14,7 @@ from crane.identification.calibration.problem import noise_of
 from crane.identification.calibration.together import together
 from crane.machine import Machine
 
+_WORSE = 1.1  # times what was left before
 _NORMAL = 0.6745  # median of the size of what has a normal distribution, in deviations
 HIGHER = (
     "Near these numbers the machine follows better still, where the search did not end: calibrate "
@@ -135,6 +136,7 @@ class Calibration:
         correlation: (n, n) of the numbers.
         states: By recording, velocities and chamber pressures of the drives of the fitted machine.
         lowest: Whether no lower minimum was seen at the ends of the intervals.
+        left: Numbers that might have been told and were not, which stay as the machine had them.
     """
 
     machine: Machine
@@ -147,6 +149,7 @@ class Calibration:
     correlation: Array = field(default_factory=lambda: np.zeros((0, 0)))
     states: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
     lowest: bool = True
+    left: tuple[str, ...] = ()
 
     @property
     def notes(self) -> dict[str, str]:
@@ -163,6 +166,31 @@ class Calibration:
     def values(self) -> dict[str, float]:
         """Fitted numbers by name."""
         return {one.name: one.value for one in self.fitted}
+
+    @property
+    def worse(self) -> list[str]:
+        """Channels that were held out and are followed worse than before."""
+        found = [
+            f"{x.recording}: {x.name}"
+            for x in self.sensors
+            if x.rms(x.after, False) > max(_WORSE * x.rms(x.before, False), x.noise)
+        ]
+        return found
+
+    @property
+    def cautions(self) -> list[str]:
+        """What is to be said of it as a whole."""
+        found = [] if self.lowest else [HIGHER]
+        if self.worse:
+            found.append(
+                f"Held out, the machine follows worse than before in {', '.join(self.worse)}: fit "
+                "fewer numbers, or record more."
+            )
+        if self.left:
+            found.append(
+                f"Not told by the recordings, left as the machine has them: {', '.join(self.left)}."
+            )
+        return found
 
     @property
     def options(self) -> str:
@@ -185,8 +213,8 @@ class Calibration:
             lines.append(
                 f"| {one.name} | {one.start:.5g} | {one.value:.5g} | {width} | {one.remark} |"
             )
-        if not self.lowest:
-            lines += ["", HIGHER]
+        for caution in self.cautions:
+            lines += ["", caution]
         if self.coupled:
             lines += ["", "Told apart badly, of which a combination alone is known:", ""]
             lines += [f"- {a} and {b} (correlation {r:+.3f})" for a, b, r in self.coupled]

@@ -48,26 +48,41 @@ class Search:
         self.sizes: dict[str, float] = {}
         self.jacobian = self.residual = self.blocks = np.zeros(0)
         self._done = done
+        self._begins: Array | None = None
+        self._sticks = any(law.sticks for law in problem.machine.friction.values())
+
+    def narrowed(self, problem: Problem, z: Array) -> "Search":
+        """A search of fewer numbers that begins near where this one ended."""
+        found = Search(problem, self._progress, self._done)
+        found.sizes, found._begins = self.sizes, z
+        problem.smooth = self._problem.smooth
+        return found
 
     def run(self) -> Array:
         """The unknowns."""
         problem = self._problem
+        z = self.begun() if self._begins is None else self._begins
+        z = self._minimum(z)
+        for problem.smooth, problem.slopes in _SHARPER if self._sticks else ():
+            z = self._minimum(z)
+        return self._ended(z)
+
+    def begun(self) -> Array:
+        """The unknowns with friction that is smoothed, linearized there."""
+        problem = self._problem
         self.sizes = self._most()
-        z = np.zeros(problem.size)
-        sticks = any(law.sticks for law in problem.machine.friction.values())
-        problem.smooth, problem.rough = float(sticks), _CRUDE
-        z = self._begun(z)
+        problem.smooth, problem.rough = float(self._sticks), _CRUDE
+        z = self._begun(np.zeros(problem.size))
         problem.rough = ROUGH
         for i in range(_ROUNDS):
             z = self._minimum(z)
             fresh = self._fresh(z)
             moved = max(abs(np.log(fresh[name] / self.sizes[name])) for name in fresh)
             self.sizes = fresh
-            if moved < 0.05 and (i or not sticks):
+            if moved < 0.05 and (i or not self._sticks):
                 break
-        for problem.smooth, problem.slopes in _SHARPER if sticks else ():
-            z = self._minimum(z)
-        return self._ended(z)
+        self._linearize(z)
+        return z
 
     def onward(self, z: Array) -> Array:
         """The unknowns of the minimum that is nearest to others, with its own weights."""

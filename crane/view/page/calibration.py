@@ -8,7 +8,7 @@ import numpy as np
 
 from crane.common.units import reading
 from crane.identification.calibration.dependence import Left, left_over
-from crane.identification.calibration.result import HIGHER, Calibration, Channel, Fitted
+from crane.identification.calibration.result import Calibration, Channel, Fitted
 from crane.recordings.summary import title
 from crane.view.page.document import facts, table, write_document
 from crane.view.plots.identification import image_tag, matrix_figure
@@ -96,7 +96,7 @@ def _numbers(found: Calibration) -> str:
     head = ["number*", "unit*", "start", "fitted", "95 %", "in the file", "remark*"]
     if not any(row[5] for row in rows):
         head, rows = head[:5] + head[6:], [row[:5] + row[6:] for row in rows]
-    doubt = "" if found.lowest else f"<p><b>{HIGHER}</b></p>"
+    doubt = "".join(f"<p><b>{escape(caution)}</b></p>" for caution in found.cautions)
     return doubt + words + table(head, rows, classes)
 
 
