@@ -135,13 +135,14 @@ def calibrate(
     ]
     problem = Problem(machine, unknowns, cases)
     before = [problem.residuals(case, np.zeros(problem.size)) for case in problem.cases]
-    search, left = Search(problem, progress), []
+    search, left = Search(problem, progress), list[str]()
     if auto:
         problem, search, left = told(Problem(machine, [*unknowns, *extras], cases), progress)
     end = found_by(search, len(problem.unknowns))
     found = replace(_result(problem, search, end, before, units), left=tuple(left))
     if not auto:
-        found = replace(found, lacking=tuple(search.lacking(extras, end.z)))
+        here = [x for x in extras if dict(x.members).get(x.name, x.start) == x.start]
+        found = replace(found, lacking=tuple(search.lacking(here, end.z)))
     known = dict(machine.sensors) | dict(cases[0].known)
     return replace(found, machine=_sensing(found.machine, known, columns, found.changes))
 

@@ -18,6 +18,7 @@ _PRESSED = 2e5  # [Pa] that pressure sensors are off
 _GAS = 5e-3  # of a chamber's volume
 _LEAKED = 1e-2  # of a valve's full flow at the supply's pressure
 _OPEN = {1: ("c1", "c2"), -1: ("c3", "c4")}  # orifices, by way
+_SOFT, _STIFF = 20.0, 4.0  # of the oil's stiffness or what is known, beyond which it is rigid
 _BRAKED = 2e-2  # of a cylinder's force at the supply's pressure
 
 
@@ -147,7 +148,8 @@ def _of_cylinder(
         for area, volume in zip((cylinder.area_a, cylinder.area_b), volumes, strict=True)
     )
     name = f"cylinder.{joint}.stiffness"
-    yield _scaled(name, numbers[name] or spring, 1.0, 20.0)
+    start = numbers[name] or spring
+    yield Candidate(name, start, start, start / _SOFT, start * _STIFF)
     name = f"cylinder.{joint}.damping"
     yield _scaled(name, numbers[name], 1.0, 20.0)
     name = f"cylinder.{joint}.leakage"

@@ -188,7 +188,8 @@ class Calibration:
             )
         if self.left:
             found.append(
-                f"Not told by the recordings, left as the machine has them: {', '.join(self.left)}."
+                "Not told by the recordings, left as the machine has them: "
+                f"{', '.join(self.left)}."
             )
         return found
 

@@ -100,7 +100,9 @@ class Sticking:
     def note(self, time: float, state: Array) -> None:
         """Remember what has changed at a time [s] and a state, if asked to."""
         if self.switches is not None:
-            now = Switch(time, state.copy(), self.slip.copy(), self.held.astype(float), self.moving)
+            now = Switch(
+                time, state.copy(), self.slip.copy(), self.held.astype(float), self.moving
+            )
             self.switches.append(now)
 
     def tell(self, dynamics: Dynamics) -> None:
