@@ -62,17 +62,6 @@ class Search:
         """The unknowns."""
         problem = self._problem
         z = self.begun() if self._begins is None else self._begins
-        z = self._minimum(z)
-        for problem.smooth, problem.slopes in _SHARPER if self._sticks else ():
-            z = self._minimum(z)
-        return self._ended(z)
-
-    def begun(self) -> Array:
-        """The unknowns with friction that is smoothed, linearized there."""
-        problem = self._problem
-        self.sizes = self._most()
-        problem.smooth, problem.rough = float(self._sticks), _CRUDE
-        z = self._begun(np.zeros(problem.size))
         problem.rough = ROUGH
         for i in range(_ROUNDS):
             z = self._minimum(z)
@@ -81,6 +70,18 @@ class Search:
             self.sizes = fresh
             if moved < 0.05 and (i or not self._sticks):
                 break
+        for problem.smooth, problem.slopes in _SHARPER if self._sticks else ():
+            z = self._minimum(z)
+        return self._ended(z)
+
+    def begun(self) -> Array:
+        """About the unknowns, with friction that is smoothed, and linearized there."""
+        problem = self._problem
+        self.sizes = self._most()
+        problem.smooth, problem.rough = float(self._sticks), _CRUDE
+        z = self._begun(np.zeros(problem.size))
+        self.sizes = self._fresh(z)
+        z = self._minimum(z, _BEGUN)
         self._linearize(z)
         return z
 
