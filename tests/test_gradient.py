@@ -269,4 +269,4 @@ def test_what_has_no_gradient_is_refused(tmp_path):
     with pytest.raises(CraneError, match="'block.mas' is not among them"):
         found.of("block.mas")
     with pytest.raises(CraneError, match="where the machine has other equations"):
-        crane.sensitivities("patu655", duration=0.1, by=["cylinder.X_lift.stiffness"])
+        crane.sensitivities("patu655", duration=0.1, by=["cylinder.X_tilt.stiffness"])

@@ -61,12 +61,19 @@ def check_balances(machine, recording, energy=1e-4):
 
 
 def test_steady_lifting_is_the_published_speed(patu, loaded):
-    """14.1 mm/s at 5.0 V; the valve's law says 14.6 on the piston's area."""
+    """14.1 mm/s at 5.0 V; the valve's law says 14.6 on the piston's area.
+
+    The boom rings on its spring, and sits up as its weight gets less: the rod goes beside it.
+    """
     law = 40 / 6e4 * ((0.8 / 3 - 0.1143) / 0.8857) / 7.853981633974483e-3
     assert law == pytest.approx(14.1e-3, rel=0.04)
     for machine in (patu, loaded):
-        recording = crane.simulate(machine, lifting(machine), duration=6.0)
-        speed = recording.v[-1000:, LIFT].mean()
+        recording = crane.simulate(machine, lifting(machine), duration=8.0)
+        cylinder, channels = machine.hydraulics.cylinders["X_lift"], recording.channels
+        force = cylinder.area_a * channels["pressure_X_lift_a"]
+        force -= cylinder.area_b * channels["pressure_X_lift_b"]
+        rod = recording.q[:, LIFT] + force / cylinder.stiffness  # but for the damper
+        speed = (rod[-1] - rod[3000]) / (recording.time[-1] - recording.time[3000])
         # what is missing leaks, and is pressed together
         assert speed == pytest.approx(law, rel=3e-3)
         assert speed <= law
@@ -108,10 +115,11 @@ def test_without_leakage_closed_valves_hold():
 
 
 def test_stiff_oil_moves_with_its_flow(loaded):
-    """The stiffer the oil, the nearer the speed is to Q / A at every instant."""
+    """The stiffer the oil under a rigid boom, the nearer is the speed to Q / A at every instant."""
     gaps = []
     for factor in (1.0, 10.0, 100.0):
         changes = {
+            "cylinder.X_lift.stiffness": 0.0,
             "oil.bulk_modulus": factor * 1.65e9,
             "oil.hose_modulus": factor * 0.7e9,
             "oil.steel_modulus": factor * 2.1e11,
@@ -288,7 +296,7 @@ def test_valve_stuck_open_runs_into_the_end_stop(loaded):
 
 @pytest.mark.parametrize(("lever", "duration"), [(1.0, 14.0), (-1.0, 9.0)])
 def test_a_tonne_on_the_stops_moves_them_as_steel_gives_way(lever, duration):
-    """The stop carries what the oil presses beyond weight and inertia: k d, a third of a mm.
+    """The stop carries what the oil presses beyond weight and inertia: k d, up to half a mm.
 
     Rods creep as oil leaks, and stick and slip at it: their accelerations, some 1e-4 m/s2, are
     some newtons at the lift cylinder.
@@ -314,7 +322,7 @@ def test_a_tonne_on_the_stops_moves_them_as_steel_gives_way(lever, duration):
     pushed = inwards * stop.stiffness * beyond[at] * sinking
     assert abs(pressed + pushed - carried[LIFT] - channels["friction_X_lift"][at]) < 0.5
     assert abs(channels["friction_X_lift"][-1]) < 300.1
-    assert 1e-4 < beyond[-1] < 6e-4 and beyond.max() < 1.5e-3
+    assert 5e-5 < beyond[-1] < 6e-4 and beyond.max() < 1.5e-3
     assert np.abs(recording.v[-1]).max() < 1e-3
 
 

@@ -254,7 +254,7 @@ def test_the_command_writes_model_pictures_and_page(tmp_path):
         "model.mat", "model.npz", "modes.md", "modes.png", "over.png", "view.html"
     }  # fmt: skip
     with np.load(tmp_path / "modes" / "model.npz") as model:
-        assert model["A"].shape[0] == len(model["states"]) == 25
+        assert model["A"].shape[0] == len(model["states"]) == 26
     done = typed("modes", "patu655", "--out", tmp_path / "modes")
     assert done.returncode == 2 and "--force" in done.stderr
     done = typed("modes", "patu655", "--vary", "X_lft=0.1:0.4:3")

@@ -17,6 +17,7 @@ from crane.recordings import timeseries
 from hydraulic_forwarder.paper import ANGLES
 
 LOAD = 80.0  # [kg] at the tip: rotator and gripper of a crane of this size
+LEAKAGE = 3.3e-14  # of a closed spool [m3/(s Pa)]
 STEP = 5e-3  # [s] of the logger
 CYLINDERS = ("X_lift", "X_tilt", "X_ext")
 
@@ -70,7 +71,9 @@ class Crane:
 
 
 def crane_of(kind: str) -> Crane:
-    """The full-size crane without slewing.
+    """The full-size crane without slewing, its boom as rigid as the paper's.
+
+    Its closed spools leak as valves of this kind may, 20 ml/min at 100 bar.
 
     Args:
         kind: "published"; "orifices": with the paper's valves (21), (22) in place of compensated
@@ -79,6 +82,9 @@ def crane_of(kind: str) -> Crane:
     """
     changes = {"payload.mass": LOAD}
     changes |= {f"friction.{joint}.smoothing": 1e-3 for joint in CYLINDERS}  # [m/s]; A
+    # strokes follow from angles by the closed loops: nothing gives way in between
+    changes |= {f"cylinder.{joint}.stiffness": 0.0 for joint in CYLINDERS}
+    changes |= {f"cylinder.{x}.leakage_{side}": LEAKAGE for x in CYLINDERS for side in "ab"}
     if kind != "published":
         for joint, values in COEFFICIENTS.items():
             changes[f"valve.{joint}.margin"] = 0.0

@@ -37,7 +37,7 @@ def errors(X: Orifices) -> list[str]:
     return out
 
 
-def inside(X: Orifices) -> np.ndarray:
+def inside(X: Orifices, level: float = 0.95) -> np.ndarray:
     """Which of the intervals (5,) hold the truth."""
-    low, high = X.interval().T
+    low, high = X.interval(level).T
     return (low < TRUE) & (high > TRUE)
