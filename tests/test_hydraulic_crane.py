@@ -115,7 +115,7 @@ def test_without_leakage_closed_valves_hold():
 
 
 def test_stiff_oil_moves_with_its_flow(loaded):
-    """The stiffer the oil under a rigid boom, the nearer is the speed to Q / A at every instant."""
+    """The stiffer the oil under a rigid boom, the nearer the speed is to Q / A at any instant."""
     gaps = []
     for factor in (1.0, 10.0, 100.0):
         changes = {

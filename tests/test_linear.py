@@ -133,6 +133,10 @@ def test_small_motions_on_the_valves_are_the_simulation(patu):
             assert np.abs(found[:, i] - wanted[:, i]).max() < 2e-3 * scale, name
     ring = next(mode for mode in model.modes if mode.pole.imag > 0)
     assert 3.0 < ring.frequency < 5.0
+    # the spring in series bears what its cylinder does, whatever pressures are asked for
+    cylinder = patu.hydraulics.cylinders["X_lift"]
+    force = cylinder.area_a * at["pressure_X_lift_a"] - cylinder.area_b * at["pressure_X_lift_b"]
+    assert at["spring_X_lift"] == pytest.approx(force / cylinder.stiffness, rel=1e-9)
 
 
 def test_a_valve_that_is_open_answers_its_signal(tmp_path):

@@ -3,6 +3,8 @@
 Numbers in this file are those of the machine's sources, not read from its files.
 """
 
+from pathlib import Path
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -21,6 +23,10 @@ EXTENSION, TIP = np.array([-0.415, 0.195]), np.array([2.113, 0.26])
 AREA_A, AREA_B = 7.854e-3, 5.391e-3
 LOAD = 211.4
 STROKES = np.array([0.535, 0.780, 1.2])
+LIFTING = Path(__file__).parents[2] / "shared" / "data" / "patu655" / "lifting_first_half.csv"
+measured = pytest.mark.skipif(
+    not LIFTING.exists(), reason="the recordings, ../shared/data, are not there"
+)
 REST = np.array([0.0, 0.117, 0.246, 0.0])  # boom level, tilt boom 45 degrees down, rod in
 
 
@@ -436,3 +442,67 @@ def test_end_stops_are_as_stiff_as_the_cylinders():
     tube, rod = np.pi / 4 * (1.2**2 - 1) * 0.063**2, np.pi / 4 * 0.036**2
     length = 1.2 + 2 * 0.063  # stroke, piston and gland
     assert stiffness["X_ext"] == pytest.approx(2.1e11 / (length / tube + length / rod), rel=0.01)
+
+
+# --- what was measured -----------------------------------------------------------------------
+
+
+def band(values, low=1.2, high=6.5):
+    """What of samples at 100 Hz lies in a band [Hz]."""
+    from scipy.signal import butter, sosfiltfilt
+
+    return sosfiltfilt(butter(3, [low, high], "bandpass", fs=100, output="sos"), values)
+
+
+@measured
+def test_it_rings_as_the_crane_did():
+    """Nothing is fitted: the valve's signal as recorded, the load as printed.
+
+    Frequency and size of the lift pressure's swing over ten seconds; a rigid boom rings at twice
+    the frequency, with a tenth of the size.
+    """
+    log = np.genfromtxt(LIFTING, delimiter=",", names=True)
+    time, rings = log["t_s"], {}
+    start = [(log[name][:75].mean() - rod_in) / 1e3
+             for name, rod_in in (("s1_mm", 820), ("s2_mm", 1050))]  # fmt: skip
+    for name, changes in (("file", {}), ("rigid", {"cylinder.X_lift.stiffness": 0.0})):
+        machine = crane.load(
+            "patu655", {"payload.mass": LOAD, **changes}, lock={"slew": 0.0, "X_ext": 0.0}
+        )
+        run = crane.simulate(
+            machine, crane.Signals(machine, time, {"X_lift": log["U1_V"]}),
+            initial=(start, [0.0, 0.0]), duration=13.5,
+        )  # fmt: skip
+        rings[name] = band(np.interp(time, run.time, run.channels["pressure_X_lift_a"]))
+    rings["crane"] = band(log["p1_Pa"])
+    some = (time > 2.5) & (time < 9.0)
+
+    def frequency(x):
+        swing = np.abs(np.fft.rfft(x[some] * np.hanning(some.sum()), 1 << 14))
+        return np.fft.rfftfreq(1 << 14, 0.01)[swing.argmax()]
+
+    assert frequency(rings["crane"]) == pytest.approx(2.15, abs=0.1)
+    assert frequency(rings["file"]) == pytest.approx(frequency(rings["crane"]), rel=0.07)
+    for low, high in ((2.2, 4.0), (4.0, 6.0), (6.0, 8.0), (8.0, 10.0)):
+        part = (time > low) & (time < high)
+        size = {name: x[part].std() for name, x in rings.items()}
+        assert size["file"] == pytest.approx(size["crane"], rel=0.2)
+        assert size["rigid"] < 0.2 * size["crane"]
+
+
+@measured
+def test_the_boom_moves_farther_than_its_rod():
+    """By F / k: the gyro's angle times the lever less the length sensor's way, while it rings."""
+    log = np.genfromtxt(LIFTING, delimiter=",", names=True)
+    time, machine = log["t_s"], crane.load("patu655", lock={"slew": 0.0, "X_ext": 0.0})
+    rod = (log["s1_mm"] - 820) / 1e3
+    q = machine.closure.solve(np.column_stack([rod, np.full_like(rod, 0.231)]))
+    lever = 1 / machine.closure.gamma(q)[:, machine.column("q2"), 0]
+    w = 2 * np.pi * np.fft.rfftfreq(len(time), 0.01)
+    rate = np.fft.rfft(band(np.deg2rad(log["z1dot_degps"]), 1.5, 3.0))
+    boom = lever * np.fft.irfft(np.divide(rate, 1j * w, where=w > 0, out=0 * rate), len(time))
+    rod = band(rod, 1.5, 3.0)
+    force = band(AREA_A * log["p1_Pa"] - AREA_B * log["p2_Pa"], 1.5, 3.0)
+    some = (time > 2.2) & (time < 9.0)
+    gives = -force[some] @ (boom - rod)[some] / (force[some] @ force[some])
+    assert 1 / gives == pytest.approx(machine.hydraulics.cylinders["X_lift"].stiffness, rel=0.2)

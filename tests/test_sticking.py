@@ -214,7 +214,7 @@ def test_methods_and_backends_agree(mini):
 
 
 def test_a_boom_on_closed_valves_stays_for_an_hour():
-    """Without leakage, with 211 kg at its tip: nothing moves, and no pressure changes."""
+    """Without leakage, with 211 kg at its tip: nothing moves, and pressures only by rounding."""
     tight = {
         f"cylinder.{joint}.leakage_{side}": 0.0
         for joint in ("slew", "X_lift", "X_tilt", "X_ext")
@@ -225,4 +225,4 @@ def test_a_boom_on_closed_valves_stays_for_an_hour():
     assert (found.q == found.q[0]).all() and (found.v == 0).all()
     for name, values in found.channels.items():
         if name.startswith("pressure"):
-            assert np.ptp(values) == 0, name
+            assert np.ptp(values) < 2e-9, name  # Pa: a spring in series rounds its force

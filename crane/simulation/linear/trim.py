@@ -14,7 +14,7 @@ from crane.simulation.linear.drive import Drive
 _STILL = 1e-9  # what is left of a trimmed machine, in its size per its pace squared
 _HANGS = 1e-6  # the same, of free joints that hang still
 _ROUNDS = 50  # of Newton's method
-_BAR, _SOON = 1e5, 0.1  # [Pa], [s]
+_BAR, _MILLIMETRE, _SOON = 1e5, 1e-3, 0.1  # [Pa], [m], [s]
 
 
 def trimmed(dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array) -> tuple[Array, Array]:
@@ -46,7 +46,8 @@ class _Trim:
     """What is left of an equilibrium on valves, over their states and signals z.
 
     Joints at rest have their valves closed: the pressure of the chamber that bears the load holds
-    the machine for now, whatever leaks. All else has to stay what it is.
+    the machine for now, whatever leaks, and springs in series bear what their cylinders do. All
+    else has to stay what it is.
 
     Args:
         dynamics: Of the machine.
@@ -63,11 +64,12 @@ class _Trim:
         closure = dynamics.machine.closure
         n, k = len(q_a), len(drive.states)
         pressure = np.array([unit == "Pa" for unit in drive.states.values()])
-        scales = np.where(pressure, _BAR, 1.0)
+        spring = np.array([name.startswith("spring_") for name in drive.states])
+        scales = np.where(pressure, _BAR, np.where(spring, _MILLIMETRE, 1.0))
         moving = drive.moving(v_a)
         loaded = drive.loaded(dynamics.inverse(q_a, v_a, np.zeros(n)))
-        self._free = np.flatnonzero(np.concatenate([loaded | moving[:k], moving[k:]]))
-        self._rows = np.concatenate([np.arange(n), n + np.flatnonzero(moving[:k])])
+        self._free = np.flatnonzero(np.concatenate([loaded | spring | moving[:k], moving[k:]]))
+        self._rows = np.concatenate([np.arange(n), n + np.flatnonzero(spring | moving[:k])])
         self._scales = np.concatenate([scales, np.ones(len(drive.u))])
         # pressures of bars within tenths of a second are as much as such accelerations
         accelerations = closure.units[closure.active] / closure.pace**2
