@@ -136,7 +136,7 @@ class Calibration:
         correlation: (n, n) of the numbers.
         states: By recording, velocities and chamber pressures of the drives of the fitted machine.
         lowest: Whether no lower minimum was seen at the ends of the intervals.
-        left: Numbers that might have been told and were not, which stay as the machine had them.
+        left: Numbers that were chosen and of which nothing was seen; they stay as they were.
     """
 
     machine: Machine
@@ -188,7 +188,7 @@ class Calibration:
             )
         if self.left:
             found.append(
-                "Not told by the recordings, left as the machine has them: "
+                "Nothing of these was seen, they are left as the machine has them: "
                 f"{', '.join(self.left)}."
             )
         return found
