@@ -1,4 +1,4 @@
-"""What is fitted where nobody says what: all that recordings may tell, but for what is not there."""
+"""What is fitted where nobody says what: all that recordings may tell and that is there."""
 
 import numpy as np
 
