@@ -170,12 +170,12 @@ class Calibration:
     @property
     def worse(self) -> list[str]:
         """Channels that were held out and are followed worse than before."""
-        found = [
-            f"{x.recording}: {x.name}"
+        several = len({x.recording for x in self.sensors}) > 1
+        return [
+            f"{x.recording}: {x.name}" if several else x.name
             for x in self.sensors
             if x.rms(x.after, False) > max(_WORSE * x.rms(x.before, False), x.noise)
         ]
-        return found
 
     @property
     def cautions(self) -> list[str]:

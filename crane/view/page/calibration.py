@@ -56,17 +56,12 @@ def _summary(found: Calibration) -> str:
     told = [x for x in found.fitted if not x.bound and not x.vague]
     names = {"on a bound": [x.name for x in found.fitted if x.bound],
              "not told": [x.name for x in found.fitted if x.vague]}  # fmt: skip
-    worse = [
-        _name(found, x) for x in found.sensors
-        if not x.train.all() and x.rms(x.after, False) > x.rms(x.before, False)
-    ]  # fmt: skip
     rows = [
         ("machine", f"{found.machine.name} ({len(found.machine.active)} drives)"),
         ("fitted to", "; ".join(fitted)),
         ("held out whole", ", ".join(held)),
         ("numbers", f"{len(found.fitted)}, of which {len(told)} are told"),
         *((what, ", ".join(some)) for what, some in names.items()),
-        ("worse than before where held out", ", ".join(worse)),
         ("simulations", f"{found.runs}"),
     ]
     return facts(rows)
