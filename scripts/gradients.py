@@ -9,7 +9,7 @@ from measuring import table
 import crane
 
 _OUTPUTS = ("X_lift", "X_tilt", "pressure_X_lift_a", "tip_z")
-_MANY = 200  # numbers forwards, more of which take long
+_MANY = 200  # numbers forwards, a minute
 
 
 def gradients() -> str:

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_sensitivities import DAMPING, HYDRAULIC, MASS, STIFFNESS, Ramp, block
+from test_sensitivities import DAMPING, HYDRAULIC, MASS, STIFFNESS, Ramp, block, swung
 from work import at_most
 
 import crane
@@ -42,13 +42,8 @@ def test_a_damped_spring_as_its_closed_form(tmp_path):
         tolerance=1e-12,
     )  # fmt: skip
 
-    def total(x0, v0, m, k, d):
-        roots = np.roots(np.array([m, d, k], dtype=complex))
-        weights = np.linalg.solve(np.array([[1, 1], roots]), np.array([x0, v0], dtype=complex))
-        waves = weights * np.exp(np.outer(found.recording.time, roots))
-        return (
-            0.5 * (waves.sum(1).real ** 2).sum() + 0.5 * ((waves * roots).sum(1).real ** 2).sum()
-        )
+    def total(*at):
+        return 0.5 * (swung(found.recording.time, *at) ** 2).sum()
 
     at = np.array([0.3, 0.1, MASS, STIFFNESS, DAMPING])
     assert found.total == pytest.approx(total(*at), rel=1e-9)
@@ -94,7 +89,7 @@ def forwarder():
 
 def hydraulic():
     """Valves that open, soft oil, joints that stick, a cylinder that meets its end stop."""
-    changes = {"payload.mass": 150.0, "X_lift.upper": 0.31, "cylinder.X_lift.stiffness": 0.0}
+    changes = {"payload.mass": 150.0, "X_lift.upper": 0.31}
     machine = crane.load("patu655", changes=changes, lock={"X_ext": 0.1, "slew": 0.0})
     levers = {}
     for joint, share in (("X_lift", 1.0), ("X_tilt", -0.5)):
@@ -148,7 +143,7 @@ def test_it_is_the_transpose_of_sensitivities(made, parted, monkeypatch):
 @pytest.mark.parametrize("made", [forwarder, hydraulic])
 def test_its_own_choice_of_steps_is_as_good(made):
     back, forward, size, _ = both(*made(), follow.ACCURACY)
-    assert (np.abs(back - forward) <= follow.ACCURACY * size).all(), np.abs(back - forward) / size
+    assert (np.abs(back - forward) <= 1e-6 * size).all(), np.abs(back - forward) / size
 
 
 def test_differences_of_order_8_agree():

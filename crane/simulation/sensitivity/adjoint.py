@@ -28,14 +28,14 @@ from crane.simulation.sensitivity.rate import traceable
 from crane.simulation.sensitivity.setup import Setup
 from crane.simulation.sensitivity.tangent import Tangent
 from crane.simulation.sensitivity.track import DEEPEST, Jump, Nodes, Part, Track
-from crane.simulation.sensitivity.variational import bending, bent, returns, staged
+from crane.simulation.sensitivity.variational import BENDING, ReturnedPairs, bent, returned_pairs
 
 
 class Gatherer:
     """The way back along a motion, stretch by stretch.
 
-    Steps are taken in parts over which A^T lambda or B^T lambda bend too much for the method, as
-    `follow` does where A S + B do: the rule for lambda and the gradient is that for S.
+    Pairs of steps over which A^T lambda or B^T lambda bend too much for the method are taken in
+    parts, as `follow` does where A S + B do: the rule for lambda and the gradient is that for S.
 
     Args:
         track: The motion.
@@ -121,29 +121,72 @@ class Gatherer:
             self._still._replace(references=np.zeros((0, len(nodes.times), still[1]))),
             self._track.rest,
         )  # fmt: skip
-        back, stages = returns(staged(by_state), lengths, self._track.largest)
+        count, paired = len(lengths), len(lengths) // 2 * 2
+        maps = returned_pairs(
+            by_state[: 2 * paired + 1], lengths[:paired], self._track.largest
+        )  # fmt: skip
         added = seen @ looks[::2, :k]
-        every = _returned(back, added, now)
-        found = self._taken(nodes, stages, every, seen)
-        self._scale(every, found)
-        rough = self._rough(nodes, by_state, every) if depth else []
-        for i in reversed(rough):
-            finer = self._track.within(nodes, i)
-            begin = self._gathered(finer, every[i + 1], None, depth - 1)
-            every[: i + 1] = _returned(back[:i], added[: i + 1], begin)
-            stages[i] = 0.0
-        if rough:
-            found = self._taken(nodes, stages, every, seen)
+        every = np.empty((count + 1, *now.shape))
+        every[-1] = now + added[-1]
+        if paired < count:
+            self._refined(nodes, every, added, count - 1, depth)
+        smooth = np.ones(len(maps.first.back), dtype=bool)
+        self._back(nodes, maps, every, added, smooth, depth)
+        found = self._taken(nodes, maps, every, added, seen, smooth)
+        self._scale(every[::2], found)
+        if depth:
+            bends = bent(by_state[: 2 * paired + 1])
+            smooth = ~self._rough(nodes, bends, every[2 : paired + 1 : 2])
+        if not smooth.all():
+            self._back(nodes, maps, every, added, smooth, depth)
+            found = self._taken(nodes, maps, every, added, seen, smooth)
         self._total += found.sum(axis=0)
         return every[0]
 
-    def _taken(self, nodes: Nodes, stages: Array, every: Array, seen: Array) -> Array:
-        """What is added to the gradient at nodes (2 n + 1, K, l)."""
+    def _back(
+        self,
+        nodes: Nodes,
+        maps: ReturnedPairs,
+        every: Array,
+        added: Array,
+        smooth: Array,
+        depth: int,
+    ) -> None:
+        """Lambda (n + 1, K, m) along pairs, with those that are not smooth in parts."""
+        for i in range(len(smooth))[::-1]:
+            begin, middle, end = 2 * i, 2 * i + 1, 2 * i + 2
+            if smooth[i]:
+                every[begin] = (
+                    every[end] @ maps.both.back[i].T
+                    + added[middle] @ maps.first.back[i].T
+                    + added[begin]
+                )
+            else:
+                self._refined(nodes, every, added, middle, depth)
+                self._refined(nodes, every, added, begin, depth)
+
+    def _refined(self, nodes: Nodes, every: Array, added: Array, step: int, depth: int) -> None:
+        """Lambda where a step begins, which is taken in parts."""
+        finer = self._track.within(nodes, step)
+        every[step] = self._gathered(finer, every[step + 1], None, depth - 1) + added[step]
+
+    def _taken(
+        self,
+        nodes: Nodes,
+        maps: ReturnedPairs,
+        every: Array,
+        added: Array,
+        seen: Array,
+        smooth: Array,
+    ) -> Array:
+        """What pairs that are smooth add to the gradient, and what is seen, at nodes (., K, l)."""
         weights = np.zeros((len(nodes.times), seen.shape[1], self._weighed))
-        m = self._tangent.size
-        mu = np.einsum("njab,nkb->njka", stages, every[1:])
-        for j in range(3):
-            weights[j : len(weights) - 2 + j : 2, :, :m] += mu[:, j]
+        m, pairs = self._tangent.size, 2 * np.arange(len(smooth))[smooth]
+        for of, end in ((maps.both, pairs + 2), (maps.first, pairs + 1)):
+            behind = every[end] if of is maps.both else added[end]
+            mu = np.einsum("njab,nkb->njka", of.stages[smooth], behind)
+            for j in range(mu.shape[1]):
+                weights[2 * pairs + j, :, :m] += mu[:, j]
         weights[::2, :, m:-1] = seen
         found = np.zeros((*weights.shape[:2], len(self._sizes)))
         some = np.flatnonzero(weights.any(axis=(1, 2)))
@@ -172,23 +215,26 @@ class Gatherer:
         np.maximum(of_total, np.abs(gathered).max(axis=0), out=of_total)
         np.maximum(of_total, least / self._sizes, out=of_total)
 
-    def _rough(self, nodes: Nodes, by_state: Array, every: Array) -> list[int]:
-        """Steps over which A^T lambda or B^T lambda bend too much, lambda that behind each."""
-        lengths, several = nodes.lengths, every.shape[1]
-        if len(lengths) < 2:
-            return list(range(len(lengths)))
-        behind = every[1:]
-        weights = np.zeros((len(lengths), several, self._weighed))
-        weights[..., : self._tangent.size] = behind
-        by_number = np.zeros((len(lengths), several, len(self._sizes)))
-        for some, share in bending(len(lengths)):
-            by_number += share * self._against(nodes, some, weights)
-        curves = behind @ bent(by_state), by_number
-        rough = np.zeros(len(lengths), dtype=bool)
-        for curve, scale in zip(curves, self._scales, strict=True):
-            error = np.abs(curve) * lengths[:, None, None]
+    def _rough(self, nodes: Nodes, bends: Array, behind: Array) -> Array:
+        """Over which pairs of steps A^T lambda or B^T lambda bend too much.
+
+        Args:
+            nodes: Of the stretch.
+            bends: Those of A (n, m, m).
+            behind: lambda (n, K, m) behind each.
+        """
+        count, several, m = behind.shape
+        weights = np.zeros((count, several, self._weighed))
+        weights[..., :m] = behind
+        by_number = np.zeros((count, several, len(self._sizes)))
+        if count:
+            for j, share in enumerate(BENDING):
+                by_number += share * self._against(nodes, 4 * np.arange(count) + j, weights)
+        rough = np.zeros(count, dtype=bool)
+        for curve, scale in zip((behind @ bends, by_number), self._scales, strict=True):
+            error = np.abs(curve) * nodes.lengths[: 2 * count : 2, None, None]
             rough |= (error > self._accuracy * scale).any(axis=(1, 2))
-        return np.flatnonzero(rough).tolist()
+        return rough
 
     def _jumped(self, jump: Jump, now: Array) -> Array:
         """Lambda before joints start or stop, from that behind; see `Track.leap`."""
@@ -200,11 +246,3 @@ class Gatherer:
         self._total += self._against(nodes, np.array([1]), weights)[0]
         out: Array = now + np.outer(weights[0, :, -1], by_state)
         return out
-
-
-def _returned(back: Array, added: Array, now: Array) -> Array:
-    """Lambda (n + 1, K, m) along n steps, from that where they end."""
-    every = [now + added[-1]]
-    for one, more in zip(back[::-1], added[-2::-1], strict=True):
-        every.append(every[-1] @ one.T + more)
-    return np.array(every[::-1])

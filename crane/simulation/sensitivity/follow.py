@@ -11,9 +11,9 @@ from crane.simulation.sensitivity.rate import traceable
 from crane.simulation.sensitivity.setup import Setup
 from crane.simulation.sensitivity.tangent import Tangent
 from crane.simulation.sensitivity.track import DEEPEST, Jump, Motion, Nodes, Part, Track
-from crane.simulation.sensitivity.variational import bent, staged, steps
+from crane.simulation.sensitivity.variational import bent, pairs
 
-ACCURACY = 1e-6  # error of a step, per size of what it is of
+ACCURACY = 1e-8  # error of a step, per size of what it is of
 LEAST = 1e-6  # of the states, what matters of what a number as a whole changes
 
 
@@ -76,8 +76,8 @@ def _moved(directions: Setup) -> Setup:
 class _Follower:
     """The variational equations along a recorded motion, stretch by stretch.
 
-    Steps over which A or B bend too much for the method are taken in parts, along states that are
-    simulated anew: where a valve opens or a compensator closes they jump.
+    Pairs of steps over which A or B bend too much for the method are taken in parts, along states
+    that are simulated anew: where a valve opens or a compensator closes they jump.
 
     Args:
         track: The motion.
@@ -131,23 +131,33 @@ class _Follower:
     def _followed(self, nodes: Nodes, now: Array, depth: int) -> tuple[Array, Array]:
         """S (n + 1, m, p) at the ends of a stretch's steps, and what is seen at its nodes."""
         m, (both, seen) = self._tangent.size, self._along(nodes)
-        stages = staged(both)
-        phi, psi = steps(stages[..., :m], stages[..., m:], nodes.lengths, self._track.largest)
-        every = _propagated(phi, psi, now)
-        self._scale = np.maximum(self._scale, np.abs(every).max(axis=0))
-        if not depth:
-            return every, seen
-        rough = np.arange(len(phi))
-        if len(phi) > 1:
-            curve = bent(both)
-            error = np.abs(curve[..., :m] @ every[:-1] + curve[..., m:])
-            error = error * nodes.lengths[:, None, None]
-            rough = np.flatnonzero((error > self._accuracy * self._scale).any(axis=(1, 2)))
-        for i in rough.tolist():
-            finer = self._track.within(nodes, i)
-            last = self._followed(finer, every[i], depth - 1)[0][-1]
-            every[i + 1 :] = _propagated(phi[i + 1 :], psi[i + 1 :], last)
-        return every, seen
+        count, paired = len(nodes.lengths), len(nodes.lengths) // 2 * 2
+        maps = pairs(both[: 2 * paired + 1], nodes.lengths[:paired], self._track.largest)
+        ends = np.empty((paired // 2 + 1, *now.shape))
+        ends[0] = now
+        for i, pair in enumerate(maps.both):
+            ends[i + 1] = pair[:, :m] @ ends[i] + pair[:, m:]
+        self._scale = np.maximum(self._scale, np.abs(ends).max(axis=0))
+        curve = bent(both[: 2 * paired + 1])
+        error = np.abs(curve[..., :m] @ ends[:-1] + curve[..., m:])
+        error *= nodes.lengths[:paired:2, None, None]
+        rough = (error > self._accuracy * self._scale).any(axis=(1, 2)) & bool(depth)
+        every = [now]
+        for first, pair, finer in zip(maps.first, maps.both, rough, strict=True):
+            if finer:
+                self._refined(nodes, every, depth)
+                self._refined(nodes, every, depth)
+            else:
+                begin = every[-1]
+                every += [one[:, :m] @ begin + one[:, m:] for one in (first, pair)]
+        if paired < count:
+            self._refined(nodes, every, depth)
+        return np.array(every), seen
+
+    def _refined(self, nodes: Nodes, every: list[Array], depth: int) -> None:
+        """One more step, in parts."""
+        finer = self._track.within(nodes, len(every) - 1)
+        every.append(self._followed(finer, every[-1], depth - 1)[0][-1])
 
     def _jumped(self, jump: Jump, now: Array) -> Array:
         """S behind an instant at which joints start or stop; see `Track.leap`."""
@@ -155,11 +165,3 @@ class _Follower:
         by_number = self._along(nodes)[1][1, -1, m:]
         by_state, leap = track.leap(self._tangent, self._base, jump)
         return now - np.outer(leap, by_state @ now + by_number)
-
-
-def _propagated(phi: Array, psi: Array, now: Array) -> Array:
-    """S (n + 1, m, p) from one on."""
-    every = [now]
-    for one, more in zip(phi, psi, strict=True):
-        every.append(one @ every[-1] + more)
-    return np.array(every)

@@ -135,8 +135,8 @@ def sensitivities(
 
     between the instants at which a joint starts or stops, at which S jumps by (r - r_+) dt/dp; dr
     is differentiated operation by operation through the closed loops. The equations are solved
-    along the states of the simulation, by Lobatto's method IIIC of order 4 over its recorded
-    steps, which are taken in up to 4,096 parts where something jumps.
+    along the states of the simulation, by Lobatto's method IIIC, extrapolated to order 5, over its
+    recorded steps, which are taken in up to 4,096 parts where something jumps.
 
     Args:
         machine: The machine, or what `crane.load` takes.

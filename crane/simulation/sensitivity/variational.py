@@ -8,36 +8,116 @@ begins, in its middle and where it ends,
 so that what oil and stops stiffen needs no shorter steps (Hairer and Wanner, Solving Ordinary
 Differential Equations II, IV.5). A step maps S linearly, S(t + h) = Phi S(t) + Psi.
 
+Two steps and one over both of them differ by 15 times the error of the two, without which they
+are of order 5 (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations I, II.4).
+
 Its transpose takes weights lambda of S(t + h) to those of S(t) and of the B_j,
 
     nu = (1 - h a (x) A)^-T (0, 0, lambda),    Phi^T lambda = sum_i nu_i,
     Psi^T lambda = sum_j B_j^T mu_j,    mu_j = h sum_i a_ij nu_i.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
-from crane.closure.structure import Indices
 from crane.common.samples import Array
 
 STAGES = np.array([[1.0, -2.0, 1.0], [1.0, 2.5, -0.5], [1.0, 4.0, 1.0]]) / 6.0
 
 
-def staged(values: Array) -> Array:
+class Pairs(NamedTuple):
+    """What n pairs of steps do to S: Phi and Psi (n, m, m + p).
+
+    Attributes:
+        first: Of the first step.
+        both: Of both, without their error.
+    """
+
+    first: Array
+    both: Array
+
+
+BENDING = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 15.0  # see `bent`
+
+
+def bent(values: Array) -> Array:
+    """By pair of steps, what parabolas through their nodes leave out of their mean, and more.
+
+    Fourth differences over 15, of values (4 n + 1, .) at the nodes.
+    """
+    count = len(values) - 4
+    out: Array = sum(
+        (share * values[i : count + i : 4] for i, share in enumerate(BENDING)), np.zeros(())
+    )
+    return out
+
+
+class Returned(NamedTuple):
+    """The way back: Phi^T (n, m, m), and what gives mu (n, nodes, m, m)."""
+
+    back: Array
+    stages: Array
+
+
+class ReturnedPairs(NamedTuple):
+    """The transpose of `Pairs`, at three nodes of the first step and at five of both."""
+
+    first: Returned
+    both: Returned
+
+
+def pairs(values: Array, lengths: Array, sizes: Array) -> Pairs:
+    """What pairs of steps do.
+
+    Args:
+        values: A and B (4 n + 1, m, m + p) at the nodes.
+        lengths: (2 n,) of the steps, those of a pair equal [s].
+        sizes: See `steps`.
+    """
+    m, count = values.shape[1], len(lengths)
+    every = np.concatenate(steps(*_paired(values, lengths), sizes), axis=2)
+    first, second, double = every[:count:2], every[1:count:2], every[count:]
+    two = second[..., :m] @ first
+    two[..., m:] += second[..., m:]
+    return Pairs(first, two + (two - double) / 15.0)
+
+
+def returned_pairs(by_state: Array, lengths: Array, sizes: Array) -> ReturnedPairs:
+    """What takes weights back along pairs of steps; see `pairs`, with A (4 n + 1, m, m)."""
+    count = len(lengths)
+    back, stages = returns(*_paired(by_state, lengths), sizes)
+    first, second = (Returned(back[i:count:2], stages[i:count:2]) for i in range(2))
+    two = np.concatenate([first.stages @ second.back[:, None], 0.0 * second.stages[:, 1:]], axis=1)
+    two[:, 2:] += second.stages
+    two *= 16.0 / 15.0
+    two[:, ::2] -= stages[count:] / 15.0
+    whole = (16.0 * first.back @ second.back - back[count:]) / 15.0
+    return ReturnedPairs(first, Returned(whole, two))
+
+
+def _paired(values: Array, lengths: Array) -> tuple[Array, Array]:
+    """Values at the stages of 2 n steps and of n over two of them each, and how long these are."""
+    stages = np.concatenate([_staged(values), _staged(values[::2])])
+    return stages, np.concatenate([lengths, lengths[::2] + lengths[1::2]])
+
+
+def _staged(values: Array) -> Array:
     """Values (N, 3, .) at the stages of N steps, of those (2 N + 1, .) at their nodes."""
     return np.stack([values[i : len(values) - 2 + i : 2] for i in range(3)], axis=1)
 
 
-def steps(by_state: Array, by_number: Array, lengths: Array, sizes: Array) -> tuple[Array, Array]:
+def steps(values: Array, lengths: Array, sizes: Array) -> tuple[Array, Array]:
     """Phi (N, m, m) and Psi (N, m, p) of steps.
 
     Args:
-        by_state: A (N, 3, m, m) at their stages.
-        by_number: B (N, 3, m, p).
+        values: A and B (N, 3, m, m + p) at their stages.
         lengths: (N,) [s].
         sizes: (m,) of states, in shares of which the equations are solved: a rounded pressure
             [Pa] is no length [m].
     """
-    count, stages, m, p = by_number.shape
+    count, stages, m, width = values.shape
+    by_state, by_number, p = values[..., :m], values[..., m:], width - m
     right = np.empty((count, stages, m, m + p))
     right[..., :m] = np.eye(m)
     right[..., m:] = np.einsum("ij,n,njmp->nimp", STAGES, lengths, by_number) / sizes[:, None]
@@ -66,20 +146,3 @@ def _system(by_state: Array, lengths: Array, sizes: Array) -> Array:
             whole[:, i, :, j] = -STAGES[i, j] * lengths[:, None, None] * by_state[:, j]
     out: Array = whole.reshape(count, stages * m, stages * m) + np.eye(stages * m)
     return out
-
-
-def bent(values: Array) -> Array:
-    """By step, what a parabola through its three nodes leaves out of its mean, and more.
-
-    Fourth differences over 15, of values (2 n + 1, .) at the nodes of at least two steps.
-    """
-    shares = bending(len(values) // 2)
-    out: Array = sum((share * values[at] for at, share in shares), np.zeros(()))
-    return out
-
-
-def bending(count: int) -> list[tuple[Indices, float]]:
-    """What `bent` adds up: a node for each of some steps, and a share, in turn."""
-    at = np.clip(2 * np.arange(count) + 1, 2, 2 * count - 2)
-    weights = ((-2, 1.0), (-1, -4.0), (0, 6.0), (1, -4.0), (2, 1.0))
-    return [(at + i, weight / 15.0) for i, weight in weights]
