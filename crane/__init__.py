@@ -29,6 +29,7 @@ if TYPE_CHECKING:
         Rope,
         Sensor,
     )
+    from crane.description.external import ExternalForce, Pushing, Wrench
     from crane.dynamics import Dynamics
     from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
     from crane.formats.adding import add_cylinder, add_loops
@@ -86,6 +87,7 @@ _HOMES = {
     "crane.control": "PI Command ComputedTorque Controller Law Sampled Signals TipVelocity "
     "ValveDrive ValvePD joystick",
     "crane.description": "EndStop ForceElement Friction GasSpring PIGains Rope Sensor",
+    "crane.description.external": "ExternalForce Pushing Wrench",
     "crane.dynamics": "Dynamics",
     "crane.formats": "load write_machine write_mjcf write_urdf_plus",
     "crane.formats.adding": "add_cylinder add_loops",
@@ -117,18 +119,19 @@ _HOMES = {
 }
 
 __all__ = [
-    "PI", "Batch", "Calibration", "Closure", "Command", "Comparison", "ComputedTorque",
-    "Controller", "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation",
+    "Batch", "Calibration", "Closure", "Command", "Comparison", "ComputedTorque", "Controller",
+    "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation", "ExternalForce",
     "ForceElement", "Friction", "GasSpring", "Gradient", "Identification", "InterruptedRun",
-    "Kinematics", "Law", "LinearModel", "Machine", "PDGains", "PIGains", "Payload", "Recording",
-    "Rope", "Sampled", "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Study",
-    "TipVelocity", "Trajectory", "ValveDrive", "ValvePD", "Workspace", "add_cylinder", "add_loops",
-    "calibrate", "casadi_function", "check", "cross_validate", "excite", "excite_valves",
-    "gradient", "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
-    "identify_valve", "joystick", "linear_models", "linearize", "load",
-    "point_to_point", "polynomial", "read_measured", "replay", "report",
-    "sensitivities", "simulate", "simulate_batch", "sketch", "study", "task_trajectory",
-    "tip_trajectory", "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
+    "Kinematics", "Law", "LinearModel", "Machine", "PDGains", "PI", "PIGains", "Payload",
+    "Pushing", "Recording", "Rope", "Sampled", "Sensitivities", "Sensor", "SignalExcitation",
+    "Signals", "Study", "TipVelocity", "Trajectory", "ValveDrive", "ValvePD", "Workspace",
+    "Wrench", "add_cylinder", "add_loops", "calibrate", "casadi_function", "check",
+    "cross_validate", "excite", "excite_valves", "gradient", "identify",
+    "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
+    "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
+    "read_measured", "replay", "report", "sensitivities", "simulate", "simulate_batch", "sketch",
+    "study", "task_trajectory", "tip_trajectory", "workspace", "write_machine", "write_mjcf",
+    "write_urdf_plus",
 ]  # fmt: skip
 
 

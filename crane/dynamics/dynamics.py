@@ -9,7 +9,9 @@ from crane.closure.traced import geometry_of
 from crane.codegen import TooLongError, carefully
 from crane.common.errors import InputError, MechanismError, known
 from crane.common.samples import Array, as_number, as_samples, per_sample
+from crane.description.external import PARTS
 from crane.dynamics.compiled import FRICTION, SLOPES, NamedCode, QuantityCode
+from crane.dynamics.frames import FrameJacobians
 from crane.dynamics.joint_forces import JointForces
 from crane.dynamics.named import Named
 from crane.dynamics.traced import Form, modes_at, numbers_of
@@ -194,6 +196,47 @@ class Dynamics:
             (n,) or (N, n) [N], [N m].
         """
         return self._evaluate("passive", (), q_a, v_a)
+
+    def applied(self, q_a: ArrayLike, wrenches: Mapping[str, ArrayLike]) -> Array:
+        """What wrenches from outside do at the active joints: gamma^T sum J^T w.
+
+        M_A a_A + bias = tau_A + applied: the active forces of a motion under them are `inverse`
+        less this, those that hold the machine `gravity` less this, and `forward` takes tau_A and
+        this added up. The quantities themselves know nothing of the machine's `external`.
+
+        Args:
+            q_a: (n,) or (N, n) [m], [rad].
+            wrenches: By link (6,) or (N, 6), force [N] and moment about the origin of its frame
+                [N m], in the world's axes.
+
+        Returns:
+            (n,) or (N, n) [N], [N m].
+
+        Raises:
+            InputError: Unknown link, or shapes that do not go together.
+        """
+        q_a = as_samples(q_a, self._n, "q_a", self.machine.active)
+        given = {
+            link: as_samples(wrench, 6, f"the wrench on '{link}'", PARTS)
+            for link, wrench in wrenches.items()
+        }
+        for link in given:
+            self.machine.frame(link)
+        lengths = {len(x) for x in (q_a, *given.values()) if x.ndim == 2}
+        if len(lengths) > 1:
+            raise InputError(
+                f"stacks of {sorted(lengths)} samples do not go together, give equal N"
+            )
+        stacked, count = bool(lengths), lengths.pop() if lengths else 1
+        q = self.machine.closure.solve(np.broadcast_to(q_a, (count, self._n)))
+        out = np.zeros((count, self._n))
+        jacobians = FrameJacobians(self.machine)
+        rows = {link: np.broadcast_to(wrench, (count, 6)) for link, wrench in given.items()}
+        for i, gamma in enumerate(self.machine.closure.gamma(q)):
+            jacobians.place(q[i])
+            for link, wrench in rows.items():
+                out[i] += gamma.T @ (jacobians.of(link).T @ wrench[i])
+        return out if stacked else out[0]
 
     def energy(self, q_a: ArrayLike, v_a: ArrayLike) -> tuple[Array, Array]:
         """Kinetic and potential energy; the potential includes springs and constant forces.

@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from crane.common.samples import Array
+from crane.dynamics.frames import point_jacobian
 from crane.machine import Machine
 
 Pair = tuple[str, str]  # names of links
@@ -74,11 +75,5 @@ class Lengths:
         """A point of a body in the world (3,), and its velocities by the joints' (3, nv)."""
         if not joint:
             return place, np.zeros((3, self._model.nv))
-        world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        columns = pin.getJointJacobian(self._model, self._data, joint, world)
-        columns = columns.reshape(6, -1)  # of a single joint it is a vector
-        arm = self._data.oMi[joint].rotation @ place
-        return (
-            self._data.oMi[joint].translation + arm,
-            columns[:3] + np.cross(columns[3:], arm, axisa=0, axisb=0, axisc=0),
-        )
+        point: Array = self._data.oMi[joint].act(place)
+        return point, point_jacobian(self._model, self._data, joint, place)[:3]

@@ -168,7 +168,7 @@ def _assembled(
     check_elements(spec, closure)
     coordinates = closure.equations.coordinates
     lower, upper = coordinates.lower, coordinates.upper
-    return Machine(
+    machine = Machine(
         name=spec.name,
         source=spec.source,
         path=spec.path,
@@ -198,9 +198,11 @@ def _assembled(
         arguments=MappingProxyType({}),
         changes=MappingProxyType({name: float(value) for name, value in (changes or {}).items()}),
         free=free_joints(spec, closure.active_names),
+        external=(),
         motors=motors(spec, closure.active_names),
         locks=MappingProxyType({name: float(value) for name, value in (lock or {}).items()}),
     )
+    return machine.under(*spec.external) if spec.external else machine
 
 
 def _closed(spec: MachineSpec, model: pin.Model) -> Closure:

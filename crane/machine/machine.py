@@ -33,6 +33,7 @@ from crane.description import (
     inertia_problem,
 )
 from crane.description.estimation import Estimation
+from crane.description.external import ExternalForce
 from crane.description.rigid import loaded
 from crane.description.sources import WITH
 from crane.description.tree import Tree
@@ -88,6 +89,7 @@ class Machine:
         estimation: What `identify` estimates, and knows before.
         sensors: What is known of its sensors by quantity, see `crane.description.sensors`.
         free: Active joints that nothing drives: no force but friction, springs and stops.
+        external: Forces from outside.
         motors: What the file says that motors act on (actuators of a MJCF), or all drives where
             there are more than freedoms; empty where `drives` are the active joints.
         changes: Numbers that are not those of its files, by name.
@@ -120,6 +122,7 @@ class Machine:
     estimation: Estimation
     sensors: Mapping[str, Sensor]
     free: tuple[str, ...]
+    external: tuple[ExternalForce, ...]
     motors: tuple[Drive, ...]
     changes: Mapping[str, float]
     locks: Mapping[str, float]
@@ -146,6 +149,11 @@ class Machine:
     def home(self) -> Array:
         """(nv,) the home posture, closed."""
         return self.closure.home
+
+    @property
+    def traced(self) -> bool:
+        """Whether all that acts on it from outside can become machine code."""
+        return all(force.traced for force in self.external)
 
     @property
     def elements(self) -> tuple[Element, ...]:
@@ -383,6 +391,23 @@ class Machine:
             free=tuple(name for name in names if name in self.free),
             motors=(),
         )
+
+    def under(self, *forces: ExternalForce) -> "Machine":
+        """The same machine under more forces from outside.
+
+        Raises:
+            InputError: What is no such force, a frame that is unknown or does not move, or a name
+                that is taken.
+        """
+        every = (*self.external, *forces)
+        for force in forces:
+            if not isinstance(force, ExternalForce):
+                raise InputError(f"{force!r} is no force from outside, give a crane.Wrench")
+            if not self.model.frames[self.frame(force.frame)].parentJoint:
+                raise InputError(f"'{force.frame}' does not move, a load on it does nothing")
+            if [other.name for other in every].count(force.name) > 1:
+                raise InputError(f"two loads are called '{force.name}', give them names")
+        return dataclasses.replace(self, external=every)
 
     def with_payload(self, payload: Payload) -> "Machine":
         """The same machine carrying a payload.

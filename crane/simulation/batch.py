@@ -110,7 +110,7 @@ def simulate_batch(
         time, rows, notes = integrate(
             dynamics, control, starts[i], steps, step, method, tolerance=tolerance
         )
-        energy = np.hstack([rows.kinetic, rows.potential, rows.work, rows.lost])
+        energy = np.hstack([rows.kinetic, rows.potential, rows.work[:, :1], rows.lost])
         q_a = rows.q[:, machine.closure.active]
         doubts = [*notes, *said(machine, time, rows, step, fixed(dynamics, control, method))]
         return time, q_a, rows.v_a, rows.tau, energy, "; ".join(doubts)

@@ -110,7 +110,7 @@ def strokes_passed(machine: Machine, time: Array, q: Array) -> str:
 def _gap(rows: Parts) -> Array:
     """(N,) work less change of energy less dissipation [J]: what a run has lost by its steps."""
     stored = rows.kinetic[:, 0] + rows.potential[:, 0]
-    gap: Array = rows.work[:, 0] - rows.lost[:, 0] - stored + stored[0]
+    gap: Array = rows.work.sum(axis=1) - rows.lost[:, 0] - stored + stored[0]
     return gap
 
 

@@ -7,6 +7,8 @@ import numpy as np
 from crane.codegen import Parts
 from crane.common.samples import Array
 from crane.control import Controller, Free, Signals, ValveDrive, reference_of
+from crane.description.external import PARTS
+from crane.dynamics.external import ExternalForces
 from crane.dynamics.joint_forces import sticking
 from crane.hydraulics.circuit import BALANCES
 from crane.machine import Machine
@@ -73,11 +75,25 @@ def _channels(machine: Machine, control: Controller, time: Array, rows: Parts) -
     names = {"kinetic": "kinetic", "potential": "potential", "work": "work", "dissipated": "lost"}
     for name, part in names.items():
         yield name, getattr(rows, part)[:, 0], "J"
+    yield from _outside(machine, time, rows)
     if isinstance(control, ValveDrive):
         integrals = rows.own[:, -len(BALANCES) :]
         units = [*control.channels, *BALANCES.items()]
         for (name, unit), values in zip(units, [*rows.channels.T, *integrals.T], strict=True):
             yield name, values, unit
+
+
+def _outside(machine: Machine, time: Array, rows: Parts) -> Iterator[Column]:
+    """What acts from outside, in the world's axes at the origins of frames, and its work."""
+    if not machine.external:
+        return
+    velocities = np.einsum("nij,nj->ni", machine.closure.gamma(rows.q), rows.v_a)
+    wrenches = ExternalForces(machine).wrenches(time, rows.q, velocities)
+    for k, force in enumerate(machine.external):
+        for part, values in zip(PARTS, wrenches[:, k].T, strict=True):
+            if part.startswith("force") or values.any():
+                yield f"load_{force.name}_{part}", values, "N" if "force" in part else "N m"
+        yield f"work_{force.name}", rows.work[:, 1 + k], "J"
 
 
 def _references(machine: Machine, reference: Trajectory, time: Array) -> Iterator[Column]:

@@ -1,7 +1,7 @@
 """Motion in time: Runge-Kutta of fourth order on the active coordinates."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from crane.control import (
     ValveDrive,
     reference_of,
 )
+from crane.description.external import ExternalForce
 from crane.dynamics import Dynamics
 from crane.formats import load
 from crane.machine import Machine
@@ -43,7 +44,6 @@ from crane.simulation.judgement import limits_passed, said
 from crane.simulation.recorded import recorded
 
 _MOST = 4_000_000  # steps of one recording
-_ENERGIES = 2  # of the state: work, lost
 _FINEST, _COARSEST = 1e-13, 1e-2  # tolerances
 
 Force = Callable[[float, Array, Array], Array]
@@ -80,6 +80,7 @@ def simulate(
     method: str | None = None,
     tolerance: float | None = None,
     formulation: str = "exact",
+    loads: Sequence[ExternalForce] = (),
     progress: Progress | None = None,
 ) -> Recording:
     """Simulate a machine with its friction, passive forces and end stops.
@@ -112,14 +113,17 @@ def simulate(
         tolerance: Error of a step per size of the state; 1e-12 for DOP853, 1e-8 for rosenbrock,
             1e-9 for others if not given.
         formulation: "exact" or "decoupled", see `Dynamics`.
+        loads: Forces from outside besides those of its file: `crane.Wrench` by time,
+            `crane.Pushing` from a function in Python, `crane.ExternalForce` in machine code.
         progress: Called with the finished share, 0 to 1.
 
     Returns:
         Recording with channels for every passive joint, the tip, the references,
         friction_<joint>, rest_<joint> where friction sticks (what holds the joint at rest, 0
-        where it slips), and the energies kinetic, potential, work (of the active forces) and
-        dissipated [J]; work = change of (kinetic + potential) + dissipated, of the exact
-        formulation only.
+        where it slips), and the energies kinetic, potential, work (of the active forces),
+        work_<load> (of each force from outside, with load_<load>_force_x and so on, in the
+        world's axes) and dissipated [J]; all work = change of (kinetic + potential) + dissipated,
+        of the exact formulation only.
 
     Raises:
         InputError: Arguments of wrong shape or value.
@@ -136,6 +140,7 @@ def simulate(
         raise InputError(f"label {label!r} is not one line of text")
     if not isinstance(machine, Machine):
         machine = load(machine)
+    machine = machine.under(*loads)
     control = as_controller(controller, machine)
     steps = count_steps(control, duration, step)
     if text := reference_beyond(machine, control, steps * step):
@@ -194,7 +199,7 @@ def integrate(
         own = _own_start(control, dynamics, posture)
     except ClosureError as error:
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
-    state = np.concatenate([posture, v_a, own, np.zeros(_ENERGIES)])
+    state = np.concatenate([posture, v_a, own, np.zeros(2 + len(machine.external))])
     make = integration_of(dynamics, control, len(own), method, tolerance)
     chart = chart or Chart.of(dynamics)
     integration = ChartedSteps(chart, control, len(own), make)
@@ -233,7 +238,7 @@ def _usual(dynamics: Dynamics, control: Controller) -> str:
     if isinstance(control, ValveDrive):
         return "rosenbrock"
     traced = dynamics.backend == "compiled" and isinstance(control, TracedController)
-    return "DOP853" if traced else "rk4"
+    return "DOP853" if traced and dynamics.machine.traced else "rk4"
 
 
 def _own_start(control: Controller, dynamics: Dynamics, q: Array) -> Array:
@@ -271,6 +276,7 @@ def integration_of(
     def make(chart: Chart) -> Way:
         """Machine code, or scipy where there is none."""
         compiled = stepper is not None and chart.dynamics.backend == "compiled"
+        compiled &= chart.machine.traced
         if compiled and isinstance(control, TracedController):
             assert stepper is not None
             with suppress(TooLongError):

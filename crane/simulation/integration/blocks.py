@@ -6,12 +6,15 @@ import numpy as np
 
 from crane.common.samples import Array
 from crane.control import TracedController
+from crane.machine import Machine
+from crane.simulation.integration.traced import references_of
 
 _BLOCK = 1000  # steps of a call: their rows stay in the cache until they are where they belong
 
 
 def in_blocks(
     call: Callable[[int, Array, Array], int],
+    machine: Machine,
     control: TracedController,
     times: Array,
     step: float,
@@ -21,7 +24,8 @@ def in_blocks(
 
     Args:
         call: (count, references (2 count + 1, c), out (count, .)) -> how many steps were done.
-        control: What has the references.
+        machine: What has references of forces from outside.
+        control: What has the others.
         times: (steps,) [s].
         step: [s].
         rows: (steps, .) in any order, filled.
@@ -33,7 +37,7 @@ def in_blocks(
     halves = times[::length, None] + 0.5 * step * np.arange(2 * length + 1)
     firsts = range(0, len(times), length)
     instants = halves.ravel()[: 2 * len(times) + len(firsts)]
-    references = np.ascontiguousarray(control.references(instants))
+    references = references_of(machine, control, instants)
     out = np.empty((length, rows.shape[1]))
     for i, first in enumerate(firsts):
         count = min(length, len(times) - first)

@@ -23,6 +23,7 @@ from crane.codegen.scalar import Number, dot
 from crane.common.errors import ClosureError, MechanismError
 from crane.common.samples import Array
 from crane.dynamics import Dynamics
+from crane.dynamics.external import ExternalForces, form_of
 from crane.machine import Machine
 from crane.simulation.integration.sticking import Sticking
 
@@ -67,7 +68,8 @@ class Chart:
     def formulas(self) -> tuple:
         """What formulas of the chart depend on besides its loops."""
         dynamics = self.dynamics
-        return folded(dynamics.pattern), dynamics.form, tuple(self.seen.tolist())
+        outside = form_of(self.machine)
+        return folded(dynamics.pattern), dynamics.form, tuple(self.seen.tolist()), outside
 
     def turns(self, q: Array) -> Array:
         """C (n, n) of closed postures (nq,) or (N, nq): v_A = C v_B."""
@@ -81,6 +83,22 @@ class Chart:
     def forces(self, q: Array, tau: Array) -> Array:
         """Forces (n,) along the chart's coordinates of the user's at a closed posture."""
         return tau if self.own else self.turns(q).T @ tau
+
+    def outside(self, time: float, q: Array, v: Array) -> tuple[Array, Array]:
+        """What forces from outside do at a time [s], a closed posture (nq,), velocities (n,).
+
+        Returns:
+            (n,) along the chart's coordinates, and powers (k,) [W].
+        """
+        if not self.machine.external:
+            return np.zeros(len(v)), np.zeros(0)
+        gamma = self.machine.closure.gamma(q)
+        along, powers = self._external.along(time, q, gamma @ v)
+        return gamma.T @ along, powers
+
+    @cached_property
+    def _external(self) -> ExternalForces:
+        return ExternalForces(self.machine)
 
     def traced_forces(self, gamma: dict[int, list[Number]], tau: Sequence[Number]) -> list[Number]:
         """`forces` as formulas, with rows of gamma by body."""

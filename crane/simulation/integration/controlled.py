@@ -13,9 +13,10 @@ from crane.codegen.representation import Routine
 from crane.codegen.scalar import add, apply, dot, maximum, minimum, scale, with_sign_of
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
+from crane.machine import Machine
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.sticking import NEAR
-from crane.simulation.integration.traced import HELD, Stepper, beyond, wrapped
+from crane.simulation.integration.traced import HELD, Stepper, beyond, references_of, wrapped
 
 SPACING = 5e-4  # [s] between the instants that references are known at, at most
 LEAST = 0.1  # what is taken for no smaller: rad, machine's size, per `Closure.pace`
@@ -75,7 +76,7 @@ def errors_of(chart: Chart, states: int, tolerance: float) -> Array:
     """
     closure = chart.machine.closure
     rates = closure.units[closure.active] / closure.pace
-    energies = np.full(2, ENERGY * energy_of(chart))
+    energies = np.full(2 + len(chart.machine.external), ENERGY * energy_of(chart))
     every = np.concatenate([closure.units, rates, np.ones(states), energies])
     return tolerance * np.append(LEAST * every, 1.0)
 
@@ -119,7 +120,10 @@ class ControlledStepper(Stepper):
         self._short = isinstance(control, ValveDrive)
         super().__init__(chart, control, states, method, fold)
         self.tolerance = np.ascontiguousarray(tolerance)
-        self._lengths, self._breaks = np.zeros(6), np.append(breaks_of(control), np.inf)
+        self._lengths, self._breaks = (
+            np.zeros(6),
+            np.append(breaks_of(chart.machine, control), np.inf),
+        )
 
     def forget(self) -> None:
         """Begin with a short step, whatever was integrated before."""
@@ -177,7 +181,7 @@ class ControlledStepper(Stepper):
         """Rows (2 pairs + 1, c) between two times [s], at the ends as between them."""
         grid = np.linspace(begins, ends, 2 * pairs + 1)
         grid[[0, -1]] += _SAME * (grid[1] - begins) * np.array([1.0, -1.0])
-        return np.ascontiguousarray(self._control.references(grid))
+        return references_of(self._chart.machine, self._control, grid)
 
     @property
     def event(self) -> float:
@@ -446,14 +450,16 @@ class ControlledStepper(Stepper):
             stop()
 
 
-def breaks_of(control: TracedController) -> Array:
-    """Times (k,) [s] at which what a controller refers to jumps or turns sharply, in order.
+def breaks_of(machine: Machine, control: TracedController) -> Array:
+    """Times (k,) [s] at which what a controller or a force refers to turns sharply, in order.
 
-    As it says itself (`breaks`), or its reference.
+    As they say themselves (`breaks`), or its reference.
     """
+    outside = [force.breaks() for force in machine.external]
     command = control.command if isinstance(control, ValveDrive) else control
     sources: tuple[Any, ...] = command, getattr(command, "reference", None)
     for one in sources:
         if hasattr(one, "breaks"):
-            return np.unique(np.asarray(one.breaks(), dtype=np.float64))
-    return np.zeros(0)
+            outside.append(np.asarray(one.breaks(), dtype=np.float64))
+            break
+    return np.unique(np.concatenate([np.zeros(0), *outside]))

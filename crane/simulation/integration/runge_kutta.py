@@ -116,7 +116,7 @@ class CompiledStepper(Stepper):
                 out, self._lengths, self.bounds,
             )  # fmt: skip
 
-        return in_blocks(call, self._control, times, step, rows)
+        return in_blocks(call, self._chart.machine, self._control, times, step, rows)
 
     def _add_sums(self, program: Program) -> None:
         """blend(s, k, h) = s + h k; finish(geometry, s, k1, k2, k3, k4, h) = s + h/6 (...).

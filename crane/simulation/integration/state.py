@@ -7,8 +7,12 @@ from crane.machine import Machine
 
 
 def state_layout(machine: Machine, own: int) -> Layout:
-    """What is integrated: q (nv), v_a (n), the controller's own, work, lost [J]."""
-    return Layout(q=machine.model.nv, v_a=len(machine.active), own=own, work=1, lost=1)
+    """What is integrated: q (nv), v_a (n), the controller's own, work, lost [J].
+
+    Work is that of the active forces, then of each force from outside.
+    """
+    n, works = len(machine.active), 1 + len(machine.external)
+    return Layout(q=machine.model.nv, v_a=n, own=own, work=works, lost=1)
 
 
 def seen_layout(machine: Machine, control: Controller) -> Layout:

@@ -31,7 +31,7 @@ class Steps(Switching):
     def __init__(self, chart: Chart, control: Controller, own: int):
         self._fast: CompiledStepper | None = None
         compiled = not isinstance(control, ValveDrive) and chart.dynamics.backend == "compiled"
-        if compiled and isinstance(control, TracedController):
+        if compiled and chart.machine.traced and isinstance(control, TracedController):
             with suppress(TooLongError):
                 self._fast = CompiledStepper(chart, control, own)
         super().__init__(chart, control, own, self._fast)

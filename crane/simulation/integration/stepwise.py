@@ -53,7 +53,7 @@ class PythonStepper:
             tau = np.zeros(0) if seen is None else seen[: len(chart.seen)]
             if seen is None:
                 tau, _ = self._asked(time, at, chart.velocities(at.q, at.v_a))
-            forces = chart.forces(at.q, tau)
+            forces = chart.forces(at.q, tau) + chart.outside(time, at.q, at.v_a)[0]
             at.v_a[:] = chart.sticking.settle(self._dynamics, at.q, at.v_a, forces)
         except ClosureError as error:
             raise HaltedError(time, self.here(state), f": {error}") from None
@@ -77,7 +77,7 @@ class PythonStepper:
         """
         rate, tau = self._rate(time, state)
         at = self.layout.view(state)
-        forces = self._chart.forces(at.q, tau)
+        forces = self._chart.forces(at.q, tau) + self._chart.outside(time, at.q, at.v_a)[0]
         seen = self._dynamics.at("observation", at.q, at.v_a, forces)
         more: Array = np.zeros(0)
         if isinstance(self._control, ValveDrive):
@@ -135,11 +135,13 @@ class PythonStepper:
         try:
             v_a = chart.velocities(at.q, at.v_a)
             tau, own_rate = self._asked(time, at, v_a)
-            rates = self._dynamics.at("rates", at.q, at.v_a, chart.forces(at.q, tau))
+            outside, powers = chart.outside(time, at.q, at.v_a)
+            forces = chart.forces(at.q, tau) + outside
+            rates = self._dynamics.at("rates", at.q, at.v_a, forces)
         except ClosureError as error:
             raise HaltedError(time, self.here(state), f": {error}") from None
         self.margin = float(rates[-1])
-        return np.concatenate([rates[:-2], own_rate, [tau @ v_a, rates[-2]]]), tau
+        return np.concatenate([rates[:-2], own_rate, [tau @ v_a, *powers, rates[-2]]]), tau
 
     def _asked(self, time: float, at: Parts, v_a: Array) -> tuple[Array, Array]:
         """What the controller answers, (n,) and (k,)."""

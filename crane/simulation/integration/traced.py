@@ -16,7 +16,10 @@ from crane.codegen.scalar import add, dot, subtract
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.control import At, TracedController, ValveDrive
+from crane.dynamics.external import Applied, traced
+from crane.dynamics.external import columns_of as counts_of
 from crane.dynamics.traced import Moved, Sweep
+from crane.machine import Machine
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.state import seen_layout, state_layout
 
@@ -29,8 +32,14 @@ def beyond(r: Routine, result: Place) -> Value:
     return (result["steepest"] > r.bounds[3]) | (result["edge"] < r.bounds[4])
 
 
+def references_of(machine: Machine, control: TracedController, times: Array) -> Array:
+    """All that depends on time alone (N, c): the controller's, then those of `external`."""
+    outside = (force.references(times) for force in machine.external)
+    return np.ascontiguousarray(np.hstack([control.references(times), *outside]))
+
+
 def columns_of(control: TracedController) -> int:
-    """Length of a row of references."""
+    """Length of a controller's row of references."""
     return control.references(np.zeros(1)).shape[1]
 
 
@@ -44,6 +53,7 @@ class Traced:
         parts: Of the state.
         q_a: (n,) coordinates that the controller sees.
         v_a: (n,) their velocities.
+        outside: What forces from outside do.
     """
 
     chart: Chart
@@ -51,6 +61,7 @@ class Traced:
     parts: Parts
     q_a: list[Number]
     v_a: list[Number]
+    outside: Applied
 
     def seen(self, settings: list[Number], reference: list[Number]) -> At:
         """What a controller sees."""
@@ -59,8 +70,11 @@ class Traced:
 
     def moved(self, tau: Sequence[Number], rest: bool) -> Moved:
         """What it does under a controller's forces, with joints at rest or without."""
-        forces = self.chart.traced_forces(self.sweep.gamma, tau)
-        return self.sweep.moved(forces, rest)
+        return self.sweep.moved(self._pushed(tau), rest)
+
+    def _pushed(self, tau: Sequence[Number]) -> list[Number]:
+        """Forces along the chart's coordinates, a controller's and those from outside."""
+        return add(self.chart.traced_forces(self.sweep.gamma, tau), self.outside.forces)
 
     def observed(self, tau: Sequence[Number], rest: bool) -> list[Number]:
         """What is seen, but for a circuit's channels; see `seen_layout`."""
@@ -68,9 +82,8 @@ class Traced:
         return [*tau, *moved.friction, sweep.kinetic, sweep.potential, *moved.rest]
 
     def forces(self, tau: Sequence[Number]) -> list[Number]:
-        """What acts along the chart's coordinates: a controller's, passive forces, friction."""
-        forces = self.chart.traced_forces(self.sweep.gamma, tau)
-        return subtract(add(forces, self.sweep.passive), self.sweep.friction)
+        """What acts along the chart's coordinates, inertia and weight apart."""
+        return subtract(add(self._pushed(tau), self.sweep.passive), self.sweep.friction)
 
     def stiffness(self, own_rate: Sequence[Number], tau: Sequence[Number]) -> list[list[Number]]:
         """What rates of a controller's states and forces along the chart change with q_B.
@@ -94,8 +107,8 @@ class Traced:
         return [*rows[: len(own_rate)], *(add(one, other) for one, other in passive)]
 
     def powers(self, tau: Sequence[Number]) -> list[Number]:
-        """What a controller's forces put in and friction and dampers take out [W]."""
-        return [dot(tau, self.v_a), self.sweep.dissipation]
+        """What forces put in, a controller's and each from outside, and what is taken out [W]."""
+        return [dot(tau, self.v_a), *self.outside.powers, self.sweep.dissipation]
 
 
 def _undetermined(a_a: Sequence[Number], friction: bool) -> list[Number]:
@@ -103,12 +116,18 @@ def _undetermined(a_a: Sequence[Number], friction: bool) -> list[Number]:
 
 
 def machine_at(
-    chart: Chart, tape: Tape, layout: Layout, state: int, folds: tuple[Array, Array] | None = None
+    chart: Chart,
+    tape: Tape,
+    layout: Layout,
+    state: int,
+    outside: Sequence[Number],
+    folds: tuple[Array, Array] | None = None,
 ) -> Traced:
     """The machine at the state in an argument.
 
-    Geometry and numbers of the machine are the arguments 0 and 1; `folds` has both with NaN where
-    none may become part of the formulas, the machine's own if not given.
+    Geometry and numbers of the machine are the arguments 0 and 1; `outside` are references of
+    forces from there; `folds` has geometry and numbers with NaN where none may become part of the
+    formulas, the machine's own if not given.
     """
     dynamics, closure = chart.dynamics, chart.machine.closure
     geometry, pattern = folds or (None, dynamics.pattern)
@@ -117,7 +136,8 @@ def machine_at(
     constants = Constants(tape, 1, pattern)
     sweep = Sweep(posture, loops, constants, q, parts.v_a, dynamics.form, modes=True)
     v_a = parts.v_a if chart.own else [sweep.rates[i + 1] for i in chart.seen]
-    return Traced(chart, sweep, parts, [q[i] for i in chart.seen], v_a)
+    applied = traced(chart.machine, sweep, outside)
+    return Traced(chart, sweep, parts, [q[i] for i in chart.seen], v_a, applied)
 
 
 class Stepper:
@@ -148,13 +168,14 @@ class Stepper:
         self._fast, self._numbers = machine.closure.fast, chart.dynamics.numbers
         self._chart, self._control = chart, control
         self.bounds = np.concatenate([self._fast.bounds, chart.limits, [0.0]])
-        self._columns, self._fold = columns_of(control), fold
+        own = columns_of(control)
+        self._columns, self._fold = own + sum(counts_of(machine.external)), fold
         self._sticks = bool(chart.sticking.columns)
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
-        form = form_of(control, self._columns, len(machine.active), states, fold)
+        form = form_of(control, own, len(machine.active), states, fold)
         key = (*method, form, states, *chart.formulas)
         if key not in self._fast.programs:
-            self._fast.programs[key] = program_of(control, self._fast, key, self._build)
+            self._fast.programs[key] = program_of(machine, control, self._fast, key, self._build)
         self._program = self._fast.programs[key]
 
     def _build(self, program: Program) -> None:
@@ -166,9 +187,10 @@ class Stepper:
 
         References and state are the arguments 3 and 4.
         """
-        machine = machine_at(self._chart, tape, self._state, 4)
+        references, own = tape.loads(3, 0, self._columns), columns_of(self._control)
+        machine = machine_at(self._chart, tape, self._state, 4, references[own:])
         settings = settings_of(self._control, tape, 2, self._fold)
-        at = machine.seen(settings, tape.loads(3, 0, self._columns))
+        at = machine.seen(settings, references[:own])
         return machine, at, *self._control.trace(at)
 
     @property
@@ -205,7 +227,7 @@ class Stepper:
 
     def observe(self, time: float, state: Array) -> tuple[Array, float]:
         """What is seen (.,) at a time [s] and a state, and its margin (`Moved.margin`)."""
-        reference = np.ascontiguousarray(self._control.references(np.array([time])))
+        reference = references_of(self._chart.machine, self._control, np.array([time]))
         layout = self._program.outputs("observe")
         out = np.empty(layout.size)
         name = "observe" + _REST if self.bounds[HELD] else "observe"
@@ -258,14 +280,19 @@ def form_of(control: TracedController, columns: int, n: int, states: int, fold: 
 
 
 def program_of(
-    control: TracedController, fast: FastClosure, key: tuple, build: Callable[[Program], None]
+    machine: Machine,
+    control: TracedController,
+    fast: FastClosure,
+    key: tuple,
+    build: Callable[[Program], None],
 ) -> Program:
     """Machine code of a machine and its controller.
 
-    Found by what it depends on only where the package wrote the controller: what a user's class
-    does with a machine may depend on more than its formulas tell.
+    Found by what it depends on only where the package wrote the controller and the forces from
+    outside: what a user's class does with a machine may depend on more than its formulas tell.
 
     Args:
+        machine: The machine.
         control: The controller.
         fast: Of the machine.
         key: What the code depends on, `form_of` among it.
@@ -274,7 +301,9 @@ def program_of(
     Raises:
         TooLongError: It would take too long to compile.
     """
-    parts = [control, control.command] if isinstance(control, ValveDrive) else [control]
+    parts: list[object] = [control, *machine.external]
+    if isinstance(control, ValveDrive):
+        parts.append(control.command)
     if all(type(part).__module__.startswith("crane.") for part in parts):
         return fast.kept(key, build)
     return Program.kept(None, build)

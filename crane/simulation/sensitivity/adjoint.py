@@ -136,7 +136,7 @@ class Gatherer:
         self._scale(every[::2], found)
         if depth:
             bends = bent(by_state[: 2 * paired + 1])
-            smooth = ~self._rough(nodes, bends, every[2 : paired + 1 : 2])
+            smooth = np.logical_not(self._rough(nodes, bends, every[2 : paired + 1 : 2]))
         if not smooth.all():
             self._back(nodes, maps, every, added, smooth, depth)
             found = self._taken(nodes, maps, every, added, seen, smooth)

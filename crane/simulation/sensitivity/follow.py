@@ -141,10 +141,10 @@ class _Follower:
         curve = bent(both[: 2 * paired + 1])
         error = np.abs(curve[..., :m] @ ends[:-1] + curve[..., m:])
         error *= nodes.lengths[:paired:2, None, None]
-        rough = (error > self._accuracy * self._scale).any(axis=(1, 2)) & bool(depth)
+        rough = np.any(error > self._accuracy * self._scale, axis=(1, 2))
         every = [now]
         for first, pair, finer in zip(maps.first, maps.both, rough, strict=True):
-            if finer:
+            if finer and depth:
                 self._refined(nodes, every, depth)
                 self._refined(nodes, every, depth)
             else:

@@ -15,6 +15,7 @@ from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.description.sensors import FORCE, INCLINATION, VELOCITY
+from crane.dynamics.external import columns_of as counts_of
 from crane.machine import Machine
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.state import state_layout
@@ -90,7 +91,8 @@ class Rate:
         machine = chart.machine
         self._fast, self._n = machine.closure.fast, len(machine.active)
         self._state, self.size = state_layout(machine, states), 2 * self._n + stiff
-        self._columns = columns_of(control)
+        self._own = columns_of(control)
+        self._columns = self._own + sum(counts_of(machine.external))
         self._frames = frames_of(machine, outputs)
         self._folds = (
             np.where(moved.geometry != 0, np.nan, self._fast.geometry.numbers),
@@ -98,7 +100,7 @@ class Rate:
         )
         # what a circuit has not is 0 among its settings, and no part of the formulas
         self._settings = np.where(moved.settings != 0, np.nan, control.settings)
-        form = form_of(control, self._columns, self._n, states, True)
+        form = form_of(control, self._own, self._n, states, True)
         key = (
             type(self).__name__, form, states, stiff, *chart.formulas, self.outputs,
             *self._frames, *map(folded, (*self._folds, self._settings)),
@@ -106,7 +108,7 @@ class Rate:
                 moved.geometry, moved.numbers, moved.settings, moved.references, moved.frames)),
         )  # fmt: skip
         if key not in self._fast.programs:
-            self._fast.programs[key] = program_of(control, self._fast, key, self._build)
+            self._fast.programs[key] = program_of(machine, control, self._fast, key, self._build)
         self._program = self._fast.programs[key]
 
     def rate(self, base: Setup, state: Array, rest: bool) -> Array:
@@ -141,9 +143,11 @@ class Rate:
 
     def _traced(self, rest: bool) -> Rated:
         tape = Tape()
-        machine = machine_at(self._chart, tape, self._state, 5, self._folds)
+        references = tape.loads(4, 0, self._columns)
+        outside = references[self._own :]
+        machine = machine_at(self._chart, tape, self._state, 5, outside, self._folds)
         settings = Constants(tape, 2, self._settings).vector(0, len(self._settings))
-        at = machine.seen(settings, tape.loads(4, 0, self._columns))
+        at = machine.seen(settings, references[: self._own])
         tau, own_rate = self._control.trace(at)
         look = self._control.look(at) if isinstance(self._control, ValveDrive) else []
         found, sweep = machine.moved(tau, rest), machine.sweep

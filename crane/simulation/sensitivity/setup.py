@@ -10,6 +10,7 @@ from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.dynamics import Dynamics
 from crane.machine import Machine
+from crane.simulation.integration.traced import references_of
 
 FRAME = 6  # numbers of a frame
 
@@ -81,6 +82,6 @@ def setup_of(
         np.where(np.isnan(dynamics.pattern), 0.0, numbers),
         np.asarray(control.settings, dtype=np.float64),
         np.concatenate(places),
-        control.references(times),
+        references_of(machine, control, times),
         np.concatenate([*initial, own]),
     )

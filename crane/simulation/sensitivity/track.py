@@ -148,10 +148,11 @@ class Track:
     def __init__(self, motion: Motion, progress: Callable[[float], None] | None):
         dynamics, control, count, step = motion.dynamics, motion.control, motion.steps, motion.step
         machine, self.chart, self.control = dynamics.machine, Chart.of(dynamics), control
-        if dynamics.backend != "compiled" or not isinstance(control, TracedController):
+        compiled = dynamics.backend == "compiled" and machine.traced
+        if not compiled or not isinstance(control, TracedController):
             raise InputError(
                 f"'{machine.name}' with its controller has no formulas to differentiate: lock "
-                "joints, or write the controller as a Law"
+                "joints, or write the controller as a Law, and loads as ExternalForce"
             )
         if machine.coordinates.floating:
             raise InputError(f"'{machine.name}' floats, sensitivities are of machines that stand")

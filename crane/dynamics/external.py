@@ -1,0 +1,156 @@
+"""Forces from outside along the joints: J^T w, by Pinocchio and as formulas."""
+
+from collections.abc import Hashable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from crane.closure.screws import Vector
+from crane.closure.traced import Geometry
+from crane.codegen import Expression, Tape
+from crane.codegen.scalar import (
+    Number,
+    add,
+    cross,
+    dot,
+    product,
+    scale,
+    subtract,
+    times,
+    transposed,
+)
+from crane.common.samples import Array
+from crane.description.external import ExternalForce, Here
+from crane.dynamics.frames import FrameJacobians
+from crane.dynamics.traced import Sweep
+from crane.machine import Machine
+
+
+class Applied(NamedTuple):
+    """What forces from outside do to a machine.
+
+    Attributes:
+        forces: gamma^T J^T w (n,) of all of them together.
+        powers: (k,) of each [W].
+    """
+
+    forces: Vector
+    powers: Vector
+
+
+def columns_of(forces: Sequence[ExternalForce]) -> list[int]:
+    """(k,) how many references each has."""
+    return [force.references(np.zeros(1)).shape[1] for force in forces]
+
+
+def form_of(machine: Machine) -> Hashable:
+    """All that the formulas of a machine's external forces are, each traced by itself."""
+    out: list[Hashable] = []
+    for force, count in zip(machine.external, columns_of(machine.external), strict=True):
+        tape = Tape()
+        parts = (tape.loads(i, 0, 3) for i in range(3))
+        place, velocity, spin = parts
+        turn = [tape.loads(3, 3 * row, 3) for row in range(3)]
+        wrench = force.wrench(Here(place, turn, velocity, spin, tape.loads(4, 0, count)))
+        outputs = [
+            [x.index if isinstance(x, Expression) else float(x) for x in part] for part in wrench
+        ]
+        joint, pose = _placed(machine, force)
+        out.append((repr((count, tape.operations, outputs)), joint, pose.homogeneous.tobytes()))
+    return tuple(out)
+
+
+def traced(machine: Machine, sweep: Sweep, references: Sequence[Number]) -> Applied:
+    """`ExternalForces` as formulas, with all their references one after the other."""
+    posture, geometry = sweep.posture, sweep.posture.geometry
+    total: Vector = [0.0] * len(machine.active)
+    powers: Vector = []
+    back, first = transposed(posture.rotation[0]), 0  # formulas are seen from the trunk
+    for force, count in zip(machine.external, columns_of(machine.external), strict=True):
+        joint, pose = _placed(machine, force)
+        body = machine.coordinates.bodies[joint]
+        turn = geometry.turns[body].T
+        arm = times(posture.rotation[body], (turn @ pose.translation).tolist())
+        at = add(posture.origin[body], arm)
+        axes = product(posture.rotation[body], (turn @ pose.rotation).tolist())
+        carriers = _carriers(geometry, body)
+        velocity: Vector = [0.0] * 3
+        spin: Vector = [0.0] * 3
+        for i in carriers:
+            linear, angular = posture.columns[i]
+            velocity = add(velocity, scale(sweep.rates[i], add(linear, cross(angular, at))))
+            spin = add(spin, scale(sweep.rates[i], angular))
+        here = Here(
+            times(back, subtract(at, posture.origin[0])), product(back, axes),
+            times(back, velocity), times(back, spin), list(references[first : first + count]),
+        )  # fmt: skip
+        first += count
+        push, moment = (times(posture.rotation[0], list(part)) for part in force.wrench(here))
+        powers.append(dot(push, velocity) + dot(moment, spin))
+        about = add(moment, cross(at, push))
+        for i in carriers:
+            linear, angular = posture.columns[i]
+            total = add(total, scale(dot(push, linear) + dot(about, angular), sweep.gamma[i]))
+    return Applied(total, powers)
+
+
+class ExternalForces:
+    """What acts on a machine from outside, in numbers.
+
+    Args:
+        machine: The machine, whose `external` act.
+    """
+
+    def __init__(self, machine: Machine):
+        self._forces, self._jacobians = machine.external, FrameJacobians(machine)
+
+    def along(self, time: float, q: Array, v: Array) -> tuple[Array, Array]:
+        """J^T w along the joints.
+
+        Args:
+            time: [s].
+            q: (nq,) closed posture.
+            v: (nv,) velocities of all joints.
+
+        Returns:
+            (nv,) of all together, and powers (k,) of each [W].
+        """
+        wrenches = self.wrenches(np.array([time]), q[None], v[None])[0]
+        total, powers = np.zeros(len(v)), np.empty(len(self._forces))
+        for k, (force, wrench) in enumerate(zip(self._forces, wrenches, strict=True)):
+            jacobian = self._jacobians.of(force.frame)
+            total += jacobian.T @ wrench
+            powers[k] = wrench @ (jacobian @ v)
+        return total, powers
+
+    def wrenches(self, instants: Array, q: Array, v: Array) -> Array:
+        """(N, k, 6) forces and moments in the world's axes at times (N,), q and v (N, nv)."""
+        out = np.empty((len(instants), len(self._forces), 6))
+        references = [force.references(instants) for force in self._forces]
+        for i, (posture, velocity) in enumerate(zip(q, v, strict=True)):
+            self._jacobians.place(posture)
+            for k, force in enumerate(self._forces):
+                pose = self._jacobians.pose(force.frame)
+                rate = (self._jacobians.of(force.frame) @ velocity).tolist()
+                here = Here(
+                    pose.translation.tolist(), pose.rotation.tolist(), rate[:3], rate[3:],
+                    references[k][i].tolist(),
+                )  # fmt: skip
+                push, moment = force.wrench(here)
+                out[i, k] = np.array([*push, *moment], dtype=np.float64)
+        return out
+
+
+def _placed(machine: Machine, force: ExternalForce) -> tuple[int, pin.SE3]:
+    """Pinocchio's joint that moves a force's frame, and where the frame is in it."""
+    frame = machine.model.frames[machine.frame(force.frame)]
+    return int(frame.parentJoint), frame.placement
+
+
+def _carriers(geometry: Geometry, body: int) -> list[int]:
+    found = []
+    while body:
+        found.append(body)
+        body = geometry.parents[body]
+    return found

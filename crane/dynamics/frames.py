@@ -1,0 +1,60 @@
+"""How frames of the tree move with its joints, by Pinocchio."""
+
+import numpy as np
+import pinocchio as pin
+
+from crane.common.samples import Array
+from crane.machine import Machine
+
+
+class FrameJacobians:
+    """Jacobians of links, posture by posture.
+
+    Args:
+        machine: The machine.
+    """
+
+    def __init__(self, machine: Machine):
+        self._machine, self._model = machine, pin.Model(machine.model)
+        self._data = self._model.createData()
+
+    def place(self, q: Array) -> None:
+        """Take up a posture (nq,)."""
+        configuration = self._machine.coordinates.configuration(q)
+        pin.computeJointJacobians(self._model, self._data, configuration)
+
+    def pose(self, link: str) -> pin.SE3:
+        """Of a link's frame in the world, at the posture."""
+        joint, placement = self._held(link)
+        return self._data.oMi[joint] * placement
+
+    def of(self, link: str) -> Array:
+        """(6, nv) velocity of a frame's origin and angular velocity, in the world's axes."""
+        joint, placement = self._held(link)
+        if not joint:
+            return np.zeros((6, self._model.nv))
+        return point_jacobian(self._model, self._data, joint, placement.translation)
+
+    def _held(self, link: str) -> tuple[int, pin.SE3]:
+        frame = self._model.frames[self._machine.frame(link)]
+        return int(frame.parentJoint), frame.placement
+
+
+def point_jacobian(model: pin.Model, data: pin.Data, joint: int, place: Array) -> Array:
+    """(6, nv) of a point of a body, which the joints' Jacobians of `data` are computed for.
+
+    Args:
+        model: The tree.
+        data: Its data.
+        joint: Pinocchio's, that moves the body.
+        place: (3,) of the point in its frame [m].
+
+    Returns:
+        Of the point's velocity and the body's angular velocity, in the world's axes.
+    """
+    world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+    # of a single joint it is a vector
+    columns: Array = pin.getJointJacobian(model, data, joint, world).reshape(6, -1).copy()
+    arm = data.oMi[joint].rotation @ place
+    columns[:3] += np.cross(columns[3:], arm, axisa=0, axisb=0, axisc=0)
+    return columns

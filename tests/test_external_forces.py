@@ -1,0 +1,150 @@
+"""Forces from outside: by Pinocchio's own external forces, closed forms, and energy."""
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import crane
+from crane.codegen.scalar import scale
+from crane.common.errors import CraneError
+
+BUNDLED = ("mini_forwarder", "patu655")
+
+
+def wandering(machine, count=5, seed=0):
+    """States (N, n) within the middle half of the limits."""
+    random = np.random.default_rng(seed)
+    middle = 0.5 * (machine.lower + machine.upper)
+    reach = 0.25 * np.minimum(machine.upper - machine.lower, 2.0)
+    middle = np.where(np.isfinite(middle), middle, 0.0)
+    q_a = middle + reach * random.uniform(-1, 1, (count, len(middle)))
+    return q_a, 0.1 * random.normal(size=q_a.shape), random
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_wrenches_do_what_those_of_pinocchio_do(name):
+    """gamma^T (rnea(q, v, a) - rnea(q, v, a, f_ext)) with wrenches on the bodies."""
+    machine = crane.load(name)
+    dynamics = crane.Dynamics(machine)
+    q_a, v_a, random = wandering(machine)
+    model, link = machine.model, machine.tip
+    wrenches = random.normal(size=(len(q_a), 6))
+    found = dynamics.applied(q_a, {link: wrenches})
+    data, frame = model.createData(), model.frames[machine.frame(link)]
+    for i, q in enumerate(machine.closure.solve(q_a)):
+        gamma = machine.closure.gamma(q)
+        at, v = machine.coordinates.configuration(q), gamma @ v_a[i]
+        a = gamma @ random.normal(size=len(v_a[i]))
+        without = pin.rnea(model, data, at, v, a).copy()
+        pin.framesForwardKinematics(model, data, at)
+        upright = pin.SE3(np.eye(3), data.oMf[machine.frame(link)].translation)
+        outer = [pin.Force.Zero() for _ in range(model.njoints)]
+        in_world = upright.act(pin.Force(wrenches[i]))
+        outer[frame.parentJoint] = data.oMi[frame.parentJoint].actInv(in_world)
+        true = gamma.T @ (without - pin.rnea(model, data, at, v, a, outer))
+        assert found[i] == pytest.approx(true, abs=1e-11 * np.abs(true).max() + 1e-12)
+
+
+class Drag(crane.ExternalForce):
+    """A force against the velocity, and a moment against the spin."""
+
+    def wrench(self, here):
+        return scale(-30.0, here.velocity), scale(-2.0, here.spin)
+
+
+def dragged(time, place, turn, velocity, spin):
+    return np.concatenate([-30.0 * velocity, -2.0 * spin])
+
+
+def loads_of(machine, drag):
+    times = [0.0, 0.2, 0.2, 0.6]
+    forces = [[0, 0, 0], [3, 2, -5], [-2, 1, 4], [0, 0, 1]]
+    turned = crane.Wrench(machine.tip, (1.0, -2.0, 0.5), (0.2, 0.1, -0.3), axes="frame", name="t")
+    return crane.Wrench(machine.tip, forces, times=times), turned, drag
+
+
+def test_a_function_in_python_does_what_formulas_do():
+    sticky = crane.load("mini_forwarder")
+    machine = sticky.replace(
+        friction={x: crane.Friction(viscous=law.viscous) for x, law in sticky.friction.items()}
+    )
+    start = machine.home[machine.closure.active], [0.3, 0.02, 0.01]
+    runs = [
+        crane.simulate(machine, None, start, 0.3, 2e-3, method="rk4", loads=loads)
+        for loads in (
+            loads_of(machine, Drag(machine.tip, "drag")),
+            loads_of(machine, crane.Pushing(machine.tip, dragged, "drag")),
+        )
+    ]
+    assert runs[0].q == pytest.approx(runs[1].q, abs=1e-11)
+    for name in ("work_drag", "work_t", "load_drag_force_x", "load_t_moment_z"):
+        one, other = (run.channels[name] for run in runs)
+        assert one == pytest.approx(other, abs=1e-9 * np.abs(other).max()), name
+        assert np.abs(other).max() > 1e-3
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Radau", "rosenbrock"])
+def test_all_methods_agree_and_work_is_in_the_balance(method):
+    machine = crane.load("mini_forwarder")
+    controller = crane.ComputedTorque(machine, crane.task_trajectory(machine, "lift"))
+    loads = loads_of(machine, Drag(machine.tip, "drag"))
+    run = crane.simulate(machine, controller, None, 0.6, method=method, loads=loads)
+    other = crane.simulate(machine, controller, None, 0.6, tolerance=1e-13, loads=loads)
+    assert run.q == pytest.approx(other.q, abs=1e-7)
+    seen = run.channels
+    names = [f"work_{name}" for name in (machine.tip, "t", "drag")]
+    assert all(np.ptp(seen[name]) > 1e-4 for name in names)
+    work = seen["work"] + sum(seen[name] for name in names)
+    stored = seen["kinetic"] + seen["potential"]
+    gap = work - (stored - stored[0]) - seen["dissipated"]
+    assert np.abs(gap).max() < 1e-6 * np.ptp(work)
+    assert (np.diff(seen["work_drag"]) <= 1e-9).all()
+    # the impulse of the drag is the way of the tip, which is seen apart
+    way = np.stack([np.ptp(seen[f"tip_{x}"][[0, -1]]) for x in "xyz"])
+    drag = np.stack([seen[f"load_drag_force_{x}"] for x in "xyz"], axis=1)
+    impulse = 0.5 * (drag[1:] + drag[:-1]).sum(axis=0) * 1e-3
+    assert np.abs(impulse) == pytest.approx(30.0 * way, rel=1e-3)
+
+
+def test_with_hydraulics_a_pull_is_in_the_chambers():
+    """A cylinder that holds still carries the load's generalised force more."""
+    machine = crane.load("patu655", lock={"X_ext": 0.1, "slew": 0.0})
+    pull = crane.Wrench(machine.tip, (0.0, 0.0, -1500.0))
+    runs = [crane.simulate(machine, None, None, 4.0, loads=loads) for loads in ((), (pull,))]
+    forces = [run.tau[-1] for run in runs]
+    q_a = [run.q[-1] for run in runs]
+    dynamics = crane.Dynamics(machine)
+    more = dynamics.applied(q_a[1], {machine.tip: [0, 0, -1500.0, 0, 0, 0]})
+    expected = [dynamics.gravity(q) - dynamics.passive(q, 0 * q) for q in q_a]
+    difference = forces[1] - forces[0]
+    friction = runs[1].channels["rest_X_lift"][-1] - runs[0].channels["rest_X_lift"][-1]
+    # what friction holds at rest is told by the recording
+    assert difference[0] - friction == pytest.approx(
+        (expected[1] - expected[0] - more)[0], rel=1e-3
+    )
+    assert abs(more[0]) > 1e3
+
+
+def test_what_is_no_load_is_refused():
+    machine = crane.load("mini_forwarder")
+    tip = machine.tip
+
+    def run(load):
+        crane.simulate(machine, None, None, 0.01, loads=[load])
+
+    for load, text in (
+        (lambda: crane.Wrench("nix", (1, 0, 0)), "'nix'"),
+        (lambda: crane.Wrench(tip, (1, 0)), r"force has the shape \(2,\)"),
+        (lambda: crane.Wrench(tip, (1, 0, np.nan)), "no finite numbers"),
+        (lambda: crane.Wrench(tip, [[1, 0, 0]] * 2, times=[1, 0]), "times do not rise"),
+        (lambda: crane.Wrench(tip, axes="tip"), "give 'world' or 'frame'"),
+        (lambda: crane.Pushing(tip, lambda *_: [np.nan] * 6), "six numbers"),
+        (lambda: crane.Pushing(tip, lambda *_: [1.0, 2.0]), "six numbers"),
+        (lambda: 3.0, "no force from outside"),
+        (lambda: crane.Wrench(machine.model.frames[1].name, (1, 0, 0)), "does not move"),
+    ):
+        with pytest.raises(CraneError, match=text):
+            run(load())
+    twice = [crane.Wrench(tip, (1, 0, 0))] * 2
+    with pytest.raises(CraneError, match="two loads are called"):
+        crane.simulate(machine, None, None, 0.01, loads=twice)
