@@ -3,10 +3,12 @@
 import numpy as np
 import pinocchio as pin
 import pytest
+from typed import typed
 
 import crane
 from crane.codegen.scalar import scale
 from crane.common.errors import CraneError
+from crane.recordings import timeseries
 
 BUNDLED = ("mini_forwarder", "patu655")
 
@@ -148,3 +150,90 @@ def test_what_is_no_load_is_refused():
     twice = [crane.Wrench(tip, (1, 0, 0))] * 2
     with pytest.raises(CraneError, match="two loads are called"):
         crane.simulate(machine, None, None, 0.01, loads=twice)
+
+
+FILE = """
+name: pushed
+chains: [{name: block, urdf: block.urdf}]
+active: [x, z]
+home: {x: 0, z: 0}
+loads:
+  - {frame: block, force: [3, 0, 0], name: push}
+  - frame: block
+    force: [[0, 0, 0], [0, 0, 4]]
+    times: [0, 2]
+"""
+MASS = 2.0
+
+
+@pytest.fixture
+def pushed(tmp_path):
+    """A block that slides along x and, without weight on it, z."""
+    joints = "".join(
+        f'''<joint name="{axis}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>
+        <axis xyz="{way}"/><limit lower="-100" upper="100" effort="1" velocity="1"/></joint>'''
+        for axis, parent, child, way in (
+            ("x", "base", "slide", "1 0 0"), ("z", "slide", "block", "0 0 1"))
+    )  # fmt: skip
+    (tmp_path / "block.urdf").write_text(
+        f'''<robot name="block"><link name="base"/><link name="slide"/>
+        <link name="block"><inertial><mass value="{MASS}"/>
+        <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+        </link>{joints}</robot>'''
+    )
+    path = tmp_path / "pushed.yaml"
+    path.write_text(FILE)
+    return path
+
+
+def test_loads_of_a_machine_file_as_closed_forms(pushed, tmp_path):
+    """Under F and c t, x = F t^2 / 2 m and z = c t^3 / 6 m - g t^2 / 2."""
+    machine = crane.load(pushed)
+    run = crane.simulate(machine, None, None, 2.0, 0.01)
+    t = run.time
+    true = np.stack([3 * t**2 / (2 * MASS), 2 * t**3 / (6 * MASS) - 9.81 * t**2 / 2], axis=1)
+    assert run.q == pytest.approx(true, abs=1e-10)
+    assert run.channels["work_push"] == pytest.approx(3 * true[:, 0], abs=1e-9)
+    by = ("block.mass", "start.x_velocity")
+    slopes = crane.sensitivities(machine, None, None, 2.0, 0.01, by=by, outputs=("x", "z")).slopes
+    assert slopes[-1, 0] == pytest.approx([-3 * 4 / (2 * MASS**2), 2.0], abs=1e-8)
+    assert slopes[-1, 1] == pytest.approx([-2 * 8 / (6 * MASS**2), 0.0], abs=1e-8)
+    written = crane.load(crane.write_machine(machine, tmp_path / "written"))
+    again = crane.simulate(written, None, None, 2.0, 0.01)
+    assert again.q == pytest.approx(run.q, abs=1e-12)
+
+
+def test_wrong_loads_of_a_machine_file_are_told_with_their_line(pushed):
+    for old, new, text in (
+        ("force: [3, 0, 0]", "force: [3, 0]", r"yaml:7: .*shape \(2,\)"),
+        ("force: [3, 0, 0]", "force: 3", "yaml:7: .*give a list"),
+        ("force: [3, 0, 0], name", "name", "yaml:7: .*does nothing"),
+        ("frame: block, force", "frame: base, force", "yaml:7: .*does not move"),
+        ("frame: block, force", "frame: nix, force", "yaml:7: .*'nix'"),
+        ("name: push}", "axes: up}", "yaml:7: .*'world' or 'frame'"),
+        ("name: push}", "name: block}", "two loads are called 'block'"),
+        ("times: [0, 2]", "times: [2, 0]", "yaml:8: .*do not rise"),
+    ):
+        pushed.write_text(FILE.replace(old, new))
+        with pytest.raises(CraneError, match=text):
+            crane.load(pushed)
+
+
+def test_loads_are_typed(pushed, tmp_path):
+    out, table = tmp_path / "out", tmp_path / "table.csv"
+    table.write_text("time [s],force_x [kN]\n0,0.001\n1,0.002\n")
+    command = ("simulate", pushed, "--duration", "1", "--step", "0.1", "--out", out)
+    done = typed(*command, "--load", f"slide={table}")
+    assert done.returncode == 0, done.stderr
+    rows = timeseries.read(out / "recording.csv")
+    x = rows.values[-1, list(rows.units).index("x")]
+    # 3 N and 1 + t N
+    assert x == pytest.approx((4 * 0.5 + 1 / 6) / MASS, abs=1e-9)
+    for word, said in (
+        ("slide", "no FRAME=WRENCH"), ("nix=1,0,0", "'nix'"), ("slide=1,0", "3 or 6 numbers"),
+        ("slide=no.csv", "no.csv"), ("slide@up=1,0,0", "'world' or 'frame'"),
+        ("block=1,0,0", "two loads are called"), ("slide=1,0,nan", "no finite numbers"),
+    ):  # fmt: skip
+        done = typed(*command[:-1], tmp_path / "other", "--load", word)
+        assert done.returncode == 2 and said in done.stderr, done.stderr
+        assert not (tmp_path / "other").exists()

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from crane.cli.loads import Load, loads_of
 from crane.cli.shared import (
     INTERRUPTED,
     Active,
@@ -71,6 +72,7 @@ def simulate(
     tolerance: Annotated[
         float | None, typer.Option(help="Error of a step per size of the state, such as 1e-8.")
     ] = None,
+    load_: Load = None,
     change: Change = None,
     lock: Lock = None,
     active: Active = None,
@@ -87,6 +89,7 @@ def simulate(
 
     check_folder(out, force)
     loaded = load(machine, lock, change, active, free, floating, packages, argument)
+    loaded = loaded.under(*loads_of(load_))
     if inputs is not None:
         named = {"--task": task, "--controller": controller}
         given = [option for option, value in named.items() if value is not None]

@@ -31,6 +31,7 @@ from crane.formats.machine_file.forces import (
     read_forces,
     read_friction,
     read_gas_springs,
+    read_loads,
     read_ropes,
     read_rotors,
 )
@@ -48,7 +49,7 @@ Part = TypeVar("Part")
 
 _KEYS = (
     "name", "source", "chains", "loops", "active", "free", "drives", "home", "friction", "forces",
-    "gas_springs", "ropes", "end_stops", "rotor_inertia", "couplings",
+    "gas_springs", "ropes", "loads", "end_stops", "rotor_inertia", "couplings",
     "tip", "payload", "tasks", "control", "hydraulics", "sensors", "identification",
 )  # fmt: skip
 
@@ -149,6 +150,7 @@ def _read_machine(path: Path) -> MachineSpec:
         free, _part(_drives, (), top, tree), _part(read_ropes, (), top, tree),
         _part(read_sensors, {}, top, tree),
         _part(read_estimation, Estimation(), top),
+        _part(read_loads, (), top, tree),
     )  # fmt: skip
 
 

@@ -249,6 +249,16 @@ class Section:
             raise self.fail(key, f"'{key}' of {self.title} is {shown}, give a list such as [0, 1]")
         return tuple(self._number(key, item) for item in value)
 
+    def rows(self, key: str, default: Any = _MISSING) -> list[list[float]]:
+        """A list of finite numbers, or of such lists: one row, or as many."""
+        value = self._take(key, default)
+        nested = isinstance(value, list | tuple) and any(isinstance(x, list) for x in value)
+        rows = value if nested else [value]
+        if not all(isinstance(row, list | tuple) and row for row in rows):
+            wanted = "give a list such as [0, 0, 1], or one of such lists"
+            raise self.fail(key, f"'{key}' of {self.title} is {_shown(value)}, {wanted}")
+        return [[self._number(key, item) for item in row] for row in rows]
+
     def _list(self, key: str, wanted: str) -> list[Any]:
         value = self._take(key, _MISSING)
         if not isinstance(value, list):
