@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         Sensor,
     )
     from crane.description.external import ExternalForce, Pushing, Wrench
+    from crane.description.ground import Contact, Ground
     from crane.dynamics import Dynamics
     from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
     from crane.formats.adding import add_cylinder, add_loops
@@ -88,6 +89,7 @@ _HOMES = {
     "ValveDrive ValvePD joystick",
     "crane.description": "EndStop ForceElement Friction GasSpring PIGains Rope Sensor",
     "crane.description.external": "ExternalForce Pushing Wrench",
+    "crane.description.ground": "Contact Ground",
     "crane.dynamics": "Dynamics",
     "crane.formats": "load write_machine write_mjcf write_urdf_plus",
     "crane.formats.adding": "add_cylinder add_loops",
@@ -119,14 +121,14 @@ _HOMES = {
 }
 
 __all__ = [
-    "Batch", "Calibration", "Closure", "Command", "Comparison", "ComputedTorque", "Controller",
-    "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation", "ExternalForce",
-    "ForceElement", "Friction", "GasSpring", "Gradient", "Identification", "InterruptedRun",
-    "Kinematics", "Law", "LinearModel", "Machine", "PDGains", "PI", "PIGains", "Payload",
-    "Pushing", "Recording", "Rope", "Sampled", "Sensitivities", "Sensor", "SignalExcitation",
-    "Signals", "Study", "TipVelocity", "Trajectory", "ValveDrive", "ValvePD", "Workspace",
-    "Wrench", "add_cylinder", "add_loops", "calibrate", "casadi_function", "check",
-    "cross_validate", "excite", "excite_valves", "gradient", "identify",
+    "Batch", "Calibration", "Closure", "Command", "Comparison", "ComputedTorque", "Contact",
+    "Controller", "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation",
+    "ExternalForce", "ForceElement", "Friction", "GasSpring", "Gradient", "Ground",
+    "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel", "Machine", "PDGains",
+    "PI", "PIGains", "Payload", "Pushing", "Recording", "Rope", "Sampled", "Sensitivities",
+    "Sensor", "SignalExcitation", "Signals", "Study", "TipVelocity", "Trajectory", "ValveDrive",
+    "ValvePD", "Workspace", "Wrench", "add_cylinder", "add_loops", "calibrate", "casadi_function",
+    "check", "cross_validate", "excite", "excite_valves", "gradient", "identify",
     "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
     "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
     "read_measured", "replay", "report", "sensitivities", "simulate", "simulate_batch", "sketch",

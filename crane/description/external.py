@@ -60,6 +60,10 @@ class ExternalForce:
         """Times (k,) [s] at which that jumps or turns sharply, in order."""
         return np.zeros(0)
 
+    def edges(self, here: Here) -> Sequence[Number]:
+        """Lengths [m] at whose signs the wrench bends sharply: steps end there; none yet."""
+        return ()
+
     def wrench(self, here: Here) -> tuple[Sequence[Number], Sequence[Number]]:
         """Force (3,) [N] and moment (3,) [N m] about the frame's origin, in the world's axes."""
         raise NotImplementedError

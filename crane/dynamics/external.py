@@ -33,10 +33,12 @@ class Applied(NamedTuple):
     Attributes:
         forces: gamma^T J^T w (n,) of all of them together.
         powers: (k,) of each [W].
+        edges: Lengths [m] at whose signs some of them bend.
     """
 
     forces: Vector
     powers: Vector
+    edges: Vector
 
 
 def columns_of(forces: Sequence[ExternalForce]) -> list[int]:
@@ -52,9 +54,10 @@ def form_of(machine: Machine) -> Hashable:
         parts = (tape.loads(i, 0, 3) for i in range(3))
         place, velocity, spin = parts
         turn = [tape.loads(3, 3 * row, 3) for row in range(3)]
-        wrench = force.wrench(Here(place, turn, velocity, spin, tape.loads(4, 0, count)))
+        here = Here(place, turn, velocity, spin, tape.loads(4, 0, count))
         outputs = [
-            [x.index if isinstance(x, Expression) else float(x) for x in part] for part in wrench
+            [x.index if isinstance(x, Expression) else float(x) for x in part]
+            for part in (*force.wrench(here), force.edges(here))
         ]
         joint, pose = _placed(machine, force)
         out.append((repr((count, tape.operations, outputs)), joint, pose.homogeneous.tobytes()))
@@ -66,6 +69,7 @@ def traced(machine: Machine, sweep: Sweep, references: Sequence[Number]) -> Appl
     posture, geometry = sweep.posture, sweep.posture.geometry
     total: Vector = [0.0] * len(machine.active)
     powers: Vector = []
+    edges: Vector = []
     back, first = transposed(posture.rotation[0]), 0  # formulas are seen from the trunk
     for force, count in zip(machine.external, columns_of(machine.external), strict=True):
         joint, pose = _placed(machine, force)
@@ -86,13 +90,14 @@ def traced(machine: Machine, sweep: Sweep, references: Sequence[Number]) -> Appl
             times(back, velocity), times(back, spin), list(references[first : first + count]),
         )  # fmt: skip
         first += count
+        edges += force.edges(here)
         push, moment = (times(posture.rotation[0], list(part)) for part in force.wrench(here))
         powers.append(dot(push, velocity) + dot(moment, spin))
         about = add(moment, cross(at, push))
         for i in carriers:
             linear, angular = posture.columns[i]
             total = add(total, scale(dot(push, linear) + dot(about, angular), sweep.gamma[i]))
-    return Applied(total, powers)
+    return Applied(total, powers, edges)
 
 
 class ExternalForces:

@@ -199,6 +199,7 @@ class ControlledStepper(Stepper):
             rate = [*slopes, *moved.a_a, *own_rate, *machine.powers(tau)]
             closure = self._chart.machine.closure
             edges = machine.sweep.edges(closure.units.tolist(), closure.size)
+            edges += scale(1.0 / closure.size, machine.outside.edges)
             outputs = {"rate": rate, "margin": [moved.margin], "edges": edges}
             program.add("rate" + added, 5, outputs)
         self._add_edges(program, len(edges))

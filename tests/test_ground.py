@@ -1,0 +1,170 @@
+"""Contact with the ground: statics of a block on a slope, falls, wheels, energy."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import crane
+from crane.common.errors import CraneError
+
+MASS, WIDE, HIGH = 40.0, 0.6, 0.5  # of a block, half its width along x, and its centre's height
+
+
+@pytest.fixture
+def block(tmp_path):
+    """A block that floats, with links at its lower corners."""
+    corners = "".join(
+        f"""<link name="c{i}"/><joint name="j{i}" type="fixed"><parent link="block"/>
+        <child link="c{i}"/><origin xyz="{x} {y} {-HIGH}"/></joint>"""
+        for i, (x, y) in enumerate(((WIDE, 0.8), (WIDE, -0.8), (-WIDE, 0.8), (-WIDE, -0.8)))
+    )
+    path = tmp_path / "block.urdf"
+    path.write_text(
+        f"""<robot name="block"><link name="world"/><joint name="fly" type="floating">
+        <parent link="world"/><child link="block"/></joint><link name="block"><inertial>
+        <mass value="{MASS}"/>
+        <inertia ixx="6" iyy="5" izz="8" ixy="0" ixz="0" iyz="0"/></inertial></link>
+        {corners}</robot>"""
+    )
+    return crane.load(path)
+
+
+def feet(slope=0.0, **options):
+    ground = crane.Ground(normal=(-np.sin(slope), 0.0, np.cos(slope)))
+    return [crane.Contact(f"c{i}", ground, name=f"foot{i}", **options) for i in range(4)]
+
+
+def start(machine, slope, above=0.0):
+    """Coordinates of the block above a slope that rises with x, and still."""
+    q = np.zeros(6)
+    q[:3] = (HIGH + above) * np.array([-np.sin(slope), 0.0, np.cos(slope)])
+    q[4] = -slope
+    return q
+
+
+def run(machine, loads, initial, duration, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return crane.simulate(machine, None, initial, duration, loads=loads, **options)
+
+
+def balance(found, loads):
+    """The gap of energies over what went through [1]."""
+    seen = found.channels
+    works = [seen[f"work_{load.name}"] for load in loads]
+    stored = seen["kinetic"] + seen["potential"]
+    gap = sum(works) - (stored - stored[0]) - seen["dissipated"]
+    return np.abs(gap).max() / max(np.ptp(x) for x in (*works, stored, seen["kinetic"]))
+
+
+def forces(found, loads):
+    """(k, 3) at the end."""
+    return np.array([
+        [found.channels[f"load_{load.name}_force_{x}"][-1] for x in "xyz"] for load in loads
+    ])  # fmt: skip
+
+
+def test_a_block_that_rests_presses_with_its_weight(block):
+    loads = feet(stiffness=1e5, damping=2.0)
+    found = run(block, loads, start(block, 0.0), 3.0, step=0.01)
+    assert balance(found, loads) < 1e-6
+    assert forces(found, loads)[:, 2] == pytest.approx(MASS * 9.81 / 4, rel=1e-6)
+    assert found.q[-1, 2] == pytest.approx(HIGH - MASS * 9.81 / 4 / 1e5, abs=1e-8)
+
+
+@pytest.mark.parametrize("smoothing", [1e-2, 1e-3])
+def test_below_the_angle_of_friction_it_creeps_as_smoothing_says(block, smoothing):
+    slope, friction = 0.3, 0.5
+    loads = feet(slope, stiffness=1e5, damping=2.0, friction=friction, smoothing=smoothing)
+    found = run(block, loads, start(block, slope), 4.0, step=0.01)
+    assert balance(found, loads) < 1e-6
+    speed = np.linalg.norm(np.diff(found.q[-2:, :3], axis=0)) / 0.01
+    k = np.tan(slope)
+    assert speed == pytest.approx(smoothing * k / np.sqrt(friction**2 - k**2), rel=1e-3)
+
+
+def test_above_it_slides_as_coulomb_says(block):
+    slope, friction = 0.5, 0.4
+    loads = feet(slope, stiffness=1e5, damping=2.0, friction=friction, smoothing=1e-3)
+    found = run(block, loads, start(block, slope), 3.0, step=0.01)
+    assert balance(found, loads) < 1e-6
+    way = np.linalg.norm(found.q[:, :3] - found.q[0, :3], axis=1)
+    gained = np.diff(way, 2)[-50:].mean() / 0.01**2
+    assert gained == pytest.approx(9.81 * (np.sin(slope) - friction * np.cos(slope)), rel=1e-3)
+
+
+def test_it_tips_where_its_weight_leaves_its_feet(block):
+    """tan(slope) = WIDE / HIGH, to 1 % of the angle, on rough and stiff ground."""
+    angle = np.arctan(WIDE / HIGH)
+    turned = []
+    for share in (0.99, 1.01):
+        slope = share * angle
+        loads = feet(slope, stiffness=1e8, damping=100.0, friction=1.6, smoothing=1e-4)
+        found = run(block, loads, start(block, slope), 3.0, step=0.01, tolerance=1e-8)
+        turned.append(abs(found.q[-1, 4] - found.q[0, 4]))
+        if share < 1:
+            upper = forces(found, loads)[:2]
+            assert (upper[:, 2] > 0).all()
+    assert turned[0] < 1e-3 and turned[1] > 0.02
+
+
+def test_what_falls_bounces_lower_and_comes_to_rest_without_energy_from_nowhere(block):
+    loads = feet(stiffness=2e5, damping=0.5, friction=0.4)
+    turned = start(block, 0.0, above=0.5)
+    turned[3:] = 0.3, 0.2, 0.4
+    found = run(block, loads, turned, 8.0, step=5e-3)
+    assert balance(found, loads) < 1e-6
+    stored = found.channels["kinetic"] + found.channels["potential"]
+    total = sum(found.channels[f"work_{load.name}"] for load in loads)
+    # what springs hold is given back: above them the energy only falls
+    free = np.flatnonzero(
+        sum(np.abs(found.channels[f"load_{x.name}_force_z"]) for x in loads) == 0
+    )
+    assert (np.diff(stored[free]) < 1e-6 * np.ptp(stored)).all() and total[-1] < 0
+    assert forces(found, loads)[:, 2].sum() == pytest.approx(MASS * 9.81, rel=1e-3)
+
+
+def test_a_ball_rolls_down_a_profile(tmp_path):
+    """A solid ball rolls with 5/7 g sin(slope); behind the slope it goes on at its speed."""
+    mass, radius, slope = 3.0, 0.2, 0.2
+    path = tmp_path / "ball.urdf"
+    inertia = 0.4 * mass * radius**2
+    path.write_text(
+        f"""<robot name="ball"><link name="world"/><joint name="fly" type="floating">
+        <parent link="world"/><child link="ball"/></joint><link name="ball"><inertial>
+        <mass value="{mass}"/>
+        <inertia ixx="{inertia}" iyy="{inertia}" izz="{inertia}" ixy="0" ixz="0" iyz="0"/>
+        </inertial></link></robot>"""
+    )
+    machine = crane.load(path)
+    fall = 10.0 * np.tan(slope)
+    ground = crane.Ground(profile=((0.0, fall), (10.0, 0.0)))
+    ball = crane.Contact(
+        "ball", ground, radius=radius, stiffness=1e5, damping=2.0, friction=0.8, smoothing=1e-4
+    )
+    q = np.zeros(6)
+    q[0] = 2.0 + radius * np.sin(slope)
+    q[2] = fall * 0.8 + radius * np.cos(slope)
+    found = run(machine, [ball], q, 4.0, step=0.01)
+    assert balance(found, [ball]) < 1e-6
+    t, way = found.time, (found.q[:, 0] - q[0]) / np.cos(slope)
+    down = found.q[:, 0] < 9.0
+    true = 0.5 * 5 / 7 * 9.81 * np.sin(slope) * t**2
+    assert way[down] == pytest.approx(true[down], abs=2e-3 * true[down].max())
+    level = found.q[:, 0] > 10.5
+    assert level.sum() > 20
+    assert np.diff(found.q[level, 0]) == pytest.approx(np.diff(found.q[level, 0]).mean(), rel=2e-3)
+
+
+def test_what_is_no_ground_is_refused(block):
+    for make, text in (
+        (lambda: crane.Ground(normal=(0, 0, -1)), "upwards"),
+        (lambda: crane.Ground(profile=((0, 0), (0, 1))), "goes back"),
+        (lambda: crane.Ground(profile=((0, 0, 1),)), "no list"),
+        (lambda: crane.Contact("c0", stiffness=0.0), "stiffness"),
+        (lambda: crane.Contact("c0", friction=-1.0), "must not be negative"),
+        (lambda: run(block, [crane.Contact("c9")], None, 0.1), "'c9'"),
+    ):
+        with pytest.raises(CraneError, match=text):
+            make()
