@@ -198,6 +198,7 @@ def test_loads_of_a_machine_file_as_closed_forms(pushed, tmp_path):
     slopes = crane.sensitivities(machine, None, None, 2.0, 0.01, by=by, outputs=("x", "z")).slopes
     assert slopes[-1, 0] == pytest.approx([-3 * 4 / (2 * MASS**2), 2.0], abs=1e-8)
     assert slopes[-1, 1] == pytest.approx([-2 * 8 / (6 * MASS**2), 0.0], abs=1e-8)
+    assert len(crane.load(pushed, lock={"x": 0.5}).external) == 2
     written = crane.load(crane.write_machine(machine, tmp_path / "written"))
     again = crane.simulate(written, None, None, 2.0, 0.01)
     assert again.q == pytest.approx(run.q, abs=1e-12)

@@ -157,6 +157,47 @@ def test_a_ball_rolls_down_a_profile(tmp_path):
     assert np.diff(found.q[level, 0]) == pytest.approx(np.diff(found.q[level, 0]).mean(), rel=2e-3)
 
 
+STANDING = """
+name: standing
+chains: [{name: block, urdf: block.urdf}]
+home: {fly_z: 0.5}
+ground: {normal: [0, 0, 1], stiffness: 1.0e+5, damping: 2}
+contacts:
+  - {frame: c0}
+  - {frame: c1, friction: 0.3, area: 0.2}
+  - {frame: c2}
+  - {frame: c3, radius: 0.0, name: rear}
+"""
+
+
+def test_machine_files_stand_on_the_ground(block, tmp_path):
+    path = tmp_path / "standing.yaml"
+    path.write_text(STANDING)
+    machine = crane.load(path)
+    found = crane.simulate(machine, None, None, 3.0, 0.01)
+    names = ("c0", "c1", "c2", "rear")
+    pressed = [found.channels[f"load_{name}_force_z"][-1] for name in names]
+    assert pressed == pytest.approx([MASS * 9.81 / 4] * 4, rel=1e-6)
+    assert found.channels["pressure_c1"][-1] == pytest.approx(pressed[1] / 0.2)
+    written = crane.load(crane.write_machine(machine, tmp_path / "written"))
+    again = crane.simulate(written, None, None, 3.0, 0.01)
+    assert again.q == pytest.approx(found.q, abs=1e-12)
+    for old, new, text in (
+        ("ground:", "#", "yaml:7: contacts without a ground"),
+        ("{frame: c0}", "{frame: nix}", "yaml:7: .*'nix'"),
+        ("{frame: c0}", "{frame: world}", "yaml:7: .*does not move"),
+        ("{frame: c0}", "{frame: c0, stiffness: 0}", "yaml:7: .*stiffness"),
+        ("normal: [0, 0, 1]", "normal: [0, 1]", "yaml:5: .*normal"),
+        ("normal: [0, 0, 1]", "profile: [[0, 1], [0, 2]]", "yaml:5: .*goes back"),
+    ):
+        path.write_text(STANDING.replace(old, new))
+        with pytest.raises(CraneError, match=text):
+            crane.load(path)
+    path.write_text(STANDING.replace("fly_z: 0.5", "fly_z: 0.4"))
+    with pytest.raises(CraneError, match="'c0' is 0.1 m inside the ground"):
+        crane.simulate(crane.load(path), None, None, 0.1)
+
+
 def test_what_is_no_ground_is_refused(block):
     for make, text in (
         (lambda: crane.Ground(normal=(0, 0, -1)), "upwards"),

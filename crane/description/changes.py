@@ -321,6 +321,7 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
         friction={joint: value for joint, value in spec.friction.items() if joint not in lock},
         control={joint: value for joint, value in spec.control.items() if joint not in lock},
         forces=tuple(filter(acts, spec.forces)),
+        external=tuple(x for x in spec.external if body[x.frame] != body[tree.root]),
         hydraulics=spec.hydraulics and spec.hydraulics.only(active or ()),
         gas_springs=tuple(filter(acts, spec.gas_springs)),
         ropes=tuple(filter(acts, spec.ropes)),

@@ -64,6 +64,15 @@ class ExternalForce:
         """Lengths [m] at whose signs the wrench bends sharply: steps end there; none yet."""
         return ()
 
+    @property
+    def channels(self) -> list[tuple[str, str]]:
+        """Names and units of what `look` tells; nothing yet."""
+        return []
+
+    def look(self, here: Here) -> Sequence[Number]:
+        """What is recorded besides the wrench, in the order of `channels`."""
+        return ()
+
     def wrench(self, here: Here) -> tuple[Sequence[Number], Sequence[Number]]:
         """Force (3,) [N] and moment (3,) [N m] about the frame's origin, in the world's axes."""
         raise NotImplementedError

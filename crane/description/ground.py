@@ -127,15 +127,30 @@ class Contact(ExternalForce):
         """See `ExternalForce`: the gap."""
         return [self.ground.over(here.place)[0] - self.radius]
 
-    def wrench(self, here: Here) -> tuple[Sequence[Number], Sequence[Number]]:
+    @property
+    def channels(self) -> list[tuple[str, str]]:
+        """See `ExternalForce`: N, and over the area."""
+        pressure = [(f"pressure_{self.name}", "Pa")] if self.area else []
+        return [(f"support_{self.name}", "N"), *pressure]
+
+    def look(self, here: Here) -> Sequence[Number]:
         """See `ExternalForce`."""
+        pressed = self._pressed(here)[0]
+        return [pressed, pressed / self.area] if self.area else [pressed]
+
+    def _pressed(self, here: Here) -> tuple[Number, list[Number], list[Number], list[Number]]:
+        """N, the normal, where the ground is touched from the frame, and how fast that slides."""
         above, normal = self.ground.over(here.place)
         arm = scale(-1.0 * above, normal)
         velocity = add(here.velocity, cross(here.spin, arm))
         rising = dot(normal, velocity)
         depth = maximum(self.radius - above, 0.0)
         pressed = self.stiffness * depth * maximum(1.0 - self.damping * rising, 0.0)
-        along = subtract(velocity, scale(rising, normal))
+        return pressed, normal, arm, subtract(velocity, scale(rising, normal))
+
+    def wrench(self, here: Here) -> tuple[Sequence[Number], Sequence[Number]]:
+        """See `ExternalForce`."""
+        pressed, normal, arm, along = self._pressed(here)
         speed = apply("sqrt", dot(along, along) + self.smoothing**2)
         force = scale(pressed, subtract(normal, scale(self.friction / speed, along)))
         return force, cross(arm, force)

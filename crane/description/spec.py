@@ -9,7 +9,7 @@ from typing import ClassVar
 from crane.common.errors import InputError
 from crane.common.samples import as_number
 from crane.description.estimation import Estimation
-from crane.description.external import Wrench
+from crane.description.external import ExternalForce
 from crane.description.sensors import Sensor
 from crane.description.tree import Joint, Tree, Vector
 from crane.hydraulics.components import Hydraulics
@@ -417,7 +417,7 @@ class MachineSpec:
     ropes: tuple[Rope, ...] = ()
     sensors: Mapping[str, Sensor] = field(default_factory=dict)  # by quantity
     estimation: Estimation = Estimation()
-    external: tuple[Wrench, ...] = ()  # forces from outside
+    external: tuple[ExternalForce, ...] = ()  # forces from outside
 
     @property
     def elements(self) -> tuple[Element, ...]:

@@ -121,30 +121,41 @@ class ExternalForces:
         Returns:
             (nv,) of all together, and powers (k,) of each [W].
         """
-        wrenches = self.wrenches(np.array([time]), q[None], v[None])[0]
+        self._jacobians.place(q)
         total, powers = np.zeros(len(v)), np.empty(len(self._forces))
-        for k, (force, wrench) in enumerate(zip(self._forces, wrenches, strict=True)):
+        for k, force in enumerate(self._forces):
             jacobian = self._jacobians.of(force.frame)
+            here = self._here(force, v, force.references(np.array([time]))[0])
+            push, moment = force.wrench(here)
+            wrench = np.array([*push, *moment], dtype=np.float64)
             total += jacobian.T @ wrench
             powers[k] = wrench @ (jacobian @ v)
         return total, powers
 
-    def wrenches(self, instants: Array, q: Array, v: Array) -> Array:
-        """(N, k, 6) forces and moments in the world's axes at times (N,), q and v (N, nv)."""
-        out = np.empty((len(instants), len(self._forces), 6))
+    def seen(self, instants: Array, q: Array, v: Array) -> list[Array]:
+        """Of each force (N, 6 + c) its wrench in the world's axes and its channels.
+
+        Args:
+            instants: (N,) [s].
+            q: (N, nq) closed postures.
+            v: (N, nv) velocities of all joints.
+        """
         references = [force.references(instants) for force in self._forces]
+        out = [np.empty((len(instants), 6 + len(force.channels))) for force in self._forces]
         for i, (posture, velocity) in enumerate(zip(q, v, strict=True)):
             self._jacobians.place(posture)
-            for k, force in enumerate(self._forces):
-                pose = self._jacobians.pose(force.frame)
-                rate = (self._jacobians.of(force.frame) @ velocity).tolist()
-                here = Here(
-                    pose.translation.tolist(), pose.rotation.tolist(), rate[:3], rate[3:],
-                    references[k][i].tolist(),
-                )  # fmt: skip
+            for force, rows, row in zip(self._forces, out, references, strict=True):
+                here = self._here(force, velocity, row[i])
                 push, moment = force.wrench(here)
-                out[i, k] = np.array([*push, *moment], dtype=np.float64)
+                rows[i] = np.array([*push, *moment, *force.look(here)], dtype=np.float64)
         return out
+
+    def _here(self, force: ExternalForce, v: Array, reference: Array) -> Here:
+        """What a force sees at the posture that was placed last."""
+        pose = self._jacobians.pose(force.frame)
+        rate = (self._jacobians.of(force.frame) @ v).tolist()
+        place, turn = pose.translation.tolist(), pose.rotation.tolist()
+        return Here(place, turn, rate[:3], rate[3:], reference.tolist())
 
 
 def _placed(machine: Machine, force: ExternalForce) -> tuple[int, pin.SE3]:

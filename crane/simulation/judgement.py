@@ -5,10 +5,13 @@ import numpy as np
 from crane.codegen import Parts
 from crane.common.errors import SimulationError
 from crane.common.samples import FARTHEST, Array
+from crane.description.ground import Contact
+from crane.dynamics.frames import FrameJacobians
 from crane.dynamics.joint_forces import JointForces
 from crane.machine import Machine
 from crane.motion.trajectories import limit_slack
 
+_BURIED = 3.0  # weights of the machine, with which a contact may press at the start
 _SHOWN = 3  # joints beyond their limits that are named
 _IMBALANCE = 5e-3  # share of the energy that went through
 _STROKE = 5e-3  # share of a cylinder's stroke, of which no steel gives way
@@ -105,6 +108,25 @@ def strokes_passed(machine: Machine, time: Array, q: Array) -> str:
     if not words:
         return ""
     return f"{', '.join(words)}: make end stops as stiff as steel is, or move slower"
+
+
+def buried(machine: Machine, q: Array) -> str:
+    """What to say of a contact deep in the ground at a posture (nq,), else nothing."""
+    contacts = [force for force in machine.external if isinstance(force, Contact)]
+    if not contacts:
+        return ""
+    weight = 9.81 * sum(inertia.mass for inertia in machine.model.inertias)
+    frames = FrameJacobians(machine)
+    frames.place(q)
+    for contact in contacts:
+        above = float(contact.ground.over(frames.pose(contact.frame).translation.tolist())[0])  # type: ignore[arg-type]
+        depth = contact.radius - above
+        if contact.stiffness * depth > _BURIED * weight:
+            return (
+                f"'{contact.name}' is {depth:.3g} m inside the ground, where its whole weight "
+                f"presses it in by {weight / contact.stiffness:.2g} m: start higher"
+            )
+    return ""
 
 
 def _gap(rows: Parts) -> Array:

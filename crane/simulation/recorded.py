@@ -88,11 +88,14 @@ def _outside(machine: Machine, time: Array, rows: Parts) -> Iterator[Column]:
     if not machine.external:
         return
     velocities = np.einsum("nij,nj->ni", machine.closure.gamma(rows.q), rows.v_a)
-    wrenches = ExternalForces(machine).wrenches(time, rows.q, velocities)
+    seen = ExternalForces(machine).seen(time, rows.q, velocities)
     for k, force in enumerate(machine.external):
-        for part, values in zip(PARTS, wrenches[:, k].T, strict=True):
+        wrench, more = np.split(seen[k], [len(PARTS)], axis=1)
+        for part, values in zip(PARTS, wrench.T, strict=True):
             if part.startswith("force") or values.any():
                 yield f"load_{force.name}_{part}", values, "N" if "force" in part else "N m"
+        for (name, unit), values in zip(force.channels, more.T, strict=True):
+            yield name, values, unit
         yield f"work_{force.name}", rows.work[:, 1 + k], "J"
 
 

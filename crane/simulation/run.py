@@ -40,7 +40,7 @@ from crane.simulation.integration.radau import RadauStepper
 from crane.simulation.integration.rosenbrock import StiffStepper
 from crane.simulation.integration.state import row_layout
 from crane.simulation.integration.steps import Steps
-from crane.simulation.judgement import limits_passed, said
+from crane.simulation.judgement import buried, limits_passed, said
 from crane.simulation.recorded import recorded
 
 _MOST = 4_000_000  # steps of one recording
@@ -199,6 +199,8 @@ def integrate(
         own = _own_start(control, dynamics, posture)
     except ClosureError as error:
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
+    if text := buried(machine, posture):
+        raise SimulationError(f"at t = 0 s, where the motion starts: {text}")
     state = np.concatenate([posture, v_a, own, np.zeros(2 + len(machine.external))])
     make = integration_of(dynamics, control, len(own), method, tolerance)
     chart = chart or Chart.of(dynamics)

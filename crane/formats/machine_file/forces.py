@@ -2,8 +2,7 @@
 
 import warnings
 
-from crane.common.errors import CraneWarning, InputError
-from crane.description.external import Wrench
+from crane.common.errors import CraneWarning
 from crane.description.findings import recoverable
 from crane.description.spec import EndStop, ForceElement, Friction, GasSpring, Rope, element_name
 from crane.formats.machine_file.section import Section
@@ -128,38 +127,6 @@ def read_ropes(top: Section, tree: TreeBuilder) -> tuple[Rope, ...]:
                 Rope(between, length, stiffness, item.number("damping", 0.0, minimum=0.0))
             )
     return tuple(ropes)
-
-
-def read_loads(top: Section, tree: TreeBuilder) -> tuple[Wrench, ...]:
-    """Forces from outside."""
-    loads: list[Wrench] = []
-    keys = ("frame", "force", "moment", "times", "axes", "name")
-    for item in top.sections("loads", "load of", *keys):
-        with recoverable():
-            frame = item.text("frame")
-            tree.check_link(frame, item.where("frame"), "the frame")
-            if not tree.moves(frame):
-                raise item.fail("frame", f"'{frame}' does not move, a load on it does nothing")
-            loads.append(_wrench(item, frame))
-    return tuple(loads)
-
-
-def _wrench(item: Section, frame: str) -> Wrench:
-    if "force" not in item and "moment" not in item:
-        raise item.fail(None, f"the load on '{frame}' does nothing, give force or moment")
-    none = (0.0, 0.0, 0.0)
-    force, moment = (item.rows(key, none) for key in ("force", "moment"))
-    times = item.numbers("times") if "times" in item else None
-    try:
-        return Wrench(
-            frame,
-            *(part[0] if len(part) == 1 else part for part in (force, moment)),
-            times=times,
-            axes=item.text("axes", "world"),
-            name=item.text("name", ""),
-        )
-    except InputError as error:
-        raise item.fail(None, str(error)) from None
 
 
 def read_end_stops(top: Section, tree: TreeBuilder) -> tuple[EndStop, ...]:

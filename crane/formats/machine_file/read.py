@@ -31,11 +31,11 @@ from crane.formats.machine_file.forces import (
     read_forces,
     read_friction,
     read_gas_springs,
-    read_loads,
     read_ropes,
     read_rotors,
 )
 from crane.formats.machine_file.open_loops import warn_of_open_loops
+from crane.formats.machine_file.outside import read_outside
 from crane.formats.machine_file.posture import read_home
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.sensors import read_sensors
@@ -49,8 +49,8 @@ Part = TypeVar("Part")
 
 _KEYS = (
     "name", "source", "chains", "loops", "active", "free", "drives", "home", "friction", "forces",
-    "gas_springs", "ropes", "loads", "end_stops", "rotor_inertia", "couplings",
-    "tip", "payload", "tasks", "control", "hydraulics", "sensors", "identification",
+    "gas_springs", "ropes", "loads", "ground", "contacts", "end_stops", "rotor_inertia",
+    "couplings", "tip", "payload", "tasks", "control", "hydraulics", "sensors", "identification",
 )  # fmt: skip
 
 
@@ -150,7 +150,7 @@ def _read_machine(path: Path) -> MachineSpec:
         free, _part(_drives, (), top, tree), _part(read_ropes, (), top, tree),
         _part(read_sensors, {}, top, tree),
         _part(read_estimation, Estimation(), top),
-        _part(read_loads, (), top, tree),
+        _part(read_outside, (), top, tree),
     )  # fmt: skip
 
 

@@ -12,9 +12,9 @@ from lxml import etree
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, one_line
 from crane.common.output import file_name, staging
 from crane.description import Task
-from crane.description.external import ExternalForce, Wrench
 from crane.description.sensors import unit_of
 from crane.formats.machine_file.estimation import estimation_data
+from crane.formats.machine_file.outside import outside_data
 from crane.formats.machine_file.places import InFile, InURDF, places
 from crane.formats.machine_file.read import read
 from crane.formats.machine_file.text import Way, yaml_text
@@ -237,7 +237,7 @@ def _content(machine: Machine) -> dict[str, Any]:
     data["forces"] = [_numbers(item) for item in machine.forces]
     data["gas_springs"] = {item.joint: _numbers(item, "joint") for item in machine.gas_springs}
     data["ropes"] = [_numbers(item) for item in machine.ropes]
-    data["loads"] = [_load(force) for force in machine.external]
+    data |= outside_data(machine.external)
     data["end_stops"] = {item.joint: _numbers(item, "joint") for item in machine.end_stops}
     data["rotor_inertia"] = rotors_of(machine)
     data["drives"] = drives_of(machine)
@@ -253,31 +253,6 @@ def _content(machine: Machine) -> dict[str, Any]:
         if unit_of(machine.tree, name) is not None  # a joint that is locked has none
     }
     return data
-
-
-def _load(force: ExternalForce) -> dict[str, Any]:
-    """One of `loads`.
-
-    Raises:
-        InputError: It is a program, not numbers.
-    """
-    if type(force) is not Wrench:
-        raise InputError(
-            f"the load '{force.name}' is a {type(force).__name__}, which no file holds: leave it "
-            "out, or give a Wrench by time"
-        )
-    data: dict[str, Any] = {"frame": force.frame}
-    several = len(force.times) > 1
-    for key, part in (("force", force.values[:, :3]), ("moment", force.values[:, 3:])):
-        if part.any():
-            data[key] = part.tolist() if several else part[0].tolist()
-    if several:
-        data["times"] = force.times.tolist()
-    if force.axes != "world":
-        data["axes"] = force.axes
-    if force.name != force.frame:
-        data["name"] = force.name
-    return data if {"force", "moment"} & data.keys() else data | {"force": [0.0] * 3}
 
 
 def _driven(machine: Machine) -> list[str]:

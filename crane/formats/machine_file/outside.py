@@ -1,0 +1,129 @@
+"""The sections of a machine file on what acts from outside: loads, ground, contacts with it."""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+from crane.common.errors import InputError
+from crane.description.external import ExternalForce, Wrench
+from crane.description.findings import recoverable
+from crane.description.ground import DAMPING, FRICTION, SMOOTHING, STIFFNESS, Contact, Ground
+from crane.formats.machine_file.section import Section
+from crane.formats.machine_file.tree_builder import TreeBuilder
+
+_SURFACE = ("height", "normal", "profile")
+_LAW = {"stiffness": STIFFNESS, "damping": DAMPING, "friction": FRICTION, "smoothing": SMOOTHING}
+
+
+def read_outside(top: Section, tree: TreeBuilder) -> tuple[Wrench | Contact, ...]:
+    """Forces from outside."""
+    return *_loads(top, tree), *_contacts(top, tree)
+
+
+def _frame(item: Section, tree: TreeBuilder) -> str:
+    frame = item.text("frame")
+    tree.check_link(frame, item.where("frame"), "the frame")
+    if not tree.moves(frame):
+        raise item.fail("frame", f"'{frame}' does not move, a load on it does nothing")
+    return frame
+
+
+def _loads(top: Section, tree: TreeBuilder) -> Iterator[Wrench]:
+    keys = ("frame", "force", "moment", "times", "axes", "name")
+    for item in top.sections("loads", "load of", *keys):
+        with recoverable():
+            yield _wrench(item, _frame(item, tree))
+
+
+def _wrench(item: Section, frame: str) -> Wrench:
+    if "force" not in item and "moment" not in item:
+        raise item.fail(None, f"the load on '{frame}' does nothing, give force or moment")
+    rows = (item.rows(key, (0.0, 0.0, 0.0)) for key in ("force", "moment"))
+    force, moment = (part[0] if len(part) == 1 else part for part in rows)
+    times = item.numbers("times") if "times" in item else None
+    axes, name = item.text("axes", "world"), item.text("name", "")
+    try:
+        return Wrench(frame, force, moment, times, axes, name)
+    except InputError as error:
+        raise item.fail(None, str(error)) from None
+
+
+def _contacts(top: Section, tree: TreeBuilder) -> Iterator[Contact]:
+    section = top.section("ground", "'ground'")
+    ground, usual = Ground(), _LAW
+    if section is not None:
+        with recoverable():
+            ground, usual = _ground(section)
+    for item in top.sections("contacts", "contact of", "frame", "radius", "area", "name", *_LAW):
+        with recoverable():
+            frame = _frame(item, tree)
+            if section is None:
+                raise item.fail(None, "contacts without a ground, add 'ground: {height: 0}'")
+            numbers = {key: item.number(key, value) for key, value in usual.items()}
+            radius, area = item.number("radius", 0.0), item.number("area", 0.0)
+            try:
+                yield Contact(
+                    frame, ground, **numbers, radius=radius, area=area, name=item.text("name", "")
+                )
+            except InputError as error:
+                raise item.fail(None, str(error)) from None
+
+
+def _ground(section: Section) -> tuple[Ground, dict[str, float]]:
+    """The surface, and its law."""
+    section.only(*_SURFACE, *_LAW)
+    law = {key: section.number(key, value) for key, value in _LAW.items()}
+    data: dict[str, Any] = {}
+    if "height" in section:
+        data["height"] = section.number("height")
+    if "normal" in section:
+        data["normal"] = section.numbers("normal")
+    if "profile" in section:
+        data["profile"] = tuple(map(tuple, section.rows("profile")))
+    try:
+        return Ground(**data), law
+    except InputError as error:
+        raise section.fail(None, str(error)) from None
+
+
+def outside_data(forces: tuple[ExternalForce, ...]) -> dict[str, Any]:
+    """The sections of forces from outside.
+
+    Raises:
+        InputError: One is a program, not numbers, or contacts are with several grounds.
+    """
+    data: dict[str, Any] = {"loads": [], "ground": None, "contacts": []}
+    grounds = {force.ground for force in forces if isinstance(force, Contact)}
+    if len(grounds) > 1:
+        raise InputError("contacts are with several grounds, a machine file has one")
+    for ground in grounds:
+        data["ground"] = {"height": ground.height} | {
+            key: [list(x) for x in value] if key == "profile" else list(value)
+            for key, value in dataclasses.asdict(ground).items()
+            if key != "height" and value
+        }
+    for force in forces:
+        if type(force) is Wrench:
+            data["loads"].append(_load(force))
+        elif type(force) is Contact:
+            item: dict[str, Any] = {"frame": force.frame}
+            item |= {key: getattr(force, key) for key in (*_LAW, "radius", "area")}
+            data["contacts"].append(item | _named(force))
+        else:
+            raise InputError(
+                f"the load '{force.name}' is a {type(force).__name__}, which no file holds: leave "
+                "it out, or give a Wrench by time"
+            )
+    return data
+
+
+def _load(force: Wrench) -> dict[str, Any]:
+    data: dict[str, Any] = {"frame": force.frame, "axes": force.axes} | _named(force)
+    several = len(force.times) > 1
+    for key, part in (("force", force.values[:, :3]), ("moment", force.values[:, 3:])):
+        data[key] = part.tolist() if several else part[0].tolist()
+    return data | ({"times": force.times.tolist()} if several else {})
+
+
+def _named(force: ExternalForce) -> dict[str, str]:
+    return {"name": force.name} if force.name != force.frame else {}
