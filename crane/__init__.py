@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     )
     from crane.description.external import ExternalForce, Pushing, Wrench
     from crane.description.ground import Contact, Ground
+    from crane.description.soil import SOILS, Cutting, Soil
     from crane.dynamics import Dynamics
     from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
     from crane.formats.adding import add_cylinder, add_loops
@@ -90,6 +91,7 @@ _HOMES = {
     "crane.description": "EndStop ForceElement Friction GasSpring PIGains Rope Sensor",
     "crane.description.external": "ExternalForce Pushing Wrench",
     "crane.description.ground": "Contact Ground",
+    "crane.description.soil": "SOILS Cutting Soil",
     "crane.dynamics": "Dynamics",
     "crane.formats": "load write_machine write_mjcf write_urdf_plus",
     "crane.formats.adding": "add_cylinder add_loops",
@@ -122,18 +124,18 @@ _HOMES = {
 
 __all__ = [
     "Batch", "Calibration", "Closure", "Command", "Comparison", "ComputedTorque", "Contact",
-    "Controller", "CraneError", "CraneWarning", "Dynamics", "EndStop", "Excitation",
+    "Controller", "CraneError", "CraneWarning", "Cutting", "Dynamics", "EndStop", "Excitation",
     "ExternalForce", "ForceElement", "Friction", "GasSpring", "Gradient", "Ground",
     "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel", "Machine", "PDGains",
-    "PI", "PIGains", "Payload", "Pushing", "Recording", "Rope", "Sampled", "Sensitivities",
-    "Sensor", "SignalExcitation", "Signals", "Study", "TipVelocity", "Trajectory", "ValveDrive",
-    "ValvePD", "Workspace", "Wrench", "add_cylinder", "add_loops", "calibrate", "casadi_function",
-    "check", "cross_validate", "excite", "excite_valves", "gradient", "identify",
-    "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
-    "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
-    "read_measured", "replay", "report", "sensitivities", "simulate", "simulate_batch", "sketch",
-    "study", "task_trajectory", "tip_trajectory", "workspace", "write_machine", "write_mjcf",
-    "write_urdf_plus",
+    "PI", "PIGains", "Payload", "Pushing", "Recording", "Rope", "SOILS", "Sampled",
+    "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study", "TipVelocity",
+    "Trajectory", "ValveDrive", "ValvePD", "Workspace", "Wrench", "add_cylinder", "add_loops",
+    "calibrate", "casadi_function", "check", "cross_validate", "excite", "excite_valves",
+    "gradient", "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
+    "identify_valve", "joystick", "linear_models", "linearize", "load", "point_to_point",
+    "polynomial", "read_measured", "replay", "report", "sensitivities", "simulate",
+    "simulate_batch", "sketch", "study", "task_trajectory", "tip_trajectory", "workspace",
+    "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 

@@ -1,23 +1,31 @@
-"""The sections of a machine file on what acts from outside: loads, ground, contacts with it."""
+"""The sections of a machine file on what acts from outside: loads, ground, contacts, soil."""
 
 import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
-from crane.common.errors import InputError
+from crane.common.errors import InputError, known
 from crane.description.external import ExternalForce, Wrench
 from crane.description.findings import recoverable
 from crane.description.ground import DAMPING, FRICTION, SMOOTHING, STIFFNESS, Contact, Ground
+from crane.description.soil import SOILS, Cutting, Soil
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
 
 _SURFACE = ("height", "normal", "profile")
 _LAW = {"stiffness": STIFFNESS, "damping": DAMPING, "friction": FRICTION, "smoothing": SMOOTHING}
+_SOIL = tuple(field.name for field in dataclasses.fields(Soil))
+_BLADE = ("width", "length", "thickness", "smoothing")
 
 
-def read_outside(top: Section, tree: TreeBuilder) -> tuple[Wrench | Contact, ...]:
+def read_outside(top: Section, tree: TreeBuilder) -> tuple[Wrench | Contact | Cutting, ...]:
     """Forces from outside."""
-    return *_loads(top, tree), *_contacts(top, tree)
+    section = top.section("ground", "'ground'")
+    ground, usual = None, _LAW
+    if section is not None:
+        with recoverable():
+            ground, usual = _ground(section)
+    return *_loads(top, tree), *_contacts(top, tree, ground, usual), *_cutters(top, tree, ground)
 
 
 def _frame(item: Section, tree: TreeBuilder) -> str:
@@ -48,16 +56,13 @@ def _wrench(item: Section, frame: str) -> Wrench:
         raise item.fail(None, str(error)) from None
 
 
-def _contacts(top: Section, tree: TreeBuilder) -> Iterator[Contact]:
-    section = top.section("ground", "'ground'")
-    ground, usual = Ground(), _LAW
-    if section is not None:
-        with recoverable():
-            ground, usual = _ground(section)
+def _contacts(
+    top: Section, tree: TreeBuilder, ground: Ground | None, usual: dict[str, float]
+) -> Iterator[Contact]:
     for item in top.sections("contacts", "contact of", "frame", "radius", "area", "name", *_LAW):
         with recoverable():
             frame = _frame(item, tree)
-            if section is None:
+            if "ground" not in top:
                 raise item.fail(None, "contacts without a ground, add 'ground: {height: 0}'")
             numbers = {key: item.number(key, value) for key, value in usual.items()}
             radius, area = item.number("radius", 0.0), item.number("area", 0.0)
@@ -67,6 +72,57 @@ def _contacts(top: Section, tree: TreeBuilder) -> Iterator[Contact]:
                 )
             except InputError as error:
                 raise item.fail(None, str(error)) from None
+
+
+def _cutters(top: Section, tree: TreeBuilder, ground: Ground | None) -> Iterator[Cutting]:
+    section = top.section("soil", "'soil'")
+    soil = None
+    if section is not None:
+        with recoverable():
+            soil = _soil(section)
+    keys = ("frame", "blade", "cutting", "name", *_BLADE)
+    for item in top.sections("cutters", "cutter of", *keys):
+        with recoverable():
+            frame = _frame(item, tree)
+            for key, hint in (("ground", "{height: 0}"), ("soil", "{kind: sandy loam}")):
+                if key not in top:
+                    raise item.fail(None, f"cutters without {key}, add '{key}: {hint}'")
+            if soil is None:  # told above
+                continue
+            width, length = item.number("width"), item.number("length")
+            blade, cutting = item.numbers("blade"), item.numbers("cutting")
+            thickness, smoothing = (
+                item.number("thickness", 0.0),
+                item.number("smoothing", SMOOTHING),
+            )
+            try:
+                yield Cutting(
+                    frame, soil, width, length, blade, cutting, ground, thickness, smoothing,
+                    item.text("name", ""),
+                )  # fmt: skip
+            except InputError as error:
+                raise item.fail(None, str(error)) from None
+
+
+def _soil(section: Section) -> Soil:
+    """A soil of the table, or numbers, or one with other numbers."""
+    section.only("kind", *_SOIL)
+    usual: dict[str, float] = {}
+    if "kind" in section:
+        kind = section.text("kind")
+        if kind not in SOILS:
+            raise section.fail("kind", f"unknown soil '{kind}', {known(SOILS, kind)}")
+        usual = dataclasses.asdict(SOILS[kind])
+    else:
+        usual = dict.fromkeys(("tool_friction", "adhesion", "surcharge"), 0.0)
+    numbers = {
+        key: section.number(key, usual[key]) if key in usual else section.number(key)
+        for key in _SOIL
+    }
+    try:
+        return Soil(**numbers)
+    except InputError as error:
+        raise section.fail(None, str(error)) from None
 
 
 def _ground(section: Section) -> tuple[Ground, dict[str, float]]:
@@ -90,12 +146,19 @@ def outside_data(forces: tuple[ExternalForce, ...]) -> dict[str, Any]:
     """The sections of forces from outside.
 
     Raises:
-        InputError: One is a program, not numbers, or contacts are with several grounds.
+        InputError: One is a program, not numbers, or there are several grounds or soils.
     """
-    data: dict[str, Any] = {"loads": [], "ground": None, "contacts": []}
-    grounds = {force.ground for force in forces if isinstance(force, Contact)}
+    data: dict[str, Any] = {
+        "loads": [], "ground": None, "contacts": [], "soil": None, "cutters": []
+    }  # fmt: skip
+    grounds = {force.ground for force in forces if isinstance(force, Contact | Cutting)}
+    soils = {force.soil for force in forces if isinstance(force, Cutting)}
     if len(grounds) > 1:
-        raise InputError("contacts are with several grounds, a machine file has one")
+        raise InputError("contacts and cutters have several grounds, a machine file has one")
+    if len(soils) > 1:
+        raise InputError("cutters are in several soils, a machine file has one")
+    for soil in soils:
+        data["soil"] = dataclasses.asdict(soil)
     for ground in grounds:
         data["ground"] = {"height": ground.height} | {
             key: [list(x) for x in value] if key == "profile" else list(value)
@@ -109,6 +172,10 @@ def outside_data(forces: tuple[ExternalForce, ...]) -> dict[str, Any]:
             item: dict[str, Any] = {"frame": force.frame}
             item |= {key: getattr(force, key) for key in (*_LAW, "radius", "area")}
             data["contacts"].append(item | _named(force))
+        elif type(force) is Cutting:
+            item = {"frame": force.frame, "blade": force.blade, "cutting": force.cutting}
+            item |= {key: getattr(force, key) for key in _BLADE}
+            data["cutters"].append(item | _named(force))
         else:
             raise InputError(
                 f"the load '{force.name}' is a {type(force).__name__}, which no file holds: leave "
