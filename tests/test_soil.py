@@ -1,6 +1,7 @@
 """Cutting soil: wedges balanced by hand, tables of earth pressure, dissipation, energy."""
 
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -129,6 +130,26 @@ def test_ahead_it_resists_with_the_wedge_and_withdrawn_it_only_rubs(soil):
     ahead, _ = wedge(deep, rake, np.arctan2(1.0, cot_beta), filled)
     force = cutter(soil).wrench(seen(filled + 0.5, rake, (1.0, 0.0, 0.0)))[0]
     assert np.array(force)[[0, 2]] == pytest.approx(1.2 * ahead, rel=1e-6)
+
+
+def test_beyond_the_bounds_of_the_rake_it_cuts_with_their_wedges():
+    """A heap before what is steeper than upright; a blade laid flat fills nothing and cuts not."""
+    depth, ahead = 0.3, (1.0, 0.0, 0.0)
+    upright, over = (
+        np.array(cutter().wrench(seen(depth, rake, ahead))[0]) for rake in (np.pi / 2, 1.9)
+    )
+    assert over == pytest.approx(upright, rel=1e-6)
+    steep = crane.Soil(15e3, 0.0, 1.0, 1.0)
+    heap, within = (
+        np.array(cutter(steep).wrench(seen(depth, rake, ahead))[0])
+        for rake in (1.5, steep.steepest)
+    )
+    assert steep.steepest == pytest.approx(np.pi - 2.35)
+    assert heap == pytest.approx(within, rel=1e-6)
+    flat, almost = (cutter().wrench(seen(depth, rake, ahead))[0] for rake in (0.0, 1e-6))
+    sides = cutter().wrench(seen(depth, 0.0, (-1.0, 0.0, 0.0)))[0]
+    assert flat[0] == pytest.approx(-sides[0], rel=1e-6)
+    assert almost == pytest.approx(flat, rel=1e-2, abs=1.0)
 
 
 def test_it_never_drives_the_edge_and_is_always_a_number():
@@ -287,6 +308,15 @@ def test_machine_files_dig(sled, tmp_path):
     ):
         with pytest.raises(CraneError, match=text):
             crane.write_machine(machine.under(other), tmp_path / "other")
+
+
+def test_the_documented_soils_are_those_of_the_table():
+    page = (Path(__file__).parents[1] / "docs" / "machine_file.md").read_text(encoding="utf-8")
+    for name, soil in crane.SOILS.items():
+        (row,) = [line for line in page.splitlines() if line.startswith(f"| `{name}` |")]
+        told = [float(word.split()[0]) for word in row.split("|")[2:7]]
+        told[2:4] = np.radians(told[2:4])
+        assert told == pytest.approx(list(vars(soil).values())[:5], rel=4e-3), name
 
 
 def test_what_cuts_nothing_is_refused():

@@ -150,14 +150,14 @@ class Cutting(ExternalForce):
         R = P (sin(delta) u - cos(delta) m) + c_a width D / sin(rho) u,
         P = width (gamma D^2 N_gamma + c D N_c + c_a D N_ca + (q + gamma (d - D)) D N_q),
         B = width thickness (c N_c' + (q + gamma d) N_q') d / sqrt(d^2 + thickness^2) u,
-        T = - width 2 L (c_a + (1 - sin phi) tan(delta) (q + gamma d / 2)) u' u,
+        T = - 2 width (L - g D / sin(rho)) tau v.u / sqrt((v.u)^2 + smoothing^2) u,
+        tau = c_a + (1 - sin phi) tan(delta) (q + gamma (d - D / 2)),
 
-    what the wedge before the blade resists with (`Soil.factors`, least where negative: 0), what
-    the edge bears (`Soil.bearing`), and what rubs on both sides of the blade, pressed by the soil
-    at rest (Jaky 1944). R acts by g = s(v.m) s(-v.R/|R|), B by s(-v.u), T by 1 - g with
-    u' = v.u / sqrt((v.u)^2 + smoothing^2), where s(x) = x^2 / (x^2 + smoothing^2) of x > 0, else
-    0: none of them ever drives the edge, and R and B vanish as it is withdrawn. So soil carries
-    nothing at rest: what leans on it creeps, slower than `smoothing` where it could be held.
+    what the wedge before the blade resists with (`Soil.factors`; P is not below 0), what the edge
+    bears (`Soil.bearing`), and what rubs on both sides of the blade where it does not cut, pressed
+    by soil at rest (Jaky 1944). R acts by g = s(v.m) s(-v.R/|R|) and B by s(-v.u), where s(x) is
+    x^2 / (x^2 + smoothing^2) of x > 0, else 0: none of the three ever drives the edge, and R and B
+    vanish as it is withdrawn. So soil carries nothing at rest: what leans on it creeps.
 
     A blade that is flatter than `FLATTEST` against the surface is taken as this one, with what it
     fills; before one that is steeper than upright (or than leaves pi - delta - phi by `MARGIN`,
@@ -259,8 +259,8 @@ class Cutting(ExternalForce):
         ]  # fmt: skip
         push = width * filled * maximum(dot(loads, factors), 0.0)
         length = minimum(depth / sine_cut, self.length)
-        stuck = (soil.adhesion * width) * minimum(filled / sine_cut, self.length)
-        along = math.sin(soil.tool_friction) * push + stuck
+        covered = minimum(filled / sine_cut, self.length)
+        along = math.sin(soil.tool_friction) * push + soil.adhesion * width * covered
         resisting = add(scale(along, up_cut), scale(-math.cos(soil.tool_friction) * push, out_cut))
         cuts = self._gate(dot(velocity, out_cut), 1.0) * self._gate(
             -1.0 * dot(velocity, resisting), dot(resisting, resisting) + _NEAR
@@ -276,11 +276,11 @@ class Cutting(ExternalForce):
             ramp = depth / apply("sqrt", depth * depth + self.thickness**2)
             bears = width * self.thickness * strip * ramp * self._gate(-1.0 * sliding, 1.0)
         pressed = (1.0 - math.sin(soil.friction)) * math.tan(soil.tool_friction)
-        rubs = 2.0 * width * length * (
-            soil.adhesion + pressed * (soil.surcharge + 0.5 * soil.unit_weight * depth)
-        )  # fmt: skip
+        middle = soil.surcharge + soil.unit_weight * (depth - 0.5 * filled)
+        shear = soil.adhesion + pressed * middle
+        rubs = 2.0 * width * (length - cuts * covered) * shear
         slip = sliding / apply("sqrt", sliding * sliding + self.smoothing**2)
-        force = add(scale(cuts, resisting), scale(bears - rubs * (1.0 - cuts) * slip, up))
+        force = add(scale(cuts, resisting), scale(bears - rubs * slip, up))
         return force, [0.0] * 3
 
     def _gate(self, speed: Number, unit: Number) -> Number:
