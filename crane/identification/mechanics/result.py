@@ -227,6 +227,8 @@ class Identification:
                 unit = "N" if self.machine.unit(joint) == "m" else "N m"
                 relative = f"{100 * fit.relative[i]:.2f} %"
                 squared = f"{fit.percentage_error[i]:.3f} %"
+                if joint in self.machine.free:
+                    relative, squared = "free", ""
                 told = [joint, f"{fit.rmse[i]:.4g}", unit, relative, squared]
                 rows.append(told if fit.moving[:, i].any() else [joint, "-", "", "-", "-"])
             mean = f"{100 * np.nanmean(fit.relative):.2f} %"
