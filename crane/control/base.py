@@ -99,7 +99,7 @@ class Law:
 
     def of_driven(self, x: Sequence[Number]) -> list[Number]:
         """Those of all active joints (n,) that belong to the driven ones."""
-        return [x[i] for i in np.flatnonzero(self.machine.driven)]
+        return [value for value, moved in zip(x, self.machine.driven, strict=True) if moved]
 
     def spread(self, forces: Sequence[Number]) -> list[Number]:
         """Forces (n,) of all active joints from those of the driven ones."""

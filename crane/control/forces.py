@@ -26,9 +26,9 @@ class PI(Law):
         machine: The machine.
         reference: Reference of the driven joints, see `with_free`.
         gains: By driven joint; those of the machine file if not given.
-        integral: (k,) int e dt of the driven joints at the start [m s], [rad s]. If not given, it carries the
-            machine's weight, as it does when a machine under control stands still; with zeros
-            the machine falls until the integrals have grown.
+        integral: (k,) int e dt of the driven joints at the start [m s], [rad s]. If not given, it
+            carries the machine's weight, as it does when a machine under control stands still;
+            with zeros the machine falls until the integrals have grown.
 
     Raises:
         InputError: No gains for a joint.

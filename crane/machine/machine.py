@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from crane.closure import Closure, frame_id
 from crane.closure.coordinates import Coordinates
@@ -130,9 +130,7 @@ class Machine:
 
     def __repr__(self) -> str:
         """Name, joints, loops and what drives it."""
-        drives = ", ".join(
-            f"{joint} [{self.unit(joint)}]" for joint in self.driven_joints
-        )
+        drives = ", ".join(f"{joint} [{self.unit(joint)}]" for joint in self.driven_joints)
         free = f", free {', '.join(self.free)}" if self.free else ""
         loops = len(self.closure.equations.loops)
         circuit = ", hydraulic" if self.hydraulics is not None else ""
@@ -185,7 +183,7 @@ class Machine:
         return tuple(joint for joint in self.active if joint not in self.free)
 
     @cached_property
-    def driven(self) -> Array:
+    def driven(self) -> NDArray[np.bool_]:
         """(n,) whether each active joint is driven, which free ones are not."""
         return np.array([joint not in self.free for joint in self.active])
 

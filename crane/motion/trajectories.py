@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PPoly, make_interp_spline
 
 from crane.common.errors import InputError, LimitError, known
@@ -202,7 +202,7 @@ def _quintics(time: Array, x: Array, v: Array, a: Array) -> PPoly:
 class _WithFree(Trajectory):
     """A reference of the driven joints beside free joints that stay where they start."""
 
-    def __init__(self, reference: Trajectory, driven: Array, start: Array):
+    def __init__(self, reference: Trajectory, driven: NDArray[np.bool_], start: Array):
         self.duration, self.tip = reference.duration, reference.tip
         self._reference, self._driven, self._start = reference, driven, start
 

@@ -9,11 +9,12 @@ As a file it is a CSV of SI units (see crane.recordings.timeseries):
     time [s],q1 [rad],X1 [m],q1_velocity [rad/s],X1_velocity [m/s],q1_force [N m],X1_force [N],...
 
 A column X is an active joint if X_force exists, or if the line `# free: X, Y` names it: nothing
-drives such a joint, its force is zero and has no column. X_velocity may be missing and is the derivative of
-X then. X_velocity and X_force without X is an error. Every other column is a channel, such as the
-angle q2 of a joint that is not active, with q2_velocity beside it or without. The order of the
-columns is free, the joints come in the order of their displacements. The comment lines may be left
-out. Other units are converted where crane.recordings.timeseries knows them. An npz file serves,
+drives such a joint, its force is zero and has no column. X_velocity may be missing and is the
+derivative of X then. X_velocity and X_force without X is an error. Every other column is a
+channel, such as the angle q2 of a joint that is not active, with q2_velocity beside it or without.
+The order of the columns is any, the joints come in the order of their displacements. The comment
+lines may be left out where no joint is free. Other units are converted where
+crane.recordings.timeseries knows them. An npz file serves,
 too: one array per column, named like those of the CSV. What a crane's sensors tell instead of
 displacements and forces, crane.recordings.measured turns into them.
 """
@@ -182,7 +183,9 @@ class Recording:
 
     def columns(self) -> dict[str, Array]:
         """All columns (N,) by name, as they are written; views, not copies."""
-        forces = (x for x, joint in zip(self.tau.T, self.joints, strict=True) if joint in self._driven)
+        forces = (
+            x for x, joint in zip(self.tau.T, self.joints, strict=True) if joint in self._driven
+        )
         columns = [self.time, *self.q.T, *self.v.T, *forces, *self.channels.values()]
         return dict(zip(self._names(), columns, strict=True))
 

@@ -20,7 +20,7 @@ from crane.identification.signals.motion import Derivatives, Motion, differentia
 from crane.identification.signals.outliers import outliers, repaired
 from crane.machine import Machine
 from crane.recordings.measured import moved_locks
-from crane.recordings.recording import FORCE, VELOCITY, VELOCITY_UNITS, Recording
+from crane.recordings.recording import FORCE, VELOCITY, VELOCITY_UNITS, Recording, derivative
 
 _MOVES = 3.0  # standard deviations of a joint's velocity, above which it moves
 _TOO_FAST = 30.0  # times its limit, at which no joint moves
@@ -95,10 +95,10 @@ def _of_machine(machine: Machine, recording: Recording) -> Recording:
                 f"'{joint}' is recorded in {units[joint]}, give {machine.unit(joint)}"
             )
     none = np.zeros_like(recording.time)
-    q, v, tau = (
-        np.column_stack([every.get(joint + suffix, none) for joint in machine.active])
-        for suffix in ("", VELOCITY, FORCE)
-    )
+    q = np.column_stack([every[joint] for joint in machine.active])
+    tau = np.column_stack([every.get(joint + FORCE, none) for joint in machine.active])
+    rates = [every.get(x + VELOCITY, derivative(every[x], recording.time)) for x in machine.active]
+    v = np.column_stack(rates)
     known_as = {joint: machine.unit(joint) for joint in machine.active}
     return Recording(recording.time, machine.active, q, v, tau, known_as, free=machine.free)
 

@@ -227,8 +227,8 @@ def form_of(
     """All that a controller's formulas are, so that equal ones share their machine code.
 
     They are traced by themselves, for rows of so many references, the active joints of a chart's
-    user and so many states, what the machine makes of accelerations left open. With `fold`, zeros and ones of the
-    settings become part of them.
+    user and so many states, what the machine makes of accelerations left open. With `fold`, zeros
+    and ones of the settings become part of them.
 
     Raises:
         InputError: There are too few or too many of them, or a free joint gets a force.
