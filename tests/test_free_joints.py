@@ -1,11 +1,16 @@
 """Joints that nothing drives: dynamics against paper, MuJoCo and Pinocchio; who may do what."""
 
+import dataclasses
+
 import hanging
 import numpy as np
 import pinocchio as pin
 import pytest
 from oracles import constraint_dynamics
+from rig import Rig, Tolerances
+from rig.sensors import default_sensors
 from scipy.integrate import solve_ivp
+from scipy.optimize import fsolve
 from typed import typed
 
 import crane
@@ -328,3 +333,40 @@ def test_a_study_lets_it_swing_and_a_workspace_holds_it(machine, tmp_path):
     assert crane.workspace(machine, 200).strokes == ("lift",)
     with pytest.raises(CraneError, match="nothing drives 'swing_x', 'swing_y', and a planned"):
         crane.excite(machine)
+
+
+def test_the_rig_measures_it_and_lets_it_swing(machine):
+    """Sensors of angles, no currents and no commands; the plant's swing is that of its angles."""
+    sensors = {
+        joint: dataclasses.replace(default_sensors(machine, joint), gain=3e4)
+        for joint in machine.active
+    }
+    rig = Rig(machine, 1, Tolerances(pins=0.0), sensors)
+    run = rig.run(crane.point_to_point([0.2, 0.3], [0.5, 0.4], 1.0))
+    assert run.free == machine.free and not run.tau[:, 2:].any()
+    assert "true_swing_x" in run.channels and "current_swing_x" not in run.channels
+    assert np.ptp(run.q[:, 3]) > 0.05
+    assert run.q[:, 3] == pytest.approx(run.channels["true_swing_y"], abs=1e-3)
+
+
+def test_it_is_linearized_where_it_hangs_still(machine, tmp_path):
+    """Frequencies of the small swings with the drives at rest, those of the crane that stands."""
+    hydraulic = crane.load(hanging.file(tmp_path, hanging.HYDRAULICS))
+    stands = crane.load(machine.path, lock={"slew": 0.2, "lift": 0.3})
+    dynamics = crane.Dynamics(stands)
+    at = fsolve(lambda q: dynamics.gravity(q), [0.3, 0.0], xtol=1e-14)
+    place = dict(zip(machine.free, at.tolist(), strict=True))
+    # little damping: roots of |K - w^2 M|, K the slope of the weight
+    slope = np.array(
+        [dynamics.gravity(at + step) - dynamics.gravity(at - step) for step in 1e-5 * np.eye(2)]
+    )
+    squares = np.linalg.eigvals(np.linalg.solve(dynamics.mass_matrix(at), slope.T / 2e-5))
+    frequencies = sorted(mode.frequency for mode in crane.linearize(stands, place).modes)
+    assert frequencies == pytest.approx(sorted(np.sqrt(squares) / (2 * np.pi)), rel=2e-3)
+    # valves that are shut hold the drives nearly so
+    held = [mode.frequency for mode in crane.linearize(hydraulic, place).modes]
+    for frequency in frequencies:
+        assert min(abs(held - np.array(frequency))) < 0.01 * frequency
+    for one in (machine, hydraulic):
+        with pytest.raises(CraneError, match="free joint 'swing_x' does not stay there, 370 N m"):
+            crane.linearize(one, {"swing_x": 0.6})

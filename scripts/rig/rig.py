@@ -177,7 +177,7 @@ class Rig:
                 ("true_velocity", v, VELOCITY_UNITS[unit]),
                 ("true_force", force, FORCE_UNITS[unit]),
             ):  # fmt: skip
-                if joint not in machine.free or name.startswith("true"):
+                if joint not in machine.free or name in ("true", "true_velocity"):
                     channels[f"{name}_{joint}"], units[f"{name}_{joint}"] = values[:, i], of
         if machine.tip is not None:
             known_tip, tip = Kinematics(machine).position(measured), Kinematics(plant)

@@ -194,7 +194,8 @@ def _check_scale(machine: Machine, rows: Equations) -> None:
         body = body_names(machine)[-1]
         raise RecordingError(
             "nothing drives what moves in this recording: it tells ratios of masses, not masses; "
-            f"say what one is known to be, as prior={{'{body}.m': '100 +- 1'}}"
+            f"say what one is known to be, as prior={{'{body}.m': '100 +- 1'}} "
+            f"(--prior {body}.m=100+-1)"
         )
 
 
