@@ -9,7 +9,6 @@ import numpy as np
 from crane.codegen import Number
 from crane.common.samples import Array, as_sample
 from crane.dynamics import Dynamics
-from crane.dynamics.hybrid import hybrid
 from crane.machine import Machine
 from crane.motion.trajectories import Trajectory, with_free
 
@@ -105,11 +104,6 @@ class Law:
         """Forces (n,) of all active joints from those of the driven ones."""
         given = iter(forces)
         return [next(given) if moved else 0.0 for moved in self.machine.driven]
-
-    def holding(self, at: At, friction: bool) -> list[Number]:
-        """Forces of the driven joints that keep these from accelerating."""
-        driven = self.machine.driven.tolist()
-        return hybrid(at.inverse, driven, [0.0] * sum(driven), friction)[0]
 
     def begin(self, at: At) -> Sequence[Number]:
         """The law's own states (k,) at the start, seen in numbers and at rest; none yet."""

@@ -69,7 +69,7 @@ class ValveDrive(Law):
 
     def begin(self, at: At) -> Sequence[Number]:
         """See `Law`."""
-        weight = np.array(self.spread(self.holding(at, friction=False)))[self._which]
+        weight = np.array(at.inverse([0.0] * len(at.q_a), friction=False))[self._which]
         x = np.array(at.q_a)[self._which] - self._lower
         hydraulics = self.circuit.hydraulics
         # a program has not been asked yet, and may remember an earlier simulation

@@ -61,7 +61,7 @@ class PI(Law):
         """See `Law`."""
         if self._integral is not None:
             return list(self._integral)
-        weight = np.array(self.holding(at, friction=True))
+        weight = np.array(self.of_driven(at.inverse([0.0] * len(at.q_a), friction=True)))
         kp, ki = np.array(self._gains(at))
         able = ki > 0
         held = np.where(able, weight - kp * np.array(self._error(at)), 0.0)
