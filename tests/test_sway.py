@@ -87,6 +87,15 @@ def test_noise_in_the_sway_biases_nothing(machine, driven, angle, force):
         assert value == pytest.approx(truth, rel=share)
 
 
+@pytest.mark.parametrize("how", [{"method": "huber"}, {"feasible": True}, {"prior": 0.3}])
+def test_every_estimator_takes_sway(machine, driven, how):
+    found = identified(machine, noisy(driven, 1e-4, 0.01), **how)
+    values = dict(zip(found.names, zip(found.values, found.nominal, strict=True), strict=True))
+    for name in ("grapple.mz", "grapple.Ixx", "swing_y.viscous"):
+        value, truth = values[name]
+        assert value == pytest.approx(truth, rel=0.01)
+
+
 def still(machine, **changes):
     return crane.load(machine.path, lock={"slew": 0.2, "lift": 0.3}, changes=changes)
 
