@@ -79,7 +79,7 @@ def test_named_controllers(forwarder, path):
 
 
 def test_errors(forwarder, path):
-    with pytest.raises(InputError, match="no PI gains for active joint 'X1'"):
+    with pytest.raises(InputError, match="no PI gains for driven joint 'X1'"):
         crane.PI(forwarder, path, gains={"q1": crane.PIGains(1, 1)})
     with pytest.raises(InputError, match="the bandwidth is 0 rad/s"):
         crane.ComputedTorque(forwarder, path, bandwidth=0)

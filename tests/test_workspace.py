@@ -278,7 +278,7 @@ def test_what_cannot_be_mapped_is_refused(five_bar, mini):
     for call, text in (
         (lambda: workspace(five_bar), "has no tip, name a frame"),
         (lambda: workspace(five_bar, 5000, "rod"), "frame 'rod' is unknown"),
-        (lambda: workspace(five_bar, 5000, "ground"), "no active joint moves 'ground'"),
+        (lambda: workspace(five_bar, 5000, "ground"), "no driven joint moves 'ground'"),
         (lambda: workspace(mini, 10), "samples is 10, give a whole number from 100 to"),
         (lambda: workspace(mini, 100, seed=-1), "the seed is -1"),
     ):

@@ -201,7 +201,8 @@ def _describe(machine: "Machine") -> Iterator[str]:
     yield f"  file        {machine.path}"
     yield f"  chains      {', '.join(chain.name for chain in machine.chains)}"
     yield (
-        f"  joints      {len(machine.joints)}, of which {len(machine.active)} active; "
+        f"  joints      {len(machine.joints)}, of which {len(machine.driven_joints)} active"
+        f"{f' and {len(machine.free)} free' if machine.free else ''}; "
         f"moving mass {quantity(mass, 'kg', 4)}"
     )
     width = max(10, 1 + max(map(len, (*machine.joints, *closure.equations.names))))

@@ -10,7 +10,7 @@ from crane.codegen import Number
 from crane.common.samples import Array, as_sample
 from crane.dynamics import Dynamics
 from crane.machine import Machine
-from crane.motion.trajectories import Trajectory
+from crane.motion.trajectories import Trajectory, with_free
 
 
 class Controller(Protocol):
@@ -93,8 +93,17 @@ class Law:
         self.machine = machine
 
     def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
-        """Active forces (n,) [N], [N m], and the rates (k,) of the law's states."""
+        """Active forces (n,) [N], [N m], 0.0 of free joints, and rates (k,) of the states."""
         raise NotImplementedError
+
+    def of_driven(self, x: Sequence[Number]) -> list[Number]:
+        """Those of all active joints (n,) that belong to the driven ones."""
+        return [value for value, moved in zip(x, self.machine.driven, strict=True) if moved]
+
+    def spread(self, forces: Sequence[Number]) -> list[Number]:
+        """Forces (n,) of all active joints from those of the driven ones."""
+        given = iter(forces)
+        return [next(given) if moved else 0.0 for moved in self.machine.driven]
 
     def begin(self, at: At) -> Sequence[Number]:
         """The law's own states (k,) at the start, seen in numbers and at rest; none yet."""
@@ -165,12 +174,12 @@ class Feedback:
     """A plain function of the user as a controller.
 
     Args:
-        function: (t, q_a, v_a) -> tau_a.
-        machine: The machine, whose number of active joints the answer must have.
+        function: (t, q_a, v_a) -> tau_a, of all active joints or of the driven ones alone.
+        machine: The machine.
     """
 
     def __init__(self, function: Callable[[float, Array, Array], Array], machine: Machine):
-        self._function, self._active = function, machine.active
+        self._function, self._machine = function, machine
 
     def start(self, q_a: Array) -> Array:
         """See `Controller`."""
@@ -179,10 +188,13 @@ class Feedback:
     def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
         """See `Controller`."""
         forces = self._function(time, q_a.copy(), v_a.copy())
-        what = f"the controller's force at t = {time:g} s"
-        return as_sample(forces, len(self._active), what, self._active), state
+        what, machine = f"the controller's force at t = {time:g} s", self._machine
+        if machine.free and np.shape(forces) == (machine.driven.sum(),):
+            return machine.spread(forces, what), state
+        return as_sample(forces, len(machine.active), what, machine.active), state
 
 
-def reference_of(controller: Controller) -> Trajectory | None:
-    """The reference motion of a controller, if it has one."""
-    return getattr(controller, "reference", None)
+def reference_of(controller: Controller, machine: Machine) -> Trajectory | None:
+    """The reference motion of a controller, if it has one, of all active joints."""
+    reference = getattr(controller, "reference", None)
+    return None if reference is None else with_free(machine, reference)

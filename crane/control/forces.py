@@ -7,28 +7,28 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.codegen import Number
-from crane.codegen.factors import Positive
-from crane.codegen.scalar import add, scale, subtract
+from crane.codegen.scalar import subtract
 from crane.common.errors import ClosureError, CraneWarning, InputError
 from crane.common.samples import Array, as_number, as_sample
 from crane.control.base import At, Law
 from crane.description import PIGains
+from crane.dynamics.hybrid import hybrid
 from crane.machine import Machine
-from crane.motion.trajectories import Trajectory
+from crane.motion.trajectories import Trajectory, with_free
 
 
 class PI(Law):
-    """One PI controller per active joint, equation (7) of the reduced-scale forwarder paper.
+    """One PI controller per driven joint, equation (7) of the reduced-scale forwarder paper.
 
     tau = K_p e + K_i int e dt, e = q_ref(t) - q_A. Free joints get no force.
 
     Args:
         machine: The machine.
-        reference: Reference of the active joints.
-        gains: By active joint; those of the machine file if not given.
-        integral: (n,) int e dt at the start [m s], [rad s]. If not given, it carries the
-            machine's weight, as it does when a machine under control stands still; with zeros
-            the machine falls until the integrals have grown.
+        reference: Reference of the driven joints, see `with_free`.
+        gains: By driven joint; those of the machine file if not given.
+        integral: (k,) int e dt of the driven joints at the start [m s], [rad s]. If not given, it
+            carries the machine's weight, as it does when a machine under control stands still;
+            with zeros the machine falls until the integrals have grown.
 
     Raises:
         InputError: No gains for a joint.
@@ -42,28 +42,26 @@ class PI(Law):
         integral: ArrayLike | None = None,
     ):
         gains = machine.control if gains is None else gains
-        driven = [joint for joint in machine.active if joint not in machine.free]
+        driven = machine.driven_joints
         for joint in driven:
             if joint not in gains:
                 raise InputError(
-                    f"no PI gains for active joint '{joint}' of '{machine.name}', give kp and ki "
+                    f"no PI gains for driven joint '{joint}' of '{machine.name}', give kp and ki "
                     "under 'control' of the machine file"
                 )
         super().__init__(machine)
-        self.reference: Trajectory = reference
-        names = machine.active
+        self.reference: Trajectory = with_free(machine, reference)
         self._integral = (
-            None if integral is None else as_sample(integral, len(names), "integral", names)
+            None if integral is None else as_sample(integral, len(driven), "integral", driven)
         )
-        gains = {joint: gains[joint] if joint in driven else PIGains(0.0, 0.0) for joint in names}
-        numbers = [[gains[joint].kp for joint in names], [gains[joint].ki for joint in names]]
+        numbers = [[gains[joint].kp for joint in driven], [gains[joint].ki for joint in driven]]
         self.settings = np.array(numbers, dtype=np.float64).ravel()
 
     def begin(self, at: At) -> Sequence[Number]:
         """See `Law`."""
         if self._integral is not None:
             return list(self._integral)
-        weight = np.array(at.inverse([0.0] * len(at.q_a), friction=True))
+        weight = np.array(self.of_driven(at.inverse([0.0] * len(at.q_a), friction=True)))
         kp, ki = np.array(self._gains(at))
         able = ki > 0
         held = np.where(able, weight - kp * np.array(self._error(at)), 0.0)
@@ -71,20 +69,21 @@ class PI(Law):
 
     def references(self, times: Array) -> Array:
         """See `TracedController`."""
-        return self.reference.position(times)
+        return self.reference.position(times)[:, self.machine.driven]
 
     def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
         """See `Law`; the states are the integrals of the errors."""
         error = self._error(at)
         kp, ki = self._gains(at)
-        return [p * e + i * z for p, i, e, z in zip(kp, ki, error, at.state, strict=True)], error
+        forces = [p * e + i * z for p, i, e, z in zip(kp, ki, error, at.state, strict=True)]
+        return self.spread(forces), error
 
     def _error(self, at: At) -> list[Number]:
-        return subtract(at.reference, at.q_a)
+        return subtract(at.reference, self.of_driven(at.q_a))
 
     def _gains(self, at: At) -> tuple[list[Number], list[Number]]:
-        n = len(at.q_a)
-        return at.settings[:n], at.settings[n : 2 * n]
+        k = len(at.reference)
+        return at.settings[:k], at.settings[k : 2 * k]
 
 
 class ComputedTorque(Law):
@@ -92,23 +91,19 @@ class ComputedTorque(Law):
 
     tau = inverse(q_A, v_A, a_ref + 2 w (v_ref - v_A) + w^2 (q_ref - q_A)) with friction.
 
-    Free joints get no force and follow no reference. With d the driven and f the free joints, and
-    c = inverse(q_A, v_A, (a_d, 0)), their acceleration and the drives' forces are
-
-        a_f = -M_ff^-1 c_f,    tau_d = c_d + M_df a_f
-
-    (collocated partial feedback linearisation, Spong 1994). Where nothing is said to drive another
-    joint (`Machine.undriven`), a warning names it and the force that it takes along the reference.
+    Free joints get no force and follow no reference: what drives the others so while these swing
+    is `Dynamics.hybrid`. Where nothing is said to drive another joint (`Machine.undriven`), a
+    warning names it and the force that it takes along the reference.
 
     Args:
         machine: The machine.
-        reference: Reference of the active joints.
+        reference: Reference of the driven joints, see `with_free`.
         bandwidth: w [rad/s].
     """
 
     def __init__(self, machine: Machine, reference: Trajectory, bandwidth: float = 20.0):
         super().__init__(machine)
-        self.reference: Trajectory = reference
+        self.reference: Trajectory = with_free(machine, reference)
         self.settings = np.array([as_number(bandwidth, "the bandwidth", "rad/s", above=0)])
         if machine.undriven:
             warnings.warn(self._needed(machine), CraneWarning, stacklevel=2)
@@ -137,33 +132,17 @@ class ComputedTorque(Law):
 
     def references(self, times: Array) -> Array:
         """See `TracedController`."""
-        return np.concatenate(self.reference(times), axis=1)
+        return np.concatenate([x[:, self.machine.driven] for x in self.reference(times)], axis=1)
 
     def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
         """See `Law`."""
-        w, n = at.settings[0], len(at.q_a)
-        motion = (at.reference[i * n : (i + 1) * n] for i in range(3))
-        driven = self.machine.driven.tolist()
+        w, k = at.settings[0], int(self.machine.driven.sum())
+        motion = (at.reference[i * k : (i + 1) * k] for i in range(3))
         wanted: list[Number] = [
-            a_ref + 2.0 * w * (v_ref - v) + w * w * (q_ref - q) if moved else 0.0
-            for q_ref, v_ref, a_ref, q, v, moved in zip(
-                *motion, at.q_a, at.v_a, driven, strict=True
+            a_ref + 2.0 * w * (v_ref - v) + w * w * (q_ref - q)
+            for q_ref, v_ref, a_ref, q, v in zip(
+                *motion, self.of_driven(at.q_a), self.of_driven(at.v_a), strict=True
             )
         ]
-        tau = at.inverse(wanted, friction=True)
-        free = [i for i in range(n) if not driven[i]]
-        return (_without(tau, free, at) if free else tau), ()
-
-
-def _without(tau: list[Number], free: list[int], at: At) -> list[Number]:
-    """Forces of inverse dynamics with those of free joints gone: these accelerate instead."""
-    n = len(tau)
-    still = at.inverse([0.0] * n, friction=False)
-    columns = []  # of M_A
-    for i in free:
-        pushed = at.inverse([float(k == i) for k in range(n)], friction=False)
-        columns.append(subtract(pushed, still))
-    mass = [[column[i] for column in columns] for i in free]
-    falling = Positive(mass).solve([-tau[i] for i in free])
-    moved = add(tau, *(scale(a, column) for a, column in zip(falling, columns, strict=True)))
-    return [0.0 if i in free else x for i, x in enumerate(moved)]
+        tau, _ = hybrid(at.inverse, self.machine.driven.tolist(), wanted, friction=True)
+        return self.spread(tau), ()

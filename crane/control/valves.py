@@ -14,7 +14,7 @@ from crane.common.samples import Array, as_number, as_sample
 from crane.control.base import At
 from crane.hydraulics import Hydraulics, PDGains
 from crane.machine import Machine
-from crane.motion.trajectories import Trajectory
+from crane.motion.trajectories import Trajectory, with_free
 
 _LONGEST = 4000.0  # of levers [s], what a simulation can have of milliseconds
 _LOGGED = 0.02  # [s] between samples of a log, at most
@@ -231,7 +231,7 @@ class ValvePD(Command):
                     f"no gains for the valve of '{joint}' of '{machine.name}', give kp and kd "
                     "under 'control' of its 'hydraulics'"
                 )
-        self.reference: Trajectory = reference
+        self.reference: Trajectory = with_free(machine, reference)
         self._which = [machine.active.index(joint) for joint in circuit.joints]
         valves = circuit.valves.values()
         numbers = [

@@ -296,7 +296,8 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
             raise InputError(f"joint '{name}' to lock is unknown, {known(joints, name)}")
         held.append(_fixed(joints[name], given))
     active = spec.active and tuple(name for name in spec.active if name not in lock)
-    if (spec.active and not active) or not joints.keys() - lock.keys():
+    sways = any(name not in lock for name in spec.free)
+    if (spec.active and not active and not sways) or not joints.keys() - lock.keys():
         raise InputError(f"with {', '.join(lock)} locked nothing drives the machine, lock less")
     tree = spec.tree.replacing(*held)
     body = tree.bodies()

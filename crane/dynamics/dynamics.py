@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from crane.closure.traced import geometry_of
 from crane.codegen import TooLongError, carefully
 from crane.common.errors import InputError, MechanismError, known
-from crane.common.samples import Array, as_number, as_samples, per_sample
+from crane.common.samples import Array, as_number, as_samples, per_sample, solve
 from crane.description.external import PARTS
 from crane.dynamics.compiled import FRICTION, SLOPES, NamedCode, QuantityCode
 from crane.dynamics.frames import FrameJacobians
@@ -138,6 +138,35 @@ class Dynamics:
         """
         quantity = "forward with friction" if friction else "forward"
         return self._evaluate(quantity, (), q_a, v_a, tau_a, "tau_a")
+
+    def hybrid(
+        self, q_a: ArrayLike, v_a: ArrayLike, a_d: ArrayLike, friction: bool = False
+    ) -> tuple[Array, Array]:
+        """Inverse dynamics of the driven joints d, forward dynamics of the free ones f.
+
+        Free joints have no force. With c = inverse(q_A, v_A, (a_d, 0)),
+
+            a_f = -M_ff^-1 c_f,    tau_d = c_d + M_df a_f.
+
+        Args:
+            q_a: (n,) or (N, n) [m], [rad].
+            v_a: The same shape [m/s], [rad/s].
+            a_d: Of the k driven joints in their order, (k,) or (N, k) [m/s2], [rad/s2].
+            friction: As of `inverse` for driven joints; of free ones as of `forward`.
+
+        Returns:
+            tau_d, (k,) or (N, k) [N], [N m], and a_f, (n - k,) or (N, n - k) [m/s2], [rad/s2].
+
+        Source: Featherstone 2008, Rigid Body Dynamics Algorithms, 9.2 (hybrid dynamics); Spong
+        1994, Partial feedback linearization of underactuated mechanical systems (collocated).
+        """
+        a_a = self.machine.spread(a_d, "a_d")
+        c = self.inverse(q_a, v_a, a_a, friction)
+        driven = self.machine.driven
+        mass = self.mass_matrix(q_a)
+        across, own = mass[..., driven, :][..., ~driven], mass[..., ~driven, :][..., ~driven]
+        a_f = -solve(own, c[..., ~driven, None])
+        return c[..., driven] + (across @ a_f)[..., 0], a_f[..., 0]
 
     def mass_matrix(self, q_a: ArrayLike) -> Array:
         """M_A = gamma^T M gamma.

@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from crane.closure import Closure, frame_id
 from crane.closure.coordinates import Coordinates
@@ -133,9 +133,7 @@ class Machine:
 
     def __repr__(self) -> str:
         """Name, joints, loops and what drives it."""
-        drives = ", ".join(
-            f"{joint} [{self.unit(joint)}]" for joint in self.active if joint not in self.free
-        )
+        drives = ", ".join(f"{joint} [{self.unit(joint)}]" for joint in self.driven_joints)
         free = f", free {', '.join(self.free)}" if self.free else ""
         loops = len(self.closure.equations.loops)
         circuit = ", hydraulic" if self.hydraulics is not None else ""
@@ -185,13 +183,28 @@ class Machine:
     @cached_property
     def drives(self) -> tuple[Drive, ...]:
         """What acts on the machine: its motors, or one drive along each driven active joint."""
-        driven = (joint for joint in self.active if joint not in self.free)
-        return self.motors or tuple(Drive(joint, {joint: 1.0}) for joint in driven)
+        return self.motors or tuple(Drive(joint, {joint: 1.0}) for joint in self.driven_joints)
+
+    @property
+    def driven_joints(self) -> tuple[str, ...]:
+        """Active joints that are not free."""
+        return tuple(joint for joint in self.active if joint not in self.free)
 
     @cached_property
-    def driven(self) -> Array:
+    def driven(self) -> NDArray[np.bool_]:
         """(n,) whether each active joint is driven, which free ones are not."""
         return np.array([joint not in self.free for joint in self.active])
+
+    def spread(self, x: ArrayLike, what: str) -> Array:
+        """Something of the k driven joints, (k,) or (N, k), with zeros of the free ones: (., n).
+
+        Raises:
+            InputError: Wrong shape or not finite.
+        """
+        given = as_samples(x, len(self.driven_joints), what, self.driven_joints)
+        out = np.zeros((*given.shape[:-1], len(self.active)))
+        out[..., self.driven] = given
+        return out
 
     @cached_property
     def reference(self) -> str:

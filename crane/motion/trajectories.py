@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import PPoly, make_interp_spline
 
 from crane.common.errors import InputError, LimitError, known
@@ -199,6 +199,61 @@ def _quintics(time: Array, x: Array, v: Array, a: Array) -> PPoly:
     return PPoly(np.array(rows), time)
 
 
+class _WithFree(Trajectory):
+    """A reference of the driven joints beside free joints that stay where they start."""
+
+    def __init__(self, reference: Trajectory, driven: NDArray[np.bool_], start: Array):
+        self.duration, self.tip = reference.duration, reference.tip
+        self._reference, self._driven, self._start = reference, driven, start
+
+    def position(self, time: ArrayLike) -> Array:
+        """See `Trajectory`."""
+        return self._beside(self._reference.position(time), self._start)
+
+    def _rate(self, order: int, time: ArrayLike) -> Array:
+        return self._beside(self._reference._rate(order, time), np.zeros_like(self._start))
+
+    def bounds(self) -> tuple[Array, Array]:
+        """See `Trajectory`."""
+        least, most = self._reference.bounds()
+        return self._beside(least, self._start), self._beside(most, self._start)
+
+    def turns(self) -> Array:
+        """See `Trajectory`."""
+        return self._reference.turns()
+
+    def breaks(self) -> Array:
+        """See `Trajectory`."""
+        return self._reference.breaks()
+
+    def _beside(self, x: Array, others: Array) -> Array:
+        out = np.tile(others, (*x.shape[:-1], 1) if x.ndim > 1 else 1)
+        out[..., self._driven] = x if x.shape[-1] < len(others) else x[..., self._driven]
+        return out
+
+
+def with_free(machine: Machine, reference: Trajectory) -> Trajectory:
+    """A reference of the driven joints as one of all active joints (n,).
+
+    Free joints follow none. Their columns only say where they start: at home, or where those of a
+    reference of all joints do.
+
+    Raises:
+        InputError: It is neither of the driven joints nor of all.
+    """
+    if not machine.free:
+        return reference
+    start, names = reference.position(0.0), machine.driven_joints
+    if len(start) not in (len(names), len(machine.active)):
+        raise InputError(
+            f"the reference has {len(start)} coordinates, give the {len(names)} of the driven "
+            f"joints ({', '.join(names)}) or those of all {len(machine.active)}"
+        )
+    if len(start) == len(names):
+        start = machine.home[machine.closure.active]
+    return _WithFree(reference, machine.driven, start)
+
+
 def task_trajectory(machine: Machine, task: str) -> Trajectory:
     """Trajectory of the active joints of a named task of the machine.
 
@@ -217,11 +272,8 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
     if chosen.space == "tip":
         rows = [chosen.coefficients[axis] for axis in ("x", "y", "z")]
         return tip_trajectory(machine, polynomial(rows, chosen.duration))
-    home = machine.home[machine.closure.active]
-    rows = [  # free joints have no reference
-        chosen.coefficients.get(name, (at,)) for name, at in zip(machine.active, home, strict=True)
-    ]
-    found = polynomial(rows, chosen.duration)
+    rows = [chosen.coefficients[name] for name in machine.active if name not in machine.free]
+    found = with_free(machine, polynomial(rows, chosen.duration))
     if text := beyond_limits(machine, found):
         raise LimitError(f"task '{task}': {text}")
     return found

@@ -29,12 +29,14 @@ from crane.recordings.reading import ALWAYS, Span, known_sensors, read
 from crane.recordings.recording import (
     FORCE,
     FORCE_UNITS,
+    FREE,
     IDEAL,
     SENSORS,
     VELOCITY,
     VELOCITY_UNITS,
     Recording,
     check_finite,
+    driven_all_the_same,
 )
 from crane.recordings.strokes import check_strokes
 from crane.recordings.timeseries import TIME, Table, column
@@ -83,14 +85,16 @@ def completed(
     Raises:
         RecordingError: As for `read_measured`.
     """
-    full = all(x in table.units and x + FORCE in table.units for x in machine.active)
     try:
+        table = _without_free_forces(machine, table)
         # before anything is computed from them, to name the column as it is in the file
         check_finite(dict(zip(table.units, table.values.T, strict=True)))
         check_strokes(machine, table)
         told = with_angles(machine, table)
         missing = Missing(machine, table)
         missing.note_absent(needs)
+        full = all(x in table.units for x in machine.active)
+        full = full and all(x + FORCE in table.units for x in machine.driven_joints)
         if not full:
             told = _completed(machine, told, missing)
         missing.refuse()
@@ -99,6 +103,26 @@ def completed(
         raise RecordingError(at(str(path), error)) from None
     notes = told.notes | ({SENSORS: IDEAL} if known_sensors(table, machine) else {})
     return Recording.from_table(Table(told.units, told.values, notes), path)
+
+
+def _without_free_forces(machine: Machine, table: Table) -> Table:
+    """The table without the forces of free joints, which it names as such.
+
+    Raises:
+        RecordingError: One is not zero.
+    """
+    notes = {key: text for key, text in table.notes.items() if key != FREE}
+    if machine.free:
+        notes[FREE] = ", ".join(machine.free)
+    kept = []
+    for i, name in enumerate(table.units):
+        joint = name.removesuffix(FORCE)
+        if not name.endswith(FORCE) or joint not in machine.free:
+            kept.append(i)
+        elif table.values[:, i].any():
+            raise RecordingError(driven_all_the_same(joint, table.values[:, i]))
+    units = {name: unit for i, (name, unit) in enumerate(table.units.items()) if i in kept}
+    return Table(units, table.values[:, kept], notes)
 
 
 def is_measured(table: Table) -> bool:
@@ -115,18 +139,18 @@ def _completed(machine: Machine, table: Table, missing: Missing) -> Table:
     drives: tuple[str, ...] = ()
     with missing.noted():
         drives = drives_of(machine, list(table.units))
-    for joint in machine.active:
+    for joint in machine.driven_joints:
         with missing.noted():
             forces.append(_force(machine, joint, table))
     missing.refuse()
     q, v = motion_by(machine, drives, table)
     columns = {TIME: column(table, TIME)} | dict(zip(machine.active, q.T, strict=True))
     columns |= {x + VELOCITY: v[:, i] for i, x in enumerate(machine.active)}
-    columns |= {x + FORCE: force for x, force in zip(machine.active, forces, strict=True)}
+    columns |= {x + FORCE: force for x, force in zip(machine.driven_joints, forces, strict=True)}
     kinds = {x: machine.unit(x) for x in machine.active}
     units = {TIME: "s"} | kinds
     units |= {x + VELOCITY: VELOCITY_UNITS[kind] for x, kind in kinds.items()}
-    units |= {x + FORCE: FORCE_UNITS[kind] for x, kind in kinds.items()}
+    units |= {x + FORCE: FORCE_UNITS[kinds[x]] for x in machine.driven_joints}
     for name, unit in table.units.items():
         if name not in units:
             units[name], columns[name] = unit, column(table, name)

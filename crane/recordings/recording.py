@@ -8,11 +8,13 @@ As a file it is a CSV of SI units (see crane.recordings.timeseries):
     # controller: PI
     time [s],q1 [rad],X1 [m],q1_velocity [rad/s],X1_velocity [m/s],q1_force [N m],X1_force [N],...
 
-A column X is an active joint if X_force exists; X_velocity may be missing and is the derivative of
-X then. X_velocity and X_force without X is an error. Every other column is a channel, such as the
-angle q2 of a joint that is not active, with q2_velocity beside it or without. The order of the
-columns is free, the joints come in the order of their displacements. The comment lines may be left
-out. Other units are converted where crane.recordings.timeseries knows them. An npz file serves,
+A column X is an active joint if X_force exists, or if the line `# free: X, Y` names it: nothing
+drives such a joint, its force is zero and has no column. X_velocity may be missing and is the
+derivative of X then. X_velocity and X_force without X is an error. Every other column is a
+channel, such as the angle q2 of a joint that is not active, with q2_velocity beside it or without.
+The order of the columns is any, the joints come in the order of their displacements. The comment
+lines may be left out where no joint is free. Other units are converted where
+crane.recordings.timeseries knows them. An npz file serves,
 too: one array per column, named like those of the CSV. What a crane's sensors tell instead of
 displacements and forces, crane.recordings.measured turns into them.
 """
@@ -35,6 +37,7 @@ from crane.recordings import timeseries
 from crane.recordings.timeseries import TIME, Table, check_unit
 
 SENSORS, IDEAL = "sensors", "ideal"  # a note of quantities themselves
+FREE = "free"  # a note of joints that nothing drives
 _LISTED = 40  # names in a message
 
 
@@ -60,6 +63,7 @@ class Recording:
         controller: What drove it, "" if not known.
         ideal: Whether the columns are the quantities themselves, simulated or corrected by what
             is known of the sensors, which a file says in its note `sensors`.
+        free: Those of the joints that nothing drives, whose forces are zero.
     """
 
     time: Array
@@ -74,6 +78,7 @@ class Recording:
     task: str = ""
     controller: str = ""
     ideal: bool = False
+    free: tuple[str, ...] = ()
     copy: InitVar[bool] = True
 
     def __post_init__(self, copy: bool) -> None:
@@ -85,8 +90,12 @@ class Recording:
                 raise RecordingError(f"unit of the channel '{name}', {known(self.channels, name)}")
         if set(self.units) != set(joints):
             raise RecordingError(f"units are for {_listed(self.units)}, give {_listed(joints)}")
+        for name in self.free:
+            if name not in joints:
+                raise RecordingError(f"free joint '{name}' is not recorded, {known(joints, name)}")
         checked = {
             "joints": joints,
+            "free": tuple(x for x in joints if x in self.free),
             "units": {x: self.units[x] for x in joints},
             "time": _array(TIME, self.time, (count,), copy),
             "q": _array("q", self.q, shape, copy, joints),
@@ -108,7 +117,7 @@ class Recording:
         for name, count in Counter(names).items():
             if count > 1:
                 raise RecordingError(f"column '{name}' is there twice, rename or remove one")
-        if _some_joints(names) != self.joints:
+        if _some_joints(names, self.free) != self.joints:
             raise RecordingError(
                 f"channels {_listed(self.channels)} hold an active joint, "
                 f"rename those that end in {VELOCITY} and {FORCE}"
@@ -124,6 +133,9 @@ class Recording:
     def _check_values(self) -> None:
         if not len(self.time):
             raise RecordingError("no samples, give at least one")
+        for i, joint in enumerate(self.joints):
+            if joint in self.free and self.tau[:, i].any():
+                raise RecordingError(driven_all_the_same(joint, self.tau[:, i]))
         arrays = (self.time, self.q, self.v, self.tau, *self.channels.values())
         if not all(np.isfinite(values).all() for values in arrays):
             check_finite(self.columns())
@@ -146,8 +158,12 @@ class Recording:
 
     def _names(self) -> list[str]:
         """Names of all columns, in the order in which they are written."""
-        joints = [x + suffix for suffix in ("", VELOCITY, FORCE) for x in self.joints]
-        return [TIME, *joints, *self.channels]
+        joints = [x + suffix for suffix in ("", VELOCITY) for x in self.joints]
+        return [TIME, *joints, *(x + FORCE for x in self._driven), *self.channels]
+
+    @property
+    def _driven(self) -> list[str]:
+        return [x for x in self.joints if x not in self.free]
 
     def _units(self) -> dict[str, str]:
         """Units of all columns.
@@ -161,14 +177,16 @@ class Recording:
             {TIME: "s"}
             | self.units
             | {x + VELOCITY: VELOCITY_UNITS[unit] for x, unit in self.units.items()}
-            | {x + FORCE: FORCE_UNITS[unit] for x, unit in self.units.items()}
+            | {x + FORCE: FORCE_UNITS[self.units[x]] for x in self._driven}
             | self.channel_units
         )
 
     def columns(self) -> dict[str, Array]:
         """All columns (N,) by name, as they are written; views, not copies."""
-        joints = [*self.q.T, *self.v.T, *self.tau.T]
-        columns = [self.time, *joints, *self.channels.values()]
+        forces = (
+            x for x, joint in zip(self.tau.T, self.joints, strict=True) if joint in self._driven
+        )
+        columns = [self.time, *self.q.T, *self.v.T, *forces, *self.channels.values()]
         return dict(zip(self._names(), columns, strict=True))
 
     def between(self, start: float, end: float) -> "Recording":
@@ -203,6 +221,8 @@ class Recording:
             notes["controller"] = self.controller
         if self.ideal:
             notes[SENSORS] = IDEAL
+        if self.free:
+            notes[FREE] = ", ".join(self.free)
         timeseries.write_columns(path, self._units(), list(self.columns().values()), notes)
 
     @classmethod
@@ -239,14 +259,18 @@ class Recording:
     @classmethod
     def _from_table(cls, table: Table) -> "Recording":
         units, column = table.units, dict(zip(table.units, table.values.T, strict=True))
-        joints = _some_joints(list(units))
+        free = tuple(filter(None, (x.strip() for x in table.notes.get(FREE, "").split(","))))
+        joints = _some_joints(list(units), free)
         for joint in joints:
             check_unit(joint, unit := units[joint], VELOCITY_UNITS)
             if joint + VELOCITY in units:
                 check_unit(joint + VELOCITY, units[joint + VELOCITY], [VELOCITY_UNITS[unit]])
             else:
                 column[joint + VELOCITY] = derivative(column[joint], column[TIME])
-            check_unit(joint + FORCE, units[joint + FORCE], [FORCE_UNITS[unit]])
+            if joint + FORCE in units:
+                check_unit(joint + FORCE, units[joint + FORCE], [FORCE_UNITS[unit]])
+            elif joint in free:
+                column[joint + FORCE] = np.zeros_like(column[TIME])
         q, v, tau = (
             np.column_stack([column[x + suffix] for x in joints])
             for suffix in ("", VELOCITY, FORCE)
@@ -266,6 +290,7 @@ class Recording:
             task=table.notes.get("task", ""),
             controller=table.notes.get("controller", ""),
             ideal=table.notes.get(SENSORS) == IDEAL,
+            free=free,
         )
 
 
@@ -310,7 +335,16 @@ def _listed(names: Iterable[str]) -> str:
     return ", ".join([f"'{name}'" for name in names[:_LISTED]] + more) or "none"
 
 
-def find_joints(names: Sequence[str]) -> tuple[str, ...]:
+def driven_all_the_same(joint: str, tau: Array) -> str:
+    """What to say of a free joint's force (N,) that is not zero."""
+    sample = int(np.argmax(tau != 0))
+    return (
+        f"'{joint}' is free and has the force {tau[sample]:.3g} at sample {sample}: leave the "
+        "force out, or name the joint as active"
+    )
+
+
+def find_joints(names: Sequence[str], free: Sequence[str] = ()) -> tuple[str, ...]:
     """The active joints among columns, by the rule in the module's docstring.
 
     Raises:
@@ -323,11 +357,14 @@ def find_joints(names: Sequence[str]) -> tuple[str, ...]:
                 f"column '{stem}' is missing beside '{stem}{VELOCITY}', '{stem}{FORCE}', "
                 f"add it, or rename those if '{stem}' is not an active joint"
             )
-    return tuple(x for x in names if x + FORCE in there)
+    for x in free:
+        if x not in there:
+            raise RecordingError(f"column '{x}' of a free joint is missing, {known(names, x)}")
+    return tuple(x for x in names if x + FORCE in there or x in free)
 
 
-def _some_joints(names: Sequence[str]) -> tuple[str, ...]:
-    joints = find_joints(names)
+def _some_joints(names: Sequence[str], free: Sequence[str]) -> tuple[str, ...]:
+    joints = find_joints(names, free)
     if not joints:
         raise RecordingError(
             f"no active joint among the columns {_listed(names)}, give for each joint "

@@ -24,8 +24,8 @@ class JointSummary:
         lowest: Smallest coordinate.
         highest: Largest coordinate.
         peak_speed: Largest absolute velocity.
-        peak_force: Largest absolute force or torque.
-        rms_force: Root of the time average of its square.
+        peak_force: Largest absolute force or torque; None where nothing drives the joint.
+        rms_force: Root of the time average of its square; likewise.
         peak_error: Largest distance from the reference; None without one.
         rms_error: Root of the time average of its square; None without one.
     """
@@ -35,8 +35,8 @@ class JointSummary:
     lowest: float
     highest: float
     peak_speed: float
-    peak_force: float
-    rms_force: float
+    peak_force: float | None
+    rms_force: float | None
     peak_error: float | None
     rms_error: float | None
 
@@ -77,8 +77,10 @@ class Summary:
                     joint.name,
                     f"{scale * joint.lowest:z.2f} to {scale * joint.highest:z.2f} {unit}",
                     f"{scale * joint.peak_speed:.2f} {unit}/s",
-                    quantity(joint.peak_force, force, 4),
-                    quantity(joint.rms_force, force, 4),
+                    *(
+                        "free" if x is None else quantity(x, force, 4)
+                        for x in (joint.peak_force, joint.rms_force)
+                    ),
                     _measure(joint.peak_error, scale, unit),
                     _measure(joint.rms_error, scale, unit),
                 )
@@ -118,8 +120,8 @@ def summarize(recording: Recording) -> Summary:
                 lowest=float(q.min()),
                 highest=float(q.max()),
                 peak_speed=_peak(v),
-                peak_force=_peak(tau),
-                rms_force=rms(time, tau),
+                peak_force=None if name in recording.free else _peak(tau),
+                rms_force=None if name in recording.free else rms(time, tau),
                 peak_error=None if error is None else _peak(error),
                 rms_error=None if error is None else rms(time, error),
             )

@@ -45,7 +45,8 @@ def recorded_of(machine: Machine, table: Table, recording: Recording) -> list[st
     """
     units = recording.units | recording.channel_units
     units |= {x + VELOCITY: VELOCITY_UNITS[unit] for x, unit in recording.units.items()}
-    units |= {x + FORCE: FORCE_UNITS[unit] for x, unit in recording.units.items()}
+    driven = (x for x in recording.joints if x not in recording.free)
+    units |= {x + FORCE: FORCE_UNITS[recording.units[x]] for x in driven}
     return _checked(machine, table, units)
 
 
@@ -74,7 +75,7 @@ def units_of(machine: Machine) -> dict[str, str]:
     kinds = {joint: machine.unit(joint) for joint in machine.joints}
     units = dict(kinds)
     units |= {joint + VELOCITY: VELOCITY_UNITS[kinds[joint]] for joint in machine.active}
-    units |= {joint + FORCE: FORCE_UNITS[kinds[joint]] for joint in machine.active}
+    units |= {joint + FORCE: FORCE_UNITS[kinds[joint]] for joint in machine.driven_joints}
     units |= {f"tip_{axis}": "m" for axis in "xyz" if machine.tip is not None}
     for joint in machine.hydraulics.joints if machine.hydraulics else ():
         units |= {f"pressure_{joint}_{side}": "Pa" for side in "ab"}

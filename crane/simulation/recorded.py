@@ -49,6 +49,7 @@ def recorded(
         task=task,
         controller=_name_of(control),
         ideal=True,
+        free=machine.free,
         copy=False,
     )
 
@@ -60,7 +61,7 @@ def _channels(machine: Machine, control: Controller, time: Array, rows: Parts) -
         yield joint, rows.q[:, column], machine.unit(joint)
     if machine.tip is not None:
         yield from _point("tip", Kinematics(machine).positions(rows.q))
-    reference = reference_of(control)
+    reference = reference_of(control, machine)
     if reference is not None:
         yield from _references(machine, reference, time)
     for i, joint in enumerate(machine.active):

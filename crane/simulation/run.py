@@ -191,7 +191,7 @@ def integrate(
         Times (N,), what `crane.simulation.integration.row_layout` names, (N, .) each, and what is
         to be said of the motion. N is smaller than there are steps where it was interrupted.
     """
-    machine, reference = dynamics.machine, reference_of(control)
+    machine, reference = dynamics.machine, reference_of(control, dynamics.machine)
     q_a, v_a = start_of(machine, initial, reference)
     try:
         # from home, whatever was solved before: a run is the same to the last bit
@@ -330,7 +330,7 @@ def count_steps(control: Controller, duration: float | None, step: float) -> int
         InputError: There is no duration, there are too many steps, or no whole number of them.
     """
     if duration is None:
-        reference = reference_of(control)
+        reference = getattr(control, "reference", None)
         if reference is None:
             raise InputError("no duration and no reference to take it from, give a duration")
         duration = reference.duration
@@ -351,7 +351,7 @@ def count_steps(control: Controller, duration: float | None, step: float) -> int
 
 def reference_beyond(machine: Machine, control: Controller, until: float) -> str:
     """What to say of a reference that leaves the limits before a time [s], else nothing."""
-    reference = reference_of(control)
+    reference = reference_of(control, machine)
     return "" if reference is None else beyond_limits(machine, reference, until)
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
+from crane.control import ComputedTorque
 from crane.dynamics import Dynamics
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
@@ -15,6 +16,7 @@ from crane.motion.trajectories import task_trajectory
 from crane.motion.workspaces.extremes import farthest
 from crane.motion.workspaces.section import upwards
 from crane.recordings.recording import FORCE_UNITS
+from crane.simulation import simulate
 
 _RATE = 200  # samples per second of a task
 _CELLS = 1000  # postures of the grid over the strokes that move passive joints
@@ -29,7 +31,7 @@ _APART = 0.2  # of the strokes, between two of them
 
 def task_measures(machine: Machine) -> dict[str, str]:
     """Names and units of what is measured task by task."""
-    units = {joint: FORCE_UNITS[machine.unit(joint)] for joint in machine.active}
+    units = {joint: FORCE_UNITS[machine.unit(joint)] for joint in machine.driven_joints}
     return {
         **{f"peak_{joint}": unit for joint, unit in units.items()},
         **{f"rms_{joint}": unit for joint, unit in units.items()},
@@ -43,15 +45,16 @@ def stroke_measures(machine: Machine) -> dict[str, str]:
     return {
         **({} if machine.tip is None else {"reach": "m"}),
         "range": "",
-        **{f"lower_{joint}": machine.unit(joint) for joint in machine.active},
-        **{f"upper_{joint}": machine.unit(joint) for joint in machine.active},
+        **{f"lower_{joint}": machine.unit(joint) for joint in machine.driven_joints},
+        **{f"upper_{joint}": machine.unit(joint) for joint in machine.driven_joints},
     }
 
 
 def of_task(machine: Machine, dynamics: Dynamics, task: str) -> tuple[float, dict[str, float]]:
-    """What the active joints need to move as a task asks, and its duration [s].
+    """What the driven joints need to move as a task asks, and its duration [s].
 
-    Inverse dynamics of the reference motion, friction included:
+    Inverse dynamics of the reference motion, friction included, while free joints move as they
+    will: with some, the motion is that of a simulation under `ComputedTorque`.
 
         tau = inverse(q_ref, v_ref, a_ref),     peak = max |tau|,   rms^2 = 1/T int tau^2 dt,
         energy = int sum max(0, tau_i v_i) dt,  work = int sum tau_i v_i dt.
@@ -61,11 +64,17 @@ def of_task(machine: Machine, dynamics: Dynamics, task: str) -> tuple[float, dic
     """
     path = task_trajectory(machine, task)
     time = np.linspace(0.0, path.duration, int(np.ceil(_RATE * path.duration)) + 1)
-    q_a, v_a, a_a = path(time)
-    tau = dynamics.inverse(q_a, v_a, a_a, friction=True)
+    if machine.free:
+        step = float(time[1] - time[0])
+        run = simulate(machine, ComputedTorque(machine, path), step=step)
+        v_a, tau = run.v, run.tau
+    else:
+        q_a, v_a, a_a = path(time)
+        tau = dynamics.inverse(q_a, v_a, a_a, friction=True)
     power = tau * v_a
     found = {}
-    for i, joint in enumerate(machine.active):
+    for joint in machine.driven_joints:
+        i = machine.active.index(joint)
         found[f"peak_{joint}"] = float(np.abs(tau[:, i]).max())
         square = np.trapezoid(tau[:, i] ** 2, time) / path.duration
         found[f"rms_{joint}"] = float(np.sqrt(square))
@@ -111,7 +120,8 @@ def of_strokes(machine: Machine) -> dict[str, float]:
     if not len(postures):
         return found
     strokes = np.flatnonzero(coupled)
-    for i, joint in enumerate(machine.active):
+    for joint in machine.driven_joints:
+        i = machine.active.index(joint)
         found[f"lower_{joint}"], found[f"upper_{joint}"] = float(low[i]), float(high[i])
         if not coupled[i]:
             continue
@@ -136,9 +146,9 @@ def notes(machine: Machine, measures: Sequence[str]) -> tuple[str, ...]:
 
 
 def _coupled(machine: Machine) -> NDArray[np.bool_]:
-    """Which active joints (n,) move passive ones."""
+    """Which driven joints (n,) move passive ones."""
     gamma = machine.closure.gamma(machine.home)[machine.closure.passive]
-    return np.asarray(np.abs(gamma).max(axis=0, initial=0.0) > 0)
+    return np.asarray((np.abs(gamma).max(axis=0, initial=0.0) > 0) & machine.driven)
 
 
 def _values(coupled: NDArray[np.bool_]) -> int:
@@ -147,12 +157,11 @@ def _values(coupled: NDArray[np.bool_]) -> int:
 
 
 def _ends(machine: Machine, home: Array) -> tuple[Array, Array]:
-    """Limits of the active joints; a turn about home where an angle has none."""
+    """Limits of the active joints; a turn about home where an angle has none, free ones there."""
     half = np.array([np.pi if machine.unit(joint) == "rad" else 0.0 for joint in machine.active])
-    return (
-        np.where(np.isfinite(machine.lower), machine.lower, home - half),
-        np.where(np.isfinite(machine.upper), machine.upper, home + half),
-    )
+    low = np.where(np.isfinite(machine.lower), machine.lower, home - half)
+    high = np.where(np.isfinite(machine.upper), machine.upper, home + half)
+    return np.where(machine.driven, low, home), np.where(machine.driven, high, home)
 
 
 def _next_to(cell: tuple[int, ...], shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
@@ -247,6 +256,7 @@ def _reach(
     drawn = postures[random.integers(len(postures), size=_DRAWN)]
     drawn[:, active[~coupled]] = random.uniform(*ends, (_DRAWN, len(active)))[:, ~coupled]
     moves = np.abs([goal(q)[1][active] for q in drawn]).max(axis=0) > _MOVES
+    moves &= machine.driven
     free = np.flatnonzero(~coupled & moves)
     each = max(2, int((_POSTURES / len(postures)) ** (1 / max(1, len(free)))))
     turns = np.array(
@@ -262,7 +272,7 @@ def _reach(
 
 def _shares(q_a: Array, ends: tuple[Array, Array]) -> Array:
     """Active coordinates (N, n) as shares of the way between their ends."""
-    return (q_a - ends[0]) / (ends[1] - ends[0])
+    return (q_a - ends[0]) / np.where(ends[1] > ends[0], ends[1] - ends[0], 1.0)
 
 
 def _apart(values: Array, places: Array) -> list[int]:

@@ -36,7 +36,7 @@ _PER_CORE = 8  # processes: more would wait for each other, and each has the mac
 _IDLE = ("control", "supply", "oil", "cylinder", "valve", "valve_control")
 # What of a machine its files describe.
 _DESCRIBED = (
-    "tree", "active", "friction", "forces", "gas_springs", "ropes", "end_stops", "tasks",
+    "tree", "active", "free", "friction", "forces", "gas_springs", "ropes", "end_stops", "tasks",
     "hydraulics",
 )  # fmt: skip
 

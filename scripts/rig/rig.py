@@ -21,7 +21,7 @@ from crane.dynamics import Dynamics
 from crane.formats import load
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
-from crane.motion.trajectories import Trajectory, beyond_limits
+from crane.motion.trajectories import Trajectory, beyond_limits, with_free
 from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS, Recording
 from crane.simulation.integration import Chart, HaltedError, Steps, explained, row_layout
 from rig.plant import Tolerances, drawn
@@ -124,7 +124,7 @@ class Rig:
         drives the actuator, as when it lowers.
 
         Args:
-            path: Reference of the active joints; the plant starts on it at rest.
+            path: Reference of the driven joints, see `with_free`; the plant starts on it at rest.
             step: Sampling interval [s].
             label: Name of the motion to put into the recording.
 
@@ -143,6 +143,7 @@ class Rig:
         if not (isinstance(label, str) and label.isprintable() and label == label.strip()):
             raise InputError(f"label {label!r} is not one line of text")
         step = as_number(step, "the step", "s", above=0)
+        path = with_free(machine, path)
         count = round(path.duration / step)
         if count < 1 or abs(count * step - path.duration) > 1e-9 * path.duration:
             raise InputError(f"the step of {step:g} s is no part of {path.duration:g} s")
@@ -176,7 +177,8 @@ class Rig:
                 ("true_velocity", v, VELOCITY_UNITS[unit]),
                 ("true_force", force, FORCE_UNITS[unit]),
             ):  # fmt: skip
-                channels[f"{name}_{joint}"], units[f"{name}_{joint}"] = values[:, i], of
+                if joint not in machine.free or name in ("true", "true_velocity"):
+                    channels[f"{name}_{joint}"], units[f"{name}_{joint}"] = values[:, i], of
         if machine.tip is not None:
             known_tip, tip = Kinematics(machine).position(measured), Kinematics(plant)
             true_tip = tip.positions(postures)
@@ -194,6 +196,7 @@ class Rig:
             channel_units=units,
             machine=machine.call,
             task=": ".join(filter(None, (f"virtual rig, seed {self.seed}", label))),
+            free=machine.free,
         )
 
     def _follow(
@@ -201,7 +204,7 @@ class Rig:
     ) -> tuple[Array, Array, Array, Array, Array]:
         """Measured coordinates, commands, forces, postures (., nq) and velocities, all (., n)."""
         control, sensors = PI(self.machine, path), list(self.sensors.values())
-        kp, ki = np.split(control.settings, 2)
+        kp, ki = (self.machine.spread(x, "gains") for x in np.split(control.settings, 2))
         noise = noise * [s.noise for s in sensors]
         plant, dynamics = self.plant, Dynamics(self.plant)
         n, nq, active = len(plant.active), plant.model.nq, plant.closure.active
@@ -211,7 +214,7 @@ class Rig:
         state = np.concatenate([plant.closure.solve(reference[0]), np.zeros(n + 2)])
         now = steps.slow.layout.view(state)
         rows = np.empty((substeps, row_layout(plant, held, 0).size))
-        integral = control.start(reference[0])
+        integral = self.machine.spread(control.start(reference[0]), "the integral")
         measured, command, force = (np.empty_like(reference) for _ in range(3))
         postures, v = np.empty((len(reference), nq)), np.empty_like(reference)
         for k in range(len(reference)):
@@ -222,7 +225,7 @@ class Rig:
             integral = integral + step * error
             force[k] = np.minimum(np.maximum(command[k], -self.limits), self.limits)
             postures[k], v[k] = now.q, now.v_a
-            held.settings[:] = force[k]
+            held.settings[:] = force[k, plant.driven]
             if k < len(reference) - 1:
                 times = k * step + h * np.arange(substeps, dtype=np.float64)
                 try:
@@ -247,10 +250,10 @@ class _Held(Law):
 
     def __init__(self, machine: Machine):
         super().__init__(machine)
-        self.settings = np.zeros(len(machine.active))
+        self.settings = np.zeros(len(machine.driven_joints))
 
     def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
-        return at.settings, ()
+        return self.spread(at.settings), ()
 
 
 def _velocity(q: Array, step: float) -> Array:

@@ -76,7 +76,7 @@ def add_loops(
     with staging(file.parent) as part:
         draft.write(part, file.name)
         closed = _closed(part / file.name, found)
-        driven = [joint for joint in closed.active if joint not in closed.free]
+        driven = closed.driven_joints
         draft.data |= {
             "active": [*(spec.active or driven)], "free": list(closed.free),
             "home": dict(zip(closed.joints, closed.home.tolist(), strict=True)),

@@ -259,7 +259,7 @@ def _driven(machine: Machine) -> list[str]:
     """Joints under `active`: drives in surplus are among them."""
     if machine.motors and all(list(x.factors.values()) == [1.0] for x in machine.motors):
         return [joint for motor in machine.motors for joint in motor.factors]
-    return [joint for joint in machine.active if joint not in machine.free]
+    return list(machine.driven_joints)
 
 
 def _numbers(item: Any, *without: str) -> dict[str, Any]:

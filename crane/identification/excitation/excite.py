@@ -203,6 +203,12 @@ def excite(
     period = as_number(period, "the period", "s", above=0)
     step = as_number(step, "the step", "s", above=0)
     seed = as_seed(seed)
+    if machine.free:
+        held = " ".join(f"--lock {joint}=VALUE" for joint in machine.free)
+        raise InputError(
+            f"nothing drives {', '.join(map(repr, machine.free))}, and a planned motion needs all "
+            f"joints where it wants them: hold what is free ({held})"
+        )
     # friction that jumps has no gradient to search along
     smooth = model or Model(_smoothed(machine))
     model = model or Model(machine)

@@ -123,6 +123,7 @@ def check(
     v: Array | None = None,
     limits: Array | None = None,
     longest_delay: float = 0.05,
+    free: Sequence[str] = (),
     trust: bool = False,
 ) -> None:
     """Refuse a recording that cannot serve an identification.
@@ -136,6 +137,7 @@ def check(
         v: Recorded velocities (N, n), compared with those of q.
         limits: Lowest and highest coordinate (n, 2).
         longest_delay: [s] between recorded velocity and q; a filter in the sensor makes some.
+        free: Those of the joints whose force is known to be zero.
         trust: Whether to tell only what is most likely wrong, and refuse what cannot be used.
 
     Raises:
@@ -146,7 +148,7 @@ def check(
     if all(np.ptp(x) == 0 or np.var(np.diff(x)) >= np.var(x) for x in q.T):
         raise RecordingError("no joint moves, record a motion")
     for i, joint in enumerate(joints):
-        if np.ptp(tau[:, i]) == 0 and np.ptp(q[:, i]) > 0:
+        if joint not in free and np.ptp(tau[:, i]) == 0 and np.ptp(q[:, i]) > 0:
             doubt(f"'{joint}_force' is constant while '{joint}' moves, check it", trust)
         if limits is not None:
             _check_range(q[:, i], limits[i], joint, units[joint], trust)

@@ -68,6 +68,7 @@ def delays(model: Model, base: Base, motion: Motion, slow: Array) -> tuple[Array
     stuck = ~moving(motion.v, np.maximum(slow, _SLOW * np.abs(motion.v).max(axis=0)))[chosen]
     kept = ~binary_dilation(stuck, np.ones((2 * reach + 1, 1), dtype=bool))
     kept[:reach] = kept[-reach:] = False
+    kept[:, ~model.machine.driven] = False  # a force that is zero has no time
     rows = np.zeros_like(kept)
     rows[::_THINNED] = kept[::_THINNED]
     if rows.sum() < 4 * (W.shape[2] + n):

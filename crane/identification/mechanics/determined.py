@@ -50,6 +50,9 @@ def sizes_of(model: Model, base: Base, factors: Array) -> Array:
         mass, length = size if min(size) > 0 else usual
         out[10 * i : 10 * i + 10] = mass * np.array([1.0, *[length] * 3, *[length**2] * 6])
     force = np.linalg.norm(factors[:, :, -1], axis=1)
+    # where nothing drives, what the described parts of the force are that add up to nothing
+    parts = np.linalg.norm(factors[:, :, :-1], axis=1) * base.values(model.nominal)
+    force = np.where(force > 0, force, np.linalg.norm(parts, axis=1))
     alone = np.linalg.norm(factors[:, :, :-1] @ base.grouping[:, count:], axis=1)
     there = alone > 1e-9 * alone.max(axis=0, initial=0.0)
     share = np.divide(force[:, None], alone, out=np.full_like(alone, np.inf), where=there)

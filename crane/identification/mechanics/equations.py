@@ -13,6 +13,8 @@ from crane.identification.estimation.regressor import add_rows, triangular
 from crane.identification.mechanics.base import Base
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.result import ForceComparison
+from crane.identification.mechanics.term import Samples
+from crane.identification.mechanics.undriven import related
 from crane.identification.signals.motion import Motion, filter_kernel, filter_rows, moving
 
 _FEWEST = 5.0  # periods of the filter's cutoff in a recording
@@ -89,6 +91,7 @@ class Equations:
         bandwidth: [Hz] of the low-pass.
         slow: (n,) velocities below which rows do not count.
         progress: Takes the finished share of each pass over the motions.
+        values: (r,) at which rows of free joints are taken, see `undriven`; as they are without.
 
     Attributes:
         time: (M,) instants that are left [s]; those of a motion after another follow it.
@@ -109,9 +112,11 @@ class Equations:
         bandwidth: float,
         slow: Array,
         progress: Progress | None = None,
+        values: Array | None = None,
     ):
         self.base, self.bandwidth, self.slow = base, bandwidth, slow
-        self._model, self._progress = model, progress
+        self._model, self._progress, self._values = model, progress, values
+        self._motions = motions
         self._parts = [_Part(motion, bandwidth, slow) for motion in motions]
         self.moving = np.concatenate([part.moving for part in self._parts])
         self.time = _one_after_the_other(
@@ -128,6 +133,11 @@ class Equations:
                 self._blocks.append(_Block(part, rows, span))
             first += len(part)
         self._held: dict[int, Array] = {}
+
+    def at(self, values: Array) -> "Equations":
+        """The same with rows of free joints taken at values (r,), see `undriven`."""
+        same = self._model, self.base, self._motions, self.bandwidth, self.slow, self._progress
+        return Equations(*same, values)
 
     def blocks(self, backwards: bool = False) -> Iterator[tuple[slice, Array]]:
         """Which of the instants, and W there (L, n, r)."""
@@ -172,11 +182,21 @@ class Equations:
             at = self._model.samples(q, v, a, part.step, (0,) if low == 0 else ())
             at = dataclasses.replace(at, memory=memory)
             here = both[low - start : high - start]
-            here[:, :, :-1] = self._model.regressor(at)[:, :, self.base.independent]
-            here[:, :, -1] = self._model.known(at)
+            here[:, :, :-1], here[:, :, -1] = self._sides(at)
             if high == first:
                 following[0].memory = dict(memory)
         return both
+
+    def _sides(self, at: Samples) -> tuple[Array, Array]:
+        """W (N, n, r) and known forces (N, n)."""
+        model = self._model
+
+        def sides(at: Samples) -> tuple[Array, Array]:
+            return model.regressor(at)[:, :, self.base.independent], model.known(at)
+
+        if self._values is None:
+            return sides(at)
+        return related(sides, at, np.flatnonzero(~model.machine.driven), self._values)
 
     def thinned(self) -> list[Motion]:
         """The motions at the instants that are left, with the filtered forces."""

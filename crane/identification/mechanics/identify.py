@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from crane.common.errors import CraneWarning, InputError, RecordingError, known
 from crane.common.samples import Array, as_number, as_sample
 from crane.identification.estimation.estimators import (
+    Estimate,
     Prior,
     conditions,
     huber,
@@ -28,6 +29,7 @@ from crane.identification.mechanics.checks import doubt
 from crane.identification.mechanics.delays import delays
 from crane.identification.mechanics.determined import advice, magnitudes, sizes_of
 from crane.identification.mechanics.equations import Equations, Progress, long_enough
+from crane.identification.mechanics.inertias import body_names
 from crane.identification.mechanics.laws import Frictional
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.possible import possible
@@ -36,6 +38,7 @@ from crane.identification.mechanics.reading import smoothed_motion
 from crane.identification.mechanics.result import Identification
 from crane.identification.mechanics.term import Term
 from crane.identification.mechanics.terms import Changes
+from crane.identification.mechanics.undriven import settled
 from crane.identification.signals.motion import Motion
 from crane.identification.signals.spectrum import below
 from crane.machine import Machine
@@ -125,13 +128,21 @@ def identify(
     sizes = sizes_of(model, told, columns.factors(rows.y, rows.groups))
     before = _prior(model, prior, rows.base, sizes, feasible)
     parameters = None
-    if before is None or feasible:
-        estimate = METHODS[method](columns, rows.y, rows.groups, rows.samples)
-    else:
-        every = rows.columns(selection @ told.grouping)
-        told_by = np.vstack(list(rows.factors[:, :, :-1] @ selection @ told.grouping))
-        check_told(model.names, told_by, before)
-        estimate = METHODS[method](every, rows.y, rows.groups, rows.samples, before)
+    pull, T = (None, selection) if feasible else (before, selection)
+    if before is None:
+        _check_scale(machine, rows)
+    elif not feasible:
+        T = selection @ told.grouping
+        check_told(model.names, np.vstack(list(rows.factors[:, :, :-1] @ T)), before)
+
+    def estimated(values: Array) -> tuple[Estimate, Array]:
+        nonlocal rows
+        rows = rows.at(values) if machine.free else rows
+        found = METHODS[method](rows.columns(T), rows.y, rows.groups, rows.samples, pull)
+        return found, T @ found.values
+
+    start = rows.base.values(model.nominal)
+    estimate = settled(estimated, start) if machine.free else estimated(start)[0]
     values, covariance = estimate.values, estimate.covariance
     if feasible:
         estimate = possible(model, told, rows, selection, estimate, before)
@@ -149,7 +160,7 @@ def identify(
         advice(machine, motions),
     )
     speeds = _speeds(model, motions, limits)
-    del rows, columns, motions
+    del rows, motions
     if validation is not None:
         others = motions_of(machine, validation, trust, progress, "validation")
         judging = [motion for motion in others if long_enough(motion, bandwidth)]
@@ -171,6 +182,21 @@ def identify(
     elif found.doubt:
         warnings.warn(found.doubt, CraneWarning, stacklevel=2)
     return found
+
+
+def _check_scale(machine: Machine, rows: Equations) -> None:
+    """See that not all forces are known to be zero.
+
+    Raises:
+        RecordingError: They are.
+    """
+    if machine.free and not rows.y.any():
+        body = body_names(machine)[-1]
+        raise RecordingError(
+            "nothing drives what moves in this recording: it tells ratios of masses, not masses; "
+            f"say what one is known to be, as prior={{'{body}.m': '100 +- 1'}} "
+            f"(--prior {body}.m=100+-1)"
+        )
 
 
 def _tell_short(others: Sequence[Motion], judging: Sequence[Motion], bandwidth: float) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from crane.common.errors import InputError, RecordingError, known
 from crane.common.samples import Array
 from crane.dynamics import Dynamics
-from crane.identification.estimation.estimators import Estimate
+from crane.identification.estimation.estimators import Estimate, Prior
 from crane.identification.estimation.regressor import triangular
 from crane.identification.mechanics.against import check_forces
 from crane.identification.mechanics.base import Base
@@ -30,6 +30,7 @@ from crane.identification.mechanics.statics import (
     weights_cutoff,
 )
 from crane.identification.mechanics.term import Samples
+from crane.identification.mechanics.undriven import settled
 from crane.identification.signals.motion import Motion
 from crane.machine import Machine
 from crane.recordings.recording import Recording
@@ -164,7 +165,7 @@ class _Case:
         moved = Motion(thinned.time, q, v, a, tau)
         check_forces(moved, rows.offset[:, moves], self.names, trust=trust)
         columns = rows.selection(base)
-        found = METHODS[self.method](rows.columns(columns), rows.y, rows.groups, rows.samples)
+        rows, found = self._estimated(rows, columns, None)
         told, directions = _told(base)
         if not told[:, 0].any():
             raise _NotToldError("this motion does not tell the mass, move all joints")
@@ -205,9 +206,7 @@ class _Case:
             band = max(sticking(self.machine, joint), least)
             std.append(band if joint in self.one_way else math.inf)
         prior = np.zeros(len(std)), np.array(std)
-        found = METHODS[self.method](
-            rows.columns(columns), rows.y, rows.groups, rows.samples, prior
-        )
+        rows, found = self._estimated(rows, columns, prior)
         change = np.zeros((4, len(std)))
         change[0, 0] = 1.0
         covariance, freedom = _widened(rows, columns, found, change, np.diag(1 / prior[1]))
@@ -226,6 +225,23 @@ class _Case:
         if estimate.static is not None:  # two answers are as uncertain as they are apart
             covariance[0, 0] += (estimate.static[0] - estimate.mass) ** 2
         return estimate
+
+    def _estimated(
+        self, rows: Equations, columns: Array, prior: Prior | None
+    ) -> tuple[Equations, Estimate]:
+        """What rows tell, and they as they tell it."""
+
+        def estimated(values: Array) -> tuple[Estimate, Array]:
+            nonlocal rows
+            rows = rows.at(values) if self.machine.free else rows
+            found = METHODS[self.method](
+                rows.columns(columns), rows.y, rows.groups, rows.samples, prior
+            )
+            return found, columns @ found.values
+
+        nothing = np.zeros(len(columns))
+        found = settled(estimated, nothing) if self.machine.free else estimated(nothing)[0]
+        return rows, found
 
     def _weighs(self, motion: Motion) -> bool:
         """Whether the weight of a point loads a drive that moves."""

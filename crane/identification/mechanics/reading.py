@@ -20,7 +20,7 @@ from crane.identification.signals.motion import Derivatives, Motion, differentia
 from crane.identification.signals.outliers import outliers, repaired
 from crane.machine import Machine
 from crane.recordings.measured import moved_locks
-from crane.recordings.recording import FORCE, VELOCITY_UNITS, Recording
+from crane.recordings.recording import FORCE, VELOCITY, VELOCITY_UNITS, Recording, derivative
 
 _MOVES = 3.0  # standard deviations of a joint's velocity, above which it moves
 _TOO_FAST = 30.0  # times its limit, at which no joint moves
@@ -51,17 +51,15 @@ def smoothed_motion(
     Raises:
         RecordingError: What is recorded cannot serve; the message names column and time.
     """
-    order = _columns(machine, recording)
+    recording = _of_machine(machine, recording)
     every = {x: column for x, column in recording.columns().items() if x in machine.locks}
     for text in moved_locks(machine, every, recording.units | recording.channel_units):
         doubt(f"{text}, do not lock it, or lock it where it is", trust)
-    time, n = recording.time, len(order)
+    time, n = recording.time, len(machine.active)
     check_samples(time)
     names = [x + suffix for suffix in ("", FORCE) for x in machine.active]
-    columns = without_outliers(
-        time, names, np.column_stack([recording.q[:, order], recording.tau[:, order]]), trust
-    )
-    _check(machine, time, columns, recording.v[:, order], trust)
+    columns = without_outliers(time, names, np.hstack([recording.q, recording.tau]), trust)
+    _check(machine, time, columns, recording.v, trust)
     time, columns = evenly(time, columns)
     step = float(np.median(np.diff(time)))
     lowest = _HUM * motion_frequency(columns[:, :n], step)
@@ -73,13 +71,17 @@ def smoothed_motion(
     return Motion(time, found.q, v, a, columns[:, n:], _passed(found))
 
 
-def _columns(machine: Machine, recording: Recording) -> list[int]:
-    """Which of a recording's joints the machine's active ones are.
+def _of_machine(machine: Machine, recording: Recording) -> Recording:
+    """Of a recording what belongs to the machine's active joints, in their order.
+
+    Free joints may be among the channels: their force is known to be zero.
 
     Raises:
-        RecordingError: One is missing, or in another unit.
+        RecordingError: One is missing, or in another unit, or a free one has a force.
     """
-    missing = [joint for joint in machine.active if joint not in recording.joints]
+    every, units = recording.columns(), recording.units | recording.channel_units
+    there = {*recording.joints, *(x for x in machine.free if x in every)}
+    missing = [joint for joint in machine.active if joint not in there]
     if missing:
         listed = ", ".join(f"'{joint}'" for joint in missing)
         held = " ".join(f"--lock {joint}=VALUE" for joint in missing)
@@ -88,11 +90,17 @@ def _columns(machine: Machine, recording: Recording) -> list[int]:
             f"held ({held})"
         )
     for joint in machine.active:
-        if recording.units[joint] != machine.unit(joint):
+        if units[joint] != machine.unit(joint):
             raise RecordingError(
-                f"'{joint}' is recorded in {recording.units[joint]}, give {machine.unit(joint)}"
+                f"'{joint}' is recorded in {units[joint]}, give {machine.unit(joint)}"
             )
-    return [recording.joints.index(joint) for joint in machine.active]
+    none = np.zeros_like(recording.time)
+    q = np.column_stack([every[joint] for joint in machine.active])
+    tau = np.column_stack([every.get(joint + FORCE, none) for joint in machine.active])
+    rates = [every.get(x + VELOCITY, derivative(every[x], recording.time)) for x in machine.active]
+    v = np.column_stack(rates)
+    known_as = {joint: machine.unit(joint) for joint in machine.active}
+    return Recording(recording.time, machine.active, q, v, tau, known_as, free=machine.free)
 
 
 def _check(machine: Machine, time: Array, columns: Array, v: Array, trust: bool) -> None:
@@ -104,7 +112,8 @@ def _check(machine: Machine, time: Array, columns: Array, v: Array, trust: bool)
     limits = np.column_stack([machine.lower, machine.upper])
     bounded = limits if np.isfinite(limits).all() else None
     units = {joint: machine.unit(joint) for joint in machine.active}
-    check(time, q, tau, machine.active, units, recorded, bounded, trust=trust)
+    free = machine.free
+    check(time, q, tau, machine.active, units, recorded, bounded, free=free, trust=trust)
 
 
 def _check_speeds(machine: Machine, v: Array, trust: bool) -> None:

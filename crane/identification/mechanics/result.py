@@ -1,5 +1,6 @@
 """What an identification found, and how well it predicts."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -53,7 +54,7 @@ class ForceComparison(Brief):
 
     @property
     def relative(self) -> Array:
-        """(n,) the same over the root mean square of the measured force."""
+        """(n,) the same over the root mean square of the measured force, nan of a free joint."""
         size = self._rms(self.measured)
         return np.divide(self.rmse, size, out=np.full_like(size, np.nan), where=size > 0)
 
@@ -64,9 +65,9 @@ class ForceComparison(Brief):
 
     @property
     def stacked(self) -> float:
-        """Norm of all residuals over that of all measured forces."""
-        kept = self.moving
-        return float(np.linalg.norm(self.residuals[kept]) / np.linalg.norm(self.measured[kept]))
+        """Norm of all residuals over that of all measured forces, nan where these are zero."""
+        left, size = (np.linalg.norm(x[self.moving]) for x in (self.residuals, self.measured))
+        return float(left / size) if size else math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,10 +114,15 @@ class Identification:
     def __repr__(self) -> str:
         """What was identified, how, and how well it predicts."""
         kind = "feasible, " if self.feasible else ""
-        judged = "" if self.validation is None else f", validation {self.validation.stacked:.3%}"
+        fits = {"error": self.training, "validation": self.validation}
+        told = (
+            f", {name} {fit.stacked:.3%}"
+            for name, fit in fits.items()
+            if fit is not None and not math.isnan(fit.stacked)
+        )
         return (
             f"Identification of '{self.machine.name}': {len(self.values)} base parameters, "
-            f"{kind}{self.method}, error {self.training.stacked:.3%}{judged}"
+            f"{kind}{self.method}{''.join(told)}"
         )
 
     @property
@@ -225,13 +231,15 @@ class Identification:
             rows = [["force", "RMS error", "", "relative", "PE (9)"]]
             for i, joint in enumerate(fit.joints):
                 unit = "N" if self.machine.unit(joint) == "m" else "N m"
-                relative = f"{100 * fit.relative[i]:.2f} %"
-                squared = f"{fit.percentage_error[i]:.3f} %"
-                told = [joint, f"{fit.rmse[i]:.4g}", unit, relative, squared]
+                shares = [f"{100 * fit.relative[i]:.2f} %", f"{fit.percentage_error[i]:.3f} %"]
+                if joint in self.machine.free:
+                    shares = ["free", ""]
+                told = [joint, f"{fit.rmse[i]:.4g}", unit, *shares]
                 rows.append(told if fit.moving[:, i].any() else [joint, "-", "", "-", "-"])
-            mean = f"{100 * np.nanmean(fit.relative):.2f} %"
-            rows.append(["mean of the joints", "", "", mean, ""])
-            rows.append(["all, stacked", "", "", f"{100 * fit.stacked:.2f} %", ""])
+            if not np.isnan(fit.stacked):
+                mean = f"{100 * np.nanmean(fit.relative):.2f} %"
+                rows.append(["mean of the joints", "", "", mean, ""])
+                rows.append(["all, stacked", "", "", f"{100 * fit.stacked:.2f} %", ""])
             lines += [f"{title}, moving rows", *aligned(rows, (0, 2)), ""]
         rows = [["parameter", "value", "std", "rel. std", "description", ""]]
         for name, value, std, before, mark in zip(

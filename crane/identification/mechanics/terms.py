@@ -46,7 +46,7 @@ KINDS = {
 
 
 def default_terms(machine: Machine) -> list[Term]:
-    """Bodies; four coefficients of friction per active joint, viscous friction of passive ones."""
+    """Bodies; four coefficients of friction per driven joint, viscous friction of all others."""
     return _built(machine, _default(machine))
 
 
@@ -113,7 +113,7 @@ def combined(name: str) -> Direction | None:
 def _default(machine: Machine) -> dict[str, dict[str, Numbers]]:
     """Numbers of the default terms, by where and kind."""
     wanted: dict[str, dict[str, Numbers]] = {
-        joint: dict.fromkeys(_ACTIVE, ()) for joint in machine.active
+        joint: dict.fromkeys(_ACTIVE, ()) for joint in machine.driven_joints
     }
     for joint in machine.joints:
         law = machine.friction.get(joint)

@@ -64,7 +64,7 @@ def workspace(
 
     Raises:
         InputError: Fewer than 100 samples or more than a million, an unknown frame, no tip, or a
-            frame that no active joint moves.
+            frame that no driven joint moves.
     """
     samples, seed = as_count(samples, "the number of samples", 100, _MOST), as_seed(seed)
     kinematics = Kinematics(machine, frame)
@@ -74,7 +74,7 @@ def workspace(
     held = None if slew is None else slew[0]
     strokes = _strokes(machine, kinematics, low, high, held, random)
     if not strokes:
-        raise InputError(f"no active joint moves '{kinematics.frame}', name another frame")
+        raise InputError(f"no driven joint moves '{kinematics.frame}', name another frame")
     patches, counted = _patches(machine, strokes, low, high, samples, random)
     q = np.concatenate([patch.q[patch.closed] for patch in patches])
     tips = kinematics.positions(q)
@@ -148,7 +148,7 @@ def _strokes(
     held: int | None,
     random: np.random.Generator,
 ) -> list[int]:
-    """Active joints that move the frame or open loops, the slewing joint left out."""
+    """Driven joints that move the frame or open loops, the slewing joint left out."""
     closure = machine.closure
     postures = [machine.home]
     for _ in range(8):
@@ -160,8 +160,9 @@ def _strokes(
         slopes = np.abs(kinematics.tree_jacobian(q) @ gamma * units).max(axis=0)
         moves = np.maximum(moves, slopes)
     coupled = np.abs(closure.gamma(machine.home)[closure.passive]).max(axis=0, initial=0.0) > 0
-    linked = [i for i in range(len(moves)) if moves[i] > _MOVES or coupled[i]]
-    return [i for i in linked if i != held] if moves.max() > _MOVES else []
+    moves[~machine.driven] = 0.0
+    linked = [i for i in np.flatnonzero(machine.driven) if moves[i] > _MOVES or coupled[i]]
+    return [int(i) for i in linked if i != held] if moves.max() > _MOVES else []
 
 
 def _patches(

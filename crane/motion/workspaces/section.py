@@ -65,7 +65,7 @@ def upwards(machine: Machine) -> Array:
 
 
 def slewing(machine: Machine, frame: str) -> tuple[int, Array] | None:
-    """The active joint that slews all that carries the frame, and a point on its axis.
+    """The driven joint that slews all that carries the frame, and a point on its axis.
 
     It stands on the ground, turns about the vertical, and moves no passive joint.
     """
@@ -82,7 +82,8 @@ def slewing(machine: Machine, frame: str) -> tuple[int, Array] | None:
         joint = model.getJointId(name)
         axis = jacobian[3:, column]
         if (
-            model.parents[joint] == 0
+            machine.driven[i]
+            and model.parents[joint] == 0
             and joint in carrying
             and machine.unit(name) == "rad"
             and not np.abs(gamma[machine.closure.passive, i]).any()

@@ -19,8 +19,8 @@ import numpy as np
 from crane.closure.choice import choose, motions, scales
 from crane.closure.structure import Indices
 from crane.closure.traced import folded
-from crane.codegen.scalar import Number, dot
-from crane.common.errors import ClosureError, MechanismError
+from crane.codegen.scalar import Expression, Number, dot
+from crane.common.errors import ClosureError, InputError, MechanismError
 from crane.common.samples import Array
 from crane.dynamics import Dynamics
 from crane.dynamics.external import ExternalForces, form_of
@@ -41,18 +41,20 @@ class Chart:
         dynamics: Of the machine in the chart's coordinates.
         seen: (n,) columns of the joints whose coordinates and forces are the user's.
         sticking: What the joints do whose friction sticks, the same in all charts of a run.
+        free: Those of the user's joints that nothing drives.
     """
 
     dynamics: Dynamics
     seen: Indices
     sticking: Sticking
+    free: tuple[str, ...]
 
     @classmethod
     def of(cls, dynamics: Dynamics) -> "Chart":
         """The user's coordinates of a machine."""
         machine, forces = dynamics.machine, dynamics.forces
         sticking = Sticking(machine, forces.sticking, forces.breakaway)
-        return cls(dynamics, machine.closure.active, sticking)
+        return cls(dynamics, machine.closure.active, sticking, machine.free)
 
     @property
     def machine(self) -> Machine:
@@ -70,6 +72,22 @@ class Chart:
         dynamics = self.dynamics
         outside = form_of(self.machine)
         return folded(dynamics.pattern), dynamics.form, tuple(self.seen.tolist()), outside
+
+    def check_free(self, tau: Sequence[Number], when: str = "") -> None:
+        """See that no free joint gets a force (n,), in numbers or formulas.
+
+        Raises:
+            InputError: One does.
+        """
+        for column, force in zip(self.seen.tolist(), tau, strict=True):
+            joint = self.machine.joints[column]
+            if joint not in self.free or (not isinstance(force, Expression) and force == 0):
+                continue
+            size = "" if isinstance(force, Expression) else f" of {force:.3g}"
+            raise InputError(
+                f"the controller gives the free joint '{joint}' a force{size}{when}: give "
+                "it 0.0, or name it under active if something drives it"
+            )
 
     def turns(self, q: Array) -> Array:
         """C (n, n) of closed postures (nq,) or (N, nq): v_A = C v_B."""
@@ -167,4 +185,4 @@ class Chart:
         except MechanismError:
             return None
         dynamics = Dynamics(machine, self.dynamics.formulation, self.dynamics.backend)
-        return Chart(dynamics, self.seen, self.sticking)
+        return Chart(dynamics, self.seen, self.sticking, self.free)

@@ -152,4 +152,6 @@ class PythonStepper:
                 f"rates of the shape {np.shape(rate)}, give {v_a.shape} and {at.own.shape}: "
                 "one per active joint, one per state"
             )
+        if self._chart.free:
+            self._chart.check_free(np.asarray(tau).tolist(), f" at t = {time:g} s")
         return np.asarray(tau), rate

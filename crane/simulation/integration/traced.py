@@ -172,7 +172,7 @@ class Stepper:
         self._columns, self._fold = own + sum(counts_of(machine.external)), fold
         self._sticks = bool(chart.sticking.columns)
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
-        form = form_of(control, own, len(machine.active), states, fold)
+        form = form_of(control, own, chart, states, fold)
         key = (*method, form, states, *chart.formulas)
         if key not in self._fast.programs:
             self._fast.programs[key] = program_of(machine, control, self._fast, key, self._build)
@@ -243,17 +243,19 @@ def wrapped(chart: Chart, state: Sequence[Number]) -> list[Number]:
     return out
 
 
-def form_of(control: TracedController, columns: int, n: int, states: int, fold: bool) -> Hashable:
+def form_of(
+    control: TracedController, columns: int, chart: Chart, states: int, fold: bool
+) -> Hashable:
     """All that a controller's formulas are, so that equal ones share their machine code.
 
-    They are traced by themselves, for rows of so many references, n active joints and so many
-    states, what the machine makes of accelerations left open. With `fold`, zeros and ones of the
-    settings become part of them.
+    They are traced by themselves, for rows of so many references, the active joints of a chart's
+    user and so many states, what the machine makes of accelerations left open. With `fold`, zeros
+    and ones of the settings become part of them.
 
     Raises:
-        InputError: There are too few or too many of them.
+        InputError: There are too few or too many of them, or a free joint gets a force.
     """
-    tape = Tape()
+    tape, n = Tape(), len(chart.seen)
     asked: list[Number] = []
 
     def inverse(a_a: Sequence[Number], friction: bool) -> list[Number]:
@@ -270,6 +272,7 @@ def form_of(control: TracedController, columns: int, n: int, states: int, fold: 
             f"the law of {type(control).__name__} gives {len(tau)} forces and {len(rates)} rates, "
             f"give {n} and {states}: one per active joint, one per state"
         )
+    chart.check_free(tau)
     seen = control.look(at) if isinstance(control, ValveDrive) else []
     outputs = [
         [x.index if isinstance(x, Expression) else float(x) for x in part]

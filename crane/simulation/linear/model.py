@@ -211,6 +211,7 @@ class LinearModel:
             channel_units={"mode_frequency": "Hz"},
             machine=machine.call,
             task="modes in slow motion",
+            free=machine.free,
         )
 
     def to_control(self) -> Any:

@@ -23,15 +23,26 @@ def trimmed(dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array) -> tuple[A
     Raises:
         SimulationError: There are none.
     """
-    if drive.states:
-        return _on_valves(_Trim(dynamics, drive, q_a, v_a))
     machine = dynamics.machine
     forces = dynamics.inverse(q_a, v_a, np.zeros(len(q_a))) + dynamics.friction(q_a, v_a)
-    driven = machine.driven.astype(bool)
-    held = np.where(driven, forces, 0.0)
+    if machine.free:
+        _check_hanging(dynamics, q_a, v_a, forces)
+    if drive.states:
+        return _on_valves(_Trim(dynamics, drive, q_a, v_a))
+    return drive.own, forces[machine.driven]
+
+
+def _check_hanging(dynamics: Dynamics, q_a: Array, v_a: Array, forces: Array) -> None:
+    """See that free joints keep their velocities while drives bear their share of forces (n,).
+
+    Raises:
+        SimulationError: One does not.
+    """
+    machine = dynamics.machine
+    held = np.where(machine.driven, forces, 0.0)
     units = machine.closure.units[machine.closure.active] / machine.closure.pace**2
     moved = np.abs(dynamics.forward(q_a, v_a, held, friction=True)) / units
-    if not driven.all() and moved.max() > _HANGS:
+    if moved.max() > _HANGS:
         worst = int(np.argmax(np.abs(forces - held)))
         joint = machine.active[worst]
         unit = FORCE_UNITS[machine.unit(joint)]
@@ -39,7 +50,6 @@ def trimmed(dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array) -> tuple[A
             f"free joint '{joint}' does not stay there, {forces[worst]:.3g} {unit} would have to "
             "hold it: linearize where it hangs still"
         )
-    return drive.own, forces[driven]
 
 
 class _Trim:

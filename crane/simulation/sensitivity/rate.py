@@ -100,7 +100,7 @@ class Rate:
         )
         # what a circuit has not is 0 among its settings, and no part of the formulas
         self._settings = np.where(moved.settings != 0, np.nan, control.settings)
-        form = form_of(control, self._own, self._n, states, True)
+        form = form_of(control, self._own, chart, states, True)
         key = (
             type(self).__name__, form, states, stiff, *chart.formulas, self.outputs,
             *self._frames, *map(folded, (*self._folds, self._settings)),

@@ -40,8 +40,9 @@ def numbers(
     rows = []
     for i, joint in enumerate(machine.active):
         unit = FORCE_UNITS[machine.unit(joint)]
-        row = [joint, quantity(posture.gravity[i], unit)]
-        rows.append(row + ([quantity(recorded[i], unit)] if recorded is not None else []))
+        told = [posture.gravity[i], *([] if recorded is None else [recorded[i]])]
+        free = joint in machine.free
+        rows.append([joint, *("free" if free else quantity(x, unit) for x in told)])
     parts = [_table(heads, rows)]
     if posture.tip is not None:
         x, y, z = (f"{round(1e3 * value, 1) + 0.0:.1f}" for value in posture.tip)

@@ -163,7 +163,7 @@ def _actuators(machine: Machine, recording: "Recording", rows: np.ndarray) -> li
         for joint, force in forces.items()
     }
     found = []
-    for joint in (name for name in machine.active if name not in machine.free):
+    for joint in machine.driven_joints:
         index, unit = model.getJointId(joint) - 1, machine.unit(joint)
         eyes = [there for there in places if there["joint"] == index] if unit == "m" else []
         found.append(

@@ -57,7 +57,7 @@ def _summary(found: Calibration) -> str:
     names = {"on a bound": [x.name for x in found.fitted if x.bound],
              "not told": [x.name for x in found.fitted if x.vague]}  # fmt: skip
     rows = [
-        ("machine", f"{found.machine.name} ({len(found.machine.active)} drives)"),
+        ("machine", f"{found.machine.name} ({len(found.machine.driven_joints)} drives)"),
         ("fitted to", "; ".join(fitted)),
         ("held out whole", ", ".join(held)),
         ("numbers", f"{len(found.fitted)}, of which {len(told)} are told"),

@@ -201,6 +201,8 @@ def columns(machine: Machine, recording: "Recording") -> Iterator[Column]:
         rates = VELOCITY_UNITS[unit]
         wanted = reference(f"velocity_{joint}")
         yield Column(joint + VELOCITY, titles[1], joint, rates, recording.v[:, i], wanted)
+        if joint in recording.free:
+            continue
         yield Column(f"{joint}_force", titles[2], joint, FORCE_UNITS[unit], recording.tau[:, i])
     for name, values in channels.items():
         if name.startswith(_REFERENCE):

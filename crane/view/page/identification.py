@@ -67,7 +67,7 @@ def _summary(result: Identification, recording: str, validation: str) -> str:
     rows = [
         (
             "machine",
-            f"{machine.name} ({len(machine.active)} drives, {len(machine.joints)} joints)",
+            f"{machine.name} ({len(machine.driven_joints)} drives, {len(machine.joints)} joints)",
         ),
         ("its numbers", machine.source),
         ("recording", recording),
@@ -90,6 +90,8 @@ def _summary(result: Identification, recording: str, validation: str) -> str:
 
 
 def _stacked(result: Identification) -> str:
+    if np.isnan(result.training.stacked):
+        return "nothing drives it: no force to compare with"
     parts = [f"{100 * result.training.stacked:.3g} % of the forces"]
     if result.validation is not None:
         parts.append(f"{100 * result.validation.stacked:.3g} % in validation")
@@ -111,6 +113,8 @@ def _fit(result: Identification) -> str:
                 f"{100 * fit.relative[i]:.3g} %",
                 f"{fit.percentage_error[i]:.3g} %",
             ]
+            if joint in result.machine.free:
+                told[1:] = "free", ""
             row += told if fit.moving[:, i].any() else ["-", "-", "-"]
         rows.append(row)
     head = ["drive*", "RMS error", "relative", "squared"]

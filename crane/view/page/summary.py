@@ -65,8 +65,10 @@ def run_summary(machine: Machine, recording: "Recording | None") -> dict[str, An
             (
                 joint.name,
                 f"{_number(scale * joint.lowest)} to {_number(scale * joint.highest)} {unit}",
-                _quantity(joint.peak_force, FORCE_UNITS[joint.unit]),
-                _quantity(joint.rms_force, FORCE_UNITS[joint.unit]),
+                *(
+                    "free" if x is None else _quantity(x, FORCE_UNITS[joint.unit])
+                    for x in (joint.peak_force, joint.rms_force)
+                ),
             )
         )
     return {"facts": facts, "forces": forces, "limits": limits_hit(machine, recording)}

@@ -163,7 +163,11 @@ def _panels(recording: Recording, column: int) -> list[_Panel]:
     found = [
         _Panel("angle" if turns else "displacement", unit, lines(recording.q, wanted)),
         _Panel("velocity", f"{unit}/s", lines(recording.v, f"reference_velocity_{name}")),
-        _Panel("torque" if turns else "force", FORCE_UNITS[unit], lines(recording.tau)),
+        _Panel(
+            "torque" if turns else "force",
+            FORCE_UNITS[unit],
+            {} if name in recording.free else lines(recording.tau),
+        ),
     ]
     for quantity, shown, names in HYDRAULIC_ROWS:
         own = [label for label, channel in names.items() if channel.format(name) != channel]
