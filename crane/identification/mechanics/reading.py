@@ -51,9 +51,9 @@ def smoothed_motion(
     Raises:
         RecordingError: What is recorded cannot serve; the message names column and time.
     """
-    recording = _of_machine(machine, recording)
-    every = {x: column for x, column in recording.columns().items() if x in machine.locks}
-    for text in moved_locks(machine, every, recording.units | recording.channel_units):
+    given, recording = recording, _of_machine(machine, recording)
+    every = {x: column for x, column in given.columns().items() if x in machine.locks}
+    for text in moved_locks(machine, every, given.units | given.channel_units):
         doubt(f"{text}, do not lock it, or lock it where it is", trust)
     time, n = recording.time, len(machine.active)
     check_samples(time)
