@@ -127,6 +127,19 @@ def test_with_hydraulics_a_pull_is_in_the_chambers():
     assert abs(more[0]) > 1e3
 
 
+def test_the_energy_of_a_load_on_valves_is_kept():
+    machine = crane.load("patu655")
+    loads = [crane.Wrench(machine.tip, (0.0, 0.0, -500.0)), Drag(machine.tip, "drag")]
+    motion = crane.ValvePD(machine, crane.task_trajectory(machine, "reach"))
+    run = crane.simulate(machine, motion, None, 3.0, loads=loads)
+    seen = run.channels
+    work = seen["work"] + seen[f"work_{machine.tip}"] + seen["work_drag"]
+    stored = seen["kinetic"] + seen["potential"]
+    gap = work - (stored - stored[0]) - seen["dissipated"]
+    assert np.abs(gap).max() < 1e-7 * np.ptp(work)
+    assert np.ptp(seen[f"work_{machine.tip}"]) > 100.0
+
+
 def test_what_is_no_load_is_refused():
     machine = crane.load("mini_forwarder")
     tip = machine.tip

@@ -34,11 +34,13 @@ class Applied(NamedTuple):
         forces: gamma^T J^T w (n,) of all of them together.
         powers: (k,) of each [W].
         edges: Lengths [m] at whose signs some of them bend.
+        seen: (s,) of each its wrench in the world's axes and its channels.
     """
 
     forces: Vector
     powers: Vector
     edges: Vector
+    seen: Vector
 
 
 def columns_of(forces: Sequence[ExternalForce]) -> list[int]:
@@ -57,7 +59,7 @@ def form_of(machine: Machine) -> Hashable:
         here = Here(place, turn, velocity, spin, tape.loads(4, 0, count))
         outputs = [
             [x.index if isinstance(x, Expression) else float(x) for x in part]
-            for part in (*force.wrench(here), force.edges(here))
+            for part in (*force.wrench(here), force.edges(here), force.look(here))
         ]
         joint, pose = _placed(machine, force)
         out.append((repr((count, tape.operations, outputs)), joint, pose.homogeneous.tobytes()))
@@ -70,6 +72,7 @@ def traced(machine: Machine, sweep: Sweep, references: Sequence[Number]) -> Appl
     total: Vector = [0.0] * len(machine.active)
     powers: Vector = []
     edges: Vector = []
+    seen: Vector = []
     back, first = transposed(posture.rotation[0]), 0  # formulas are seen from the trunk
     for force, count in zip(machine.external, columns_of(machine.external), strict=True):
         joint, pose = _placed(machine, force)
@@ -91,13 +94,15 @@ def traced(machine: Machine, sweep: Sweep, references: Sequence[Number]) -> Appl
         )  # fmt: skip
         first += count
         edges += force.edges(here)
-        push, moment = (times(posture.rotation[0], list(part)) for part in force.wrench(here))
+        acting = [list(part) for part in force.wrench(here)]
+        seen += [*acting[0], *acting[1], *force.look(here)]
+        push, moment = (times(posture.rotation[0], part) for part in acting)
         powers.append(dot(push, velocity) + dot(moment, spin))
         about = add(moment, cross(at, push))
         for i in carriers:
             linear, angular = posture.columns[i]
             total = add(total, scale(dot(push, linear) + dot(about, angular), sweep.gamma[i]))
-    return Applied(total, powers, edges)
+    return Applied(total, powers, edges, seen)
 
 
 class ExternalForces:
@@ -110,7 +115,7 @@ class ExternalForces:
     def __init__(self, machine: Machine):
         self._forces, self._jacobians = machine.external, FrameJacobians(machine)
 
-    def along(self, time: float, q: Array, v: Array) -> tuple[Array, Array]:
+    def along(self, time: float, q: Array, v: Array) -> tuple[Array, Array, Array]:
         """J^T w along the joints.
 
         Args:
@@ -119,36 +124,20 @@ class ExternalForces:
             v: (nv,) velocities of all joints.
 
         Returns:
-            (nv,) of all together, and powers (k,) of each [W].
+            (nv,) of all together, powers (k,) of each [W], and what is seen, see `Applied`.
         """
         self._jacobians.place(q)
         total, powers = np.zeros(len(v)), np.empty(len(self._forces))
+        seen: Vector = []
         for k, force in enumerate(self._forces):
             jacobian = self._jacobians.of(force.frame)
             here = self._here(force, v, force.references(np.array([time]))[0])
             push, moment = force.wrench(here)
+            seen += [*push, *moment, *force.look(here)]
             wrench = np.array([*push, *moment], dtype=np.float64)
             total += jacobian.T @ wrench
             powers[k] = wrench @ (jacobian @ v)
-        return total, powers
-
-    def seen(self, instants: Array, q: Array, v: Array) -> list[Array]:
-        """Of each force (N, 6 + c) its wrench in the world's axes and its channels.
-
-        Args:
-            instants: (N,) [s].
-            q: (N, nq) closed postures.
-            v: (N, nv) velocities of all joints.
-        """
-        references = [force.references(instants) for force in self._forces]
-        out = [np.empty((len(instants), 6 + len(force.channels))) for force in self._forces]
-        for i, (posture, velocity) in enumerate(zip(q, v, strict=True)):
-            self._jacobians.place(posture)
-            for force, rows, row in zip(self._forces, out, references, strict=True):
-                here = self._here(force, velocity, row[i])
-                push, moment = force.wrench(here)
-                rows[i] = np.array([*push, *moment, *force.look(here)], dtype=np.float64)
-        return out
+        return total, powers, np.array(seen, dtype=np.float64)
 
     def _here(self, force: ExternalForce, v: Array, reference: Array) -> Here:
         """What a force sees at the posture that was placed last."""

@@ -8,7 +8,6 @@ from crane.codegen import Parts
 from crane.common.samples import Array
 from crane.control import Controller, Free, Signals, ValveDrive, reference_of
 from crane.description.external import PARTS
-from crane.dynamics.external import ExternalForces
 from crane.dynamics.joint_forces import sticking
 from crane.hydraulics.circuit import BALANCES
 from crane.machine import Machine
@@ -76,7 +75,7 @@ def _channels(machine: Machine, control: Controller, time: Array, rows: Parts) -
     names = {"kinetic": "kinetic", "potential": "potential", "work": "work", "dissipated": "lost"}
     for name, part in names.items():
         yield name, getattr(rows, part)[:, 0], "J"
-    yield from _outside(machine, time, rows)
+    yield from _outside(machine, rows)
     if isinstance(control, ValveDrive):
         integrals = rows.own[:, -len(BALANCES) :]
         units = [*control.channels, *BALANCES.items()]
@@ -84,18 +83,14 @@ def _channels(machine: Machine, control: Controller, time: Array, rows: Parts) -
             yield name, values, unit
 
 
-def _outside(machine: Machine, time: Array, rows: Parts) -> Iterator[Column]:
+def _outside(machine: Machine, rows: Parts) -> Iterator[Column]:
     """What acts from outside, in the world's axes at the origins of frames, and its work."""
-    if not machine.external:
-        return
-    velocities = np.einsum("nij,nj->ni", machine.closure.gamma(rows.q), rows.v_a)
-    seen = ExternalForces(machine).seen(time, rows.q, velocities)
+    columns = iter(rows.outside.T)
     for k, force in enumerate(machine.external):
-        wrench, more = np.split(seen[k], [len(PARTS)], axis=1)
-        for part, values in zip(PARTS, wrench.T, strict=True):
+        for part, values in zip(PARTS, columns, strict=False):
             if part.startswith("force") or values.any():
                 yield f"load_{force.name}_{part}", values, "N" if "force" in part else "N m"
-        for (name, unit), values in zip(force.channels, more.T, strict=True):
+        for (name, unit), values in zip(force.channels, columns, strict=False):
             yield name, values, unit
         yield f"work_{force.name}", rows.work[:, 1 + k], "J"
 

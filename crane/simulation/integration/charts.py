@@ -102,17 +102,17 @@ class Chart:
         """Forces (n,) along the chart's coordinates of the user's at a closed posture."""
         return tau if self.own else self.turns(q).T @ tau
 
-    def outside(self, time: float, q: Array, v: Array) -> tuple[Array, Array]:
+    def outside(self, time: float, q: Array, v: Array) -> tuple[Array, Array, Array]:
         """What forces from outside do at a time [s], a closed posture (nq,), velocities (n,).
 
         Returns:
-            (n,) along the chart's coordinates, and powers (k,) [W].
+            (n,) along the chart's coordinates, powers (k,) [W], and what is seen.
         """
         if not self.machine.external:
-            return np.zeros(len(v)), np.zeros(0)
+            return np.zeros(len(v)), np.zeros(0), np.zeros(0)
         gamma = self.machine.closure.gamma(q)
-        along, powers = self._external.along(time, q, gamma @ v)
-        return gamma.T @ along, powers
+        along, powers, seen = self._external.along(time, q, gamma @ v)
+        return gamma.T @ along, powers, seen
 
     @cached_property
     def _external(self) -> ExternalForces:

@@ -110,8 +110,8 @@ class StiffStepper(ControlledStepper):
         state = tape.loads(1, 0, size)
         after = add(state, mixed(tape, 2, size, _FINAL))
         gap = mixed(tape, 2, size, _FINAL - _SECOND)
-        used = self._state.start("own") + self._stiff
-        relative = tape.load(3, size - 2)
+        used, energies = self._state.start("own") + self._stiff, self._state.start("work")
+        relative = tape.load(3, energies)
         shares = [
             gap[i] / (1.0 / tape.load(3, i) + relative * apply("abs", after[i]))
             for i in range(used)
@@ -119,8 +119,8 @@ class StiffStepper(ControlledStepper):
         if not self._short:
             shares += [
                 gap[i]
-                / (1.0 / tape.load(3, size - 1) + ENERGY * relative * apply("abs", after[i]))
-                for i in range(size - 2, size)
+                / (1.0 / tape.load(3, energies + 1) + ENERGY * relative * apply("abs", after[i]))
+                for i in range(energies, size)
             ]
         # the other integrals count only so far as that NaN and infinity anywhere show
         error = maximum(largest(shares), largest(scale(1e-30, gap[used:])))

@@ -2,6 +2,7 @@
 
 from crane.codegen import Layout
 from crane.control import Controller, ValveDrive
+from crane.description.external import PARTS
 from crane.dynamics.joint_forces import sticking
 from crane.machine import Machine
 
@@ -18,12 +19,15 @@ def state_layout(machine: Machine, own: int) -> Layout:
 def seen_layout(machine: Machine, control: Controller) -> Layout:
     """What is observed.
 
-    tau (n), friction (n), kinetic, potential [J], friction of joints at rest that stick, channels
-    of circuits.
+    tau (n), friction (n), kinetic, potential [J], friction of joints at rest that stick, wrench
+    and channels of each force from outside, channels of circuits.
     """
     n, rest = len(machine.active), len(sticking(machine))
     channels = len(control.channels) if isinstance(control, ValveDrive) else 0
-    return Layout(tau=n, friction=n, kinetic=1, potential=1, rest=rest, channels=channels)
+    outside = sum(len(PARTS) + len(force.channels) for force in machine.external)
+    return Layout(
+        tau=n, friction=n, kinetic=1, potential=1, rest=rest, outside=outside, channels=channels
+    )
 
 
 def row_layout(machine: Machine, control: Controller, own: int) -> Layout:

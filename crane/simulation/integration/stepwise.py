@@ -77,7 +77,8 @@ class PythonStepper:
         """
         rate, tau = self._rate(time, state)
         at = self.layout.view(state)
-        forces = self._chart.forces(at.q, tau) + self._chart.outside(time, at.q, at.v_a)[0]
+        outside, _, acting = self._chart.outside(time, at.q, at.v_a)
+        forces = self._chart.forces(at.q, tau) + outside
         seen = self._dynamics.at("observation", at.q, at.v_a, forces)
         more: Array = np.zeros(0)
         if isinstance(self._control, ValveDrive):
@@ -85,7 +86,7 @@ class PythonStepper:
             v_a = self._chart.velocities(at.q, at.v_a)
             where = control.at(time, self.here(state), v_a, at.own)
             more = np.array(control.look(where), dtype=np.float64)
-        return rate, np.concatenate([tau, seen, more])
+        return rate, np.concatenate([tau, seen, acting, more])
 
     def advance(self, time: float, state: Array, first: Array, step: float) -> Array:
         """The state one step later, its rate at the start given.
@@ -135,7 +136,7 @@ class PythonStepper:
         try:
             v_a = chart.velocities(at.q, at.v_a)
             tau, own_rate = self._asked(time, at, v_a)
-            outside, powers = chart.outside(time, at.q, at.v_a)
+            outside, powers, _ = chart.outside(time, at.q, at.v_a)
             forces = chart.forces(at.q, tau) + outside
             rates = self._dynamics.at("rates", at.q, at.v_a, forces)
         except ClosureError as error:

@@ -79,7 +79,8 @@ class Traced:
     def observed(self, tau: Sequence[Number], rest: bool) -> list[Number]:
         """What is seen, but for a circuit's channels; see `seen_layout`."""
         moved, sweep = self.moved(tau, rest), self.sweep
-        return [*tau, *moved.friction, sweep.kinetic, sweep.potential, *moved.rest]
+        own = [*tau, *moved.friction, sweep.kinetic, sweep.potential, *moved.rest]
+        return [*own, *self.outside.seen]
 
     def forces(self, tau: Sequence[Number]) -> list[Number]:
         """What acts along the chart's coordinates, inertia and weight apart."""
