@@ -65,14 +65,15 @@ def loads_of(machine, drag):
     return crane.Wrench(machine.tip, forces, times=times), turned, drag
 
 
-def test_a_function_in_python_does_what_formulas_do():
+@pytest.mark.parametrize("method", ["rk4", "DOP853"])
+def test_a_function_in_python_does_what_formulas_do(method):
     sticky = crane.load("mini_forwarder")
     machine = sticky.replace(
         friction={x: crane.Friction(viscous=law.viscous) for x, law in sticky.friction.items()}
     )
     start = machine.home[machine.closure.active], [0.3, 0.02, 0.01]
     runs = [
-        crane.simulate(machine, None, start, 0.3, 2e-3, method="rk4", loads=loads)
+        crane.simulate(machine, None, start, 0.3, 2e-3, method=method, loads=loads)
         for loads in (
             loads_of(machine, Drag(machine.tip, "drag")),
             loads_of(machine, crane.Pushing(machine.tip, dragged, "drag")),
@@ -129,15 +130,35 @@ def test_with_hydraulics_a_pull_is_in_the_chambers():
 
 def test_the_energy_of_a_load_on_valves_is_kept():
     machine = crane.load("patu655")
-    loads = [crane.Wrench(machine.tip, (0.0, 0.0, -500.0)), Drag(machine.tip, "drag")]
+    pull = crane.Wrench(machine.tip, (0.0, 0.0, -500.0))
     motion = crane.ValvePD(machine, crane.task_trajectory(machine, "reach"))
-    run = crane.simulate(machine, motion, None, 3.0, loads=loads)
+    run, other = (
+        crane.simulate(machine, motion, None, 3.0, loads=[pull, drag])
+        for drag in (Drag(machine.tip, "drag"), crane.Pushing(machine.tip, dragged, "drag"))
+    )
+    assert other.q == pytest.approx(run.q, abs=1e-8)
     seen = run.channels
     work = seen["work"] + seen[f"work_{machine.tip}"] + seen["work_drag"]
     stored = seen["kinetic"] + seen["potential"]
     gap = work - (stored - stored[0]) - seen["dissipated"]
     assert np.abs(gap).max() < 1e-7 * np.ptp(work)
     assert np.ptp(seen[f"work_{machine.tip}"]) > 100.0
+
+
+def test_what_a_function_in_python_raises_comes_out():
+    machine = crane.load("patu655")
+
+    def torn(time, place, turn, velocity, spin):
+        if time > 0.05:
+            raise ZeroDivisionError("torn")
+        return np.zeros(6)
+
+    motion = crane.task_trajectory(machine, "reach")
+    for controller in (None, crane.ComputedTorque(machine, motion)):
+        with pytest.raises(ZeroDivisionError, match="torn"):
+            crane.simulate(
+                machine, controller, None, 0.2, loads=[crane.Pushing(machine.tip, torn)]
+            )
 
 
 def test_what_is_no_load_is_refused():

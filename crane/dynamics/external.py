@@ -8,7 +8,7 @@ import pinocchio as pin
 
 from crane.closure.screws import Vector
 from crane.closure.traced import Geometry
-from crane.codegen import Expression, Tape
+from crane.codegen import Callback, Expression, Tape
 from crane.codegen.scalar import (
     Number,
     add,
@@ -21,10 +21,12 @@ from crane.codegen.scalar import (
     transposed,
 )
 from crane.common.samples import Array
-from crane.description.external import ExternalForce, Here
+from crane.description.external import PARTS, ExternalForce, Here
 from crane.dynamics.frames import FrameJacobians
 from crane.dynamics.traced import Sweep
 from crane.machine import Machine
+
+_SEEN = 19  # numbers that a function in Python is called with
 
 
 class Applied(NamedTuple):
@@ -35,17 +37,29 @@ class Applied(NamedTuple):
         powers: (k,) of each [W].
         edges: Lengths [m] at whose signs some of them bend.
         seen: (s,) of each its wrench in the world's axes and its channels.
+        asked: What those that are functions in Python are called with, see `Asked`.
     """
 
     forces: Vector
     powers: Vector
     edges: Vector
     seen: Vector
+    asked: Vector
+
+
+def references_of(forces: Sequence[ExternalForce], times: Array) -> Array:
+    """References (N, c) of all at times (N,) [s], with room for answers of functions in Python."""
+    parts: list[Array] = [np.zeros((len(times), 0))]
+    for force in forces:
+        parts.append(force.references(times))
+        if not force.traced:
+            parts.append(np.zeros((len(times), len(PARTS))))
+    return np.hstack(parts)
 
 
 def columns_of(forces: Sequence[ExternalForce]) -> list[int]:
-    """(k,) how many references each has."""
-    return [force.references(np.zeros(1)).shape[1] for force in forces]
+    """(k,) how many references each has there."""
+    return [references_of([force], np.zeros(1)).shape[1] for force in forces]
 
 
 def form_of(machine: Machine) -> Hashable:
@@ -73,6 +87,7 @@ def traced(machine: Machine, sweep: Sweep, references: Sequence[Number]) -> Appl
     powers: Vector = []
     edges: Vector = []
     seen: Vector = []
+    asked: Vector = []
     back, first = transposed(posture.rotation[0]), 0  # formulas are seen from the trunk
     for force, count in zip(machine.external, columns_of(machine.external), strict=True):
         joint, pose = _placed(machine, force)
@@ -93,6 +108,9 @@ def traced(machine: Machine, sweep: Sweep, references: Sequence[Number]) -> Appl
             times(back, velocity), times(back, spin), list(references[first : first + count]),
         )  # fmt: skip
         first += count
+        if not force.traced:
+            axes_ = [x for row in here.turn for x in row]
+            asked += [here.reference[0], *here.place, *axes_, *here.velocity, *here.spin]
         edges += force.edges(here)
         acting = [list(part) for part in force.wrench(here)]
         seen += [*acting[0], *acting[1], *force.look(here)]
@@ -102,7 +120,36 @@ def traced(machine: Machine, sweep: Sweep, references: Sequence[Number]) -> Appl
         for i in carriers:
             linear, angular = posture.columns[i]
             total = add(total, scale(dot(push, linear) + dot(about, angular), sweep.gamma[i]))
-    return Applied(total, powers, edges, seen)
+    return Applied(total, powers, edges, seen, asked)
+
+
+class Asked(Callback):
+    """Calls those of a machine's external forces that are functions in Python, for machine code.
+
+    It reads of each (19,): time, place, axes, velocity and spin, see `Here`, and fills its answer
+    into the references of all.
+
+    Args:
+        forces: All of a machine.
+    """
+
+    def __init__(self, forces: Sequence[ExternalForce]):
+        counts = columns_of(forces)
+        ends = np.cumsum(counts)
+        self._places = [
+            (force, slice(end - len(PARTS), end))
+            for force, end in zip(forces, ends.tolist(), strict=True)
+            if not force.traced
+        ]
+        super().__init__(self._answer, _SEEN * len(self._places), int(sum(counts)))
+
+    def _answer(self, seen: Array, references: Array) -> None:
+        for k, (force, place) in enumerate(self._places):
+            x = seen[_SEEN * k : _SEEN * (k + 1)].tolist()
+            turn = [x[4:7], x[7:10], x[10:13]]
+            here = Here(x[1:4], turn, x[13:16], x[16:], x[:1])
+            push, moment = force.wrench(here)
+            references[place] = np.array([*push, *moment], dtype=np.float64)
 
 
 class ExternalForces:

@@ -240,7 +240,7 @@ def _usual(dynamics: Dynamics, control: Controller) -> str:
     if isinstance(control, ValveDrive):
         return "rosenbrock"
     traced = dynamics.backend == "compiled" and isinstance(control, TracedController)
-    return "DOP853" if traced and dynamics.machine.traced else "rk4"
+    return "DOP853" if traced else "rk4"
 
 
 def _own_start(control: Controller, dynamics: Dynamics, q: Array) -> Array:
@@ -278,7 +278,6 @@ def integration_of(
     def make(chart: Chart) -> Way:
         """Machine code, or scipy where there is none."""
         compiled = stepper is not None and chart.dynamics.backend == "compiled"
-        compiled &= chart.machine.traced
         if compiled and isinstance(control, TracedController):
             assert stepper is not None
             with suppress(TooLongError):

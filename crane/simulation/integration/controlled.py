@@ -16,7 +16,14 @@ from crane.control import TracedController, ValveDrive
 from crane.machine import Machine
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.sticking import NEAR
-from crane.simulation.integration.traced import HELD, Stepper, beyond, references_of, wrapped
+from crane.simulation.integration.traced import (
+    HELD,
+    Stepper,
+    beyond,
+    columns_of,
+    references_of,
+    wrapped,
+)
 
 SPACING = 5e-4  # [s] between the instants that references are known at, at most
 LEAST = 0.1  # what is taken for no smaller: rad, machine's size, per `Closure.pace`
@@ -149,6 +156,9 @@ class ControlledStepper(Stepper):
         lengths[5] = 0.0
         if lengths[0] != step:
             lengths[:2] = step, 0.01 * min(step, SPACING)
+        functions = [self._fast.close_address]
+        if self.asks is not None:
+            functions.append(self.asks.address)
         most, done = max(1, int(_ROWS * pair / step)), 0
         out = np.empty((min(most, len(rows)), rows.shape[1]))
         while done < len(rows) or offset < 0:
@@ -160,10 +170,12 @@ class ControlledStepper(Stepper):
             pairs = max(1, int(np.ceil((ends - begins) / pair - _SAME)))
             lengths[2:5] = begins, (ends - begins) / pairs, ends
             made = self._program.call(
-                "run", count, self._fast.close_address, *self._arguments,
+                "run", count, *functions, *self._arguments,
                 self._references(now + begins, now + ends, pairs), state, out, lengths,
                 self.bounds, self.tolerance,
             )  # fmt: skip
+            if self.asks is not None:
+                self.asks.check()
             rows[done : done + made] = out[:made]
             done, offset = done + made, float(lengths[2])
             left = ends - (made * step + offset)
@@ -202,6 +214,10 @@ class ControlledStepper(Stepper):
             edges += scale(1.0 / closure.size, machine.outside.edges)
             outputs = {"rate": rate, "margin": [moved.margin], "edges": edges}
             program.add("rate" + added, 5, outputs)
+        if self.asks is not None:
+            program.add("asked", 5, machine.outside.asked)
+            with program.routine("ask", functions=("answer",), arrays=("asked", "outside")) as r:
+                r.give(r.call("answer", r.asked, r.outside))
         self._add_edges(program, len(edges))
         # the parabola through rows at 0, 1/2, 1
         tape = Tape()
@@ -277,7 +293,8 @@ class ControlledStepper(Stepper):
         size, seen, columns = self._state.size, self._seen.size, self._columns
         floating = self._chart.machine.coordinates.floating
         names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds", "tol")
-        with program.routine("run", counts=("steps",), functions=("close",), arrays=names) as r:
+        functions = ("close",) if self.asks is None else ("close", "answer")
+        with program.routine("run", counts=("steps",), functions=functions, arrays=names) as r:
             following = r.array("following", program.outputs("finish"))
             first, ending = (r.array(x, program.outputs("rate")) for x in ("first", "ending"))
             looked = r.array("looked", program.outputs("observe"))
@@ -288,6 +305,9 @@ class ControlledStepper(Stepper):
             theta, part = r.array("theta", 1), r.array("part", 1)
             reference = r.array("reference", max(1, columns))
             machine = r.geometry, r.numbers, r.control, reference
+            if self.asks is not None:
+                asked = r.array("asked", program.outputs("asked"))
+                outside = reference.at(columns_of(self._control))
             whole, pair, end = r.let(r.h[0]), r.let(r.h[3]), r.let(r.h[4])
             t = r.let(r.h[2])
             recorded, due = r.let(0), r.let(0.0)
@@ -307,6 +327,9 @@ class ControlledStepper(Stepper):
             def call(formula: str, time: Value, *arrays: Place) -> None:
                 if columns:
                     refer(time)
+                if self.asks is not None:
+                    r.call("asked", *machine, arrays[0], asked)
+                    r.call("answer", asked, outside)
                 self._call(r, formula, *machine, *arrays)
 
             def stop() -> None:

@@ -16,8 +16,7 @@ from crane.codegen.scalar import add, dot, subtract
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.control import At, TracedController, ValveDrive
-from crane.dynamics.external import Applied, traced
-from crane.dynamics.external import columns_of as counts_of
+from crane.dynamics import external
 from crane.dynamics.traced import Moved, Sweep
 from crane.machine import Machine
 from crane.simulation.integration.charts import Chart
@@ -34,8 +33,8 @@ def beyond(r: Routine, result: Place) -> Value:
 
 def references_of(machine: Machine, control: TracedController, times: Array) -> Array:
     """All that depends on time alone (N, c): the controller's, then those of `external`."""
-    outside = (force.references(times) for force in machine.external)
-    return np.ascontiguousarray(np.hstack([control.references(times), *outside]))
+    outside = external.references_of(machine.external, times)
+    return np.ascontiguousarray(np.hstack([control.references(times), outside]))
 
 
 def columns_of(control: TracedController) -> int:
@@ -61,7 +60,7 @@ class Traced:
     parts: Parts
     q_a: list[Number]
     v_a: list[Number]
-    outside: Applied
+    outside: external.Applied
 
     def seen(self, settings: list[Number], reference: list[Number]) -> At:
         """What a controller sees."""
@@ -137,7 +136,7 @@ def machine_at(
     constants = Constants(tape, 1, pattern)
     sweep = Sweep(posture, loops, constants, q, parts.v_a, dynamics.form, modes=True)
     v_a = parts.v_a if chart.own else [sweep.rates[i + 1] for i in chart.seen]
-    applied = traced(chart.machine, sweep, outside)
+    applied = external.traced(chart.machine, sweep, outside)
     return Traced(chart, sweep, parts, [q[i] for i in chart.seen], v_a, applied)
 
 
@@ -157,6 +156,7 @@ class Stepper:
     Attributes:
         bounds: See `FastClosure`; where other coordinates are better, see `Chart.limits`; whether
             joints are at rest.
+        asks: What calls those external forces that are functions in Python, if there are some.
 
     Raises:
         TooLongError: It would take too long to compile.
@@ -170,7 +170,8 @@ class Stepper:
         self._chart, self._control = chart, control
         self.bounds = np.concatenate([self._fast.bounds, chart.limits, [0.0]])
         own = columns_of(control)
-        self._columns, self._fold = own + sum(counts_of(machine.external)), fold
+        self._columns, self._fold = own + sum(external.columns_of(machine.external)), fold
+        self.asks = None if machine.traced else external.Asked(machine.external)
         self._sticks = bool(chart.sticking.columns)
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
         form = form_of(control, own, chart, states, fold)
@@ -229,6 +230,12 @@ class Stepper:
     def observe(self, time: float, state: Array) -> tuple[Array, float]:
         """What is seen (.,) at a time [s] and a state, and its margin (`Moved.margin`)."""
         reference = references_of(self._chart.machine, self._control, np.array([time]))
+        if self.asks is not None:
+            asked = np.empty(self._program.outputs("asked").size)
+            self._program.call("asked", *self._arguments, reference, state, asked)
+            outside = columns_of(self._control)
+            self._program.call("ask", self.asks.address, asked, reference[0, outside:])
+            self.asks.check()
         layout = self._program.outputs("observe")
         out = np.empty(layout.size)
         name = "observe" + _REST if self.bounds[HELD] else "observe"
