@@ -198,6 +198,42 @@ def test_machine_files_stand_on_the_ground(block, tmp_path):
         crane.simulate(crane.load(path), None, None, 0.1)
 
 
+ROCKING = STANDING.replace("fly_z: 0.5", "base_z: 0.5, base_ry: 0.3") + "floating: [ry, z]\n"
+
+
+def test_a_root_has_the_freedoms_that_are_named(block, tmp_path):
+    """In its plane it rocks as one does that floats."""
+    urdf = (tmp_path / "block.urdf").read_text()
+    fixed = urdf[: urdf.index('<link name="world"/>')] + urdf[urdf.index('<link name="block">') :]
+    (tmp_path / "root.urdf").write_text(fixed)
+    path = tmp_path / "rocking.yaml"
+    text = ROCKING.replace("block.urdf", "root.urdf").replace("base_z: 0.5", "base_z: 0.8")
+    text = text.replace("friction: 0.3, ", "")
+    text = text.replace("ground: {", "ground: {friction: 0, ")
+    path.write_text(text)
+    machine = crane.load(path)
+    assert (machine.free, machine.driven_joints) == (("base_z", "base_ry"), ())
+    rocks = crane.simulate(machine, None, None, 1.5)
+    floats = crane.load(block.path).under(*machine.external)
+    q = np.array([0.0, 0.0, 0.8, 0.0, 0.3, 0.0])
+    whole = crane.simulate(floats, None, q, 1.5)
+    assert rocks.q == pytest.approx(whole.q[:, [2, 4]], abs=1e-7)
+    assert rocks.channels["support_c0"].max() > 2 * MASS * 9.81 and np.ptp(rocks.q[:, 1]) > 0.3
+    again = crane.load(crane.write_machine(machine, tmp_path / "written"))
+    assert crane.simulate(again, None, None, 0.2).q == pytest.approx(rocks.q[:201], abs=1e-10)
+    named = crane.load(tmp_path / "root.urdf", floating=("ry", "z"))
+    assert named.joints == ("base_z", "base_ry") and "floating" in named.call
+    assert crane.formats.recalled(named.call).joints == named.joints
+    locks = dict.fromkeys(("base_x", "base_y", "base_rx", "base_rz"), 0.0)
+    held = crane.load(tmp_path / "root.urdf", floating=True, lock=locks)
+    assert held.free == machine.free
+    with pytest.raises(CraneError, match="floating is 'z', give True or some of x, y, z"):
+        crane.load(tmp_path / "root.urdf", floating="z")
+    path.write_text(text.replace("[ry, z]", "[ry, zz]"))
+    with pytest.raises(CraneError, match=r"rocking.yaml:\d+: freedom 'zz' of the root is unknown"):
+        crane.load(path)
+
+
 def test_what_is_no_ground_is_refused(block):
     for make, text in (
         (lambda: crane.Ground(normal=(0, 0, -1)), "upwards"),

@@ -15,8 +15,9 @@ length of at most pi; its velocities the body's twist in the body's axes, V = (l
 """
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+from crane.common.errors import InputError
 from crane.description.spec import MachineSpec
 from crane.description.tree import Joint, Link, Tree
 
@@ -25,13 +26,18 @@ PARTS = ("x", "y", "z", "rx", "ry", "rz")
 
 def flyers(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
     """By name of each joint with six freedoms that floats the joints of its series, in order."""
+    return {name: part for name, part in afloat(spec).items() if len(part) == len(PARTS)}
+
+
+def afloat(spec: MachineSpec) -> dict[str, tuple[str, ...]]:
+    """The same, and what moves of series of which some freedoms are locked or not there."""
     groups: dict[str, list[Joint]] = {}
     for joint in spec.tree.joints.values():
         if joint.floats and joint.moves:
             groups.setdefault(joint.floats, []).append(joint)
     found = {}
     for name, series in groups.items():
-        if len(series) == len(PARTS) and _is_free(spec, series):
+        if _is_free(spec, series):
             found[name] = tuple(joint.name for joint in series)
     return found
 
@@ -104,14 +110,35 @@ def grounded(
     return dataclasses.replace(spec, home=home), held
 
 
-def floated(spec: MachineSpec) -> MachineSpec:
+def floated(spec: MachineSpec, freedoms: bool | Sequence[str] = True) -> MachineSpec:
     """A machine whose root floats instead of standing on the ground, by base_x to base_rz.
 
     A machine that floats already stays as it is.
+
+    Args:
+        spec: The machine.
+        freedoms: Those of `PARTS` that it has; True for all.
     """
-    if flyers(spec):
+    if not freedoms or afloat(spec):
         return spec
-    tree, root = spec.tree, spec.tree.root
+    parts = PARTS if freedoms is True else freedoms_of(freedoms)
+    return dataclasses.replace(spec, tree=afloat_tree(spec.tree, parts))
+
+
+def freedoms_of(names: object) -> tuple[str, ...]:
+    """Freedoms of a root in the order of `PARTS`.
+
+    Raises:
+        InputError: Names that are none of those.
+    """
+    if isinstance(names, str) or not isinstance(names, Sequence) or not set(names) <= set(PARTS):
+        raise InputError(f"floating is {names!r}, give True or some of {', '.join(PARTS)}")
+    return tuple(part for part in PARTS if part in names)
+
+
+def afloat_tree(tree: Tree, parts: Sequence[str]) -> Tree:
+    """A tree whose root has some of the `PARTS`, by joints base_x to base_rz."""
+    root = tree.root
     taken = {*tree.links, *tree.joints}
     name = "base"
     while taken & {f"{name}_{part}" for part in (*PARTS, *range(1, len(PARTS)), "ground")}:
@@ -119,10 +146,10 @@ def floated(spec: MachineSpec) -> MachineSpec:
     ground = f"{name}_ground"
     where = tree.links[root].where
     links = [Link(ground, where)]
-    links += [Link(f"{name}_{i}", where, between=name) for i in range(1, len(PARTS))]
+    links += [Link(f"{name}_{i}", where, between=name) for i in range(1, len(parts))]
     ends = [ground, *(link.name for link in links[1:]), root]
     joints = []
-    for i, part in enumerate(PARTS):
+    for i, part in enumerate(parts):
         kind = "revolute" if part.startswith("r") else "prismatic"
         axis = [0.0, 0.0, 0.0]
         axis["xyz".index(part[-1])] = 1.0
@@ -133,5 +160,4 @@ def floated(spec: MachineSpec) -> MachineSpec:
             )
         )  # fmt: skip
     # the ground first: it is the root now
-    whole = Tree({links[0].name: links[0]}, {}).replacing(*tree, *links[1:], *joints)
-    return dataclasses.replace(spec, tree=whole)
+    return Tree({links[0].name: links[0]}, {}).replacing(*tree, *links[1:], *joints)

@@ -15,7 +15,7 @@ from crane.common.counted import few_warnings
 from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.packages import giving, package_folders, values_by_name
 from crane.description import MachineSpec, changed, driven, locked, parameters
-from crane.description.floating import floated
+from crane.description.floating import floated, freedoms_of
 from crane.description.sources import WITH, find
 from crane.formats.ambiguity import warn_of_assemblies
 from crane.formats.home import warn_of_home
@@ -33,7 +33,7 @@ def load(
     lock: Mapping[str, float] | None = None,
     active: Sequence[str] | None = None,
     free: Sequence[str] | None = None,
-    floating: bool = False,
+    floating: bool | Sequence[str] = False,
     packages: Sequence[str | Path] = (),
     arguments: Mapping[str, object] | None = None,
 ) -> Machine:
@@ -51,7 +51,8 @@ def load(
         free: Coordinates that nothing drives, if not those of the file. What the active joints
             leave open is free anyway, with a warning.
         floating: Whether the root floats instead of standing on the ground: a vehicle, a humanoid.
-            Its six freedoms, base_x to base_rz, are free, see `crane.description.floating`.
+            Its six freedoms, base_x to base_rz, are free, see `crane.description.floating`;
+            of some freedoms their names, such as ("z", "ry") for one that heaves and pitches.
         packages: Folders of the packages that files name by `package://`, `model://` and
             `$(find ...)`, or folders in which these are, see `crane.common.packages`.
         arguments: Values of the arguments of a xacro file; `model` of an SDF with several models.
@@ -65,7 +66,8 @@ def load(
         InputError: A change of a parameter that is not there, or to what cannot be.
     """
     folders, values = package_folders(packages), values_by_name(arguments)
-    with few_warnings(), giving(folders, values, floating) as said:
+    floating = floating if isinstance(floating, bool) else freedoms_of(floating)
+    with few_warnings(), giving(folders, values, bool(floating)) as said:
         machine = _load(name, changes, lock, active, free, floating)
         return replace(machine, packages=said.packages, arguments=MappingProxyType(said.arguments))
 
@@ -120,7 +122,7 @@ class Variants:
     def _giving(self) -> AbstractContextManager[object]:
         was = self._machine
         folders, values = package_folders(was.packages), values_by_name(was.arguments)
-        return giving(folders, values, was.floats)
+        return giving(folders, values, bool(was.floats))
 
 
 def _load(
@@ -129,18 +131,19 @@ def _load(
     lock: Mapping[str, float] | None,
     active: Sequence[str] | None,
     free: Sequence[str] | None,
-    floating: bool,
+    floating: bool | tuple[str, ...],
 ) -> Machine:
     spec = _described(name, active, free, floating)
     return _assembled(spec, changes, lock, active, free, floating)
 
 
 def _described(
-    name: str | Path, active: Sequence[str] | None, free: Sequence[str] | None, floating: bool
+    name: str | Path,
+    active: Sequence[str] | None,
+    free: Sequence[str] | None,
+    floating: bool | tuple[str, ...],
 ) -> MachineSpec:
-    spec = read(name)
-    if floating:
-        spec = floated(spec)
+    spec = floated(read(name), floating)
     if active is not None or free is not None:
         spec = driven(spec, _names(active, "active"), _names(free, "free"))
     return spec
@@ -152,7 +155,7 @@ def _assembled(
     lock: Mapping[str, float] | None,
     active: Sequence[str] | None,
     free: Sequence[str] | None,
-    floating: bool,
+    floating: bool | tuple[str, ...],
     near: Closure | None = None,
 ) -> Machine:
     said = {"active": active, "free": free}
@@ -245,7 +248,7 @@ def recalled(call: str) -> Machine:
             [str(joint) for joint in given.pop(kind)] if kind in given else None
             for kind in ("active", "free")
         )
-        floating = given.pop("floating", False) is True
+        floating = given.pop("floating", False)
         packages = [str(folder) for folder in given.pop("packages", [])]
         arguments = {key: str(value) for key, value in given.pop("arguments", {}).items()}
     except (ValueError, TypeError, AttributeError, RecursionError):

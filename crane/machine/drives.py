@@ -12,7 +12,7 @@ from crane.closure.equations import LoopEquations
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
 from crane.description import Drive, MachineSpec
-from crane.description.floating import flyers
+from crane.description.floating import afloat
 
 _OF_ACTIVE = {"tasks", "control", "hydraulics"}  # sections that only active joints can have
 
@@ -36,8 +36,8 @@ def active_joints(spec: MachineSpec, model: pin.Model) -> tuple[str, ...]:
 
 def said_free(spec: MachineSpec) -> tuple[str, ...]:
     """Coordinates that the file calls free, and those of bodies that float."""
-    afloat = (joint for series in flyers(spec).values() for joint in series)
-    return tuple(dict.fromkeys((*spec.free, *afloat)))
+    floating = (joint for series in afloat(spec).values() for joint in series)
+    return tuple(dict.fromkeys((*spec.free, *floating)))
 
 
 def free_joints(spec: MachineSpec, active: Sequence[str]) -> tuple[str, ...]:

@@ -95,7 +95,8 @@ class Machine:
         changes: Numbers that are not those of its files, by name.
         locks: Where joints are held that its files let move, by name [m], [rad].
         chosen: Active and free joints that are not those of its file, under "active" and "free".
-        floats: Whether its root was made to float, which its file lets stand on the ground.
+        floats: Whether its root was made to float, which its file lets stand on the ground, or by
+            which freedoms.
         packages: Folders in which its files' packages were sought.
         arguments: Values of its file's arguments.
     """
@@ -127,7 +128,7 @@ class Machine:
     changes: Mapping[str, float]
     locks: Mapping[str, float]
     chosen: Mapping[str, tuple[str, ...]]
-    floats: bool
+    floats: bool | tuple[str, ...]
     packages: tuple[str, ...]
     arguments: Mapping[str, str]
 

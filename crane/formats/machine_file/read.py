@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from crane.common.errors import DescriptionError, known
+from crane.common.packages import given
 from crane.description.estimation import Estimation
 from crane.description.findings import Anything, FollowUpError, flag, recoverable
+from crane.description.floating import PARTS, freedoms_of
 from crane.description.sources import find
 from crane.description.spec import (
     LOOP_TYPES,
@@ -48,9 +50,9 @@ from crane.formats.urdf.read import Urdf, read_urdf
 Part = TypeVar("Part")
 
 _KEYS = (
-    "name", "source", "chains", "loops", "active", "free", "drives", "home", "friction", "forces",
-    "gas_springs", "ropes", "loads", "ground", "contacts", "soil", "cutters", "end_stops",
-    "rotor_inertia", "couplings", "tip", "payload", "tasks", "control", "hydraulics", "sensors",
+    "name", "source", "chains", "floating", "loops", "active", "free", "drives", "home",
+    "friction", "forces", "gas_springs", "ropes", "loads", "ground", "contacts", "soil",
+    "cutters", "end_stops", "rotor_inertia", "couplings", "tip", "payload", "tasks", "control", "hydraulics", "sensors",
     "identification",
 )  # fmt: skip
 
@@ -82,7 +84,7 @@ def _read_single(path: Path) -> MachineSpec:
     chain = Chain(path.stem, path, None, path.name, urdf.moving)
     tree = TreeBuilder()
     tree.add(chain, urdf)
-    if not tree.joints:
+    if not tree.joints and not given().floating:
         flag(DescriptionError(f"{path.name}: no joint moves in this file, add one"))
     for loop in urdf.loops:
         with recoverable():
@@ -155,6 +157,19 @@ def _read_machine(path: Path) -> MachineSpec:
     )  # fmt: skip
 
 
+def _floating(top: Section) -> tuple[str, ...]:
+    """Freedoms of the first chain's root."""
+    if "floating" not in top:
+        return ()
+    names = top.names("floating")
+    for name in names:
+        if name not in PARTS:
+            raise top.fail(
+                "floating", f"freedom '{name}' of the root is unknown, {known(PARTS, name)}"
+            )
+    return freedoms_of(names)
+
+
 def _free(top: Section, tree: TreeBuilder, active: Container[str]) -> tuple[str, ...]:
     """Independent coordinates that nothing drives."""
     free: tuple[str, ...] = ()
@@ -214,6 +229,8 @@ def _chains(
     if not chains and tree.complete:
         flag(top.fail("chains", "there are no chains, add one under 'chains:'"))
         tree.complete = False
+    with recoverable(harmless=True):
+        tree.let_float(_floating(top))
     if not tree.joints and tree.complete:
         flag(top.fail("chains", "no joint of these chains moves, add one"))
     return tuple(chains), tree, friction, couplings, springs

@@ -1,10 +1,11 @@
 """The tree as it grows, chain by chain, and whether the names that others use are in it."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 from crane.common.errors import CraneError, DescriptionError, known
 from crane.description.findings import FollowUpError, flag, recoverable
+from crane.description.floating import afloat_tree
 from crane.description.spec import Chain, LoopSpec
 from crane.description.tree import Joint, Link, Tree
 from crane.formats.machine_file.section import Section
@@ -49,6 +50,17 @@ class TreeBuilder:
         for part in free:
             self._enter(part)
         self._attach(urdf)
+
+    def let_float(self, freedoms: Sequence[str]) -> None:
+        """Let the root of the first chain float instead of standing on the world."""
+        if not freedoms or not self.links:
+            return
+        root = self.tree.root
+        whole = afloat_tree(self.tree, freedoms)
+        self.links, self._every = dict(whole.links), dict(whole.joints)
+        self.joints = {name: joint for name, joint in whole.joints.items() if joint.moves}
+        bodies = {link: root for link, body in self._body.items() if body == root}
+        self._body = {whole.root: whole.root} | self._body | bodies
 
     def free(self, parts: Iterable[Link | Joint]) -> Iterator[Link | Joint]:
         """Those whose names are not taken; the others are noted."""
