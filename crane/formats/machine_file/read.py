@@ -52,8 +52,8 @@ Part = TypeVar("Part")
 _KEYS = (
     "name", "source", "chains", "floating", "loops", "active", "free", "drives", "home",
     "friction", "forces", "gas_springs", "ropes", "loads", "ground", "contacts", "soil",
-    "cutters", "end_stops", "rotor_inertia", "couplings", "tip", "payload", "tasks", "control", "hydraulics", "sensors",
-    "identification",
+    "cutters", "end_stops", "rotor_inertia", "couplings", "tip", "payload", "tasks", "control",
+    "hydraulics", "sensors", "identification",
 )  # fmt: skip
 
 
