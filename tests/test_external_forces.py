@@ -1,5 +1,8 @@
 """Forces from outside: by Pinocchio's own external forces, closed forms, and energy."""
 
+import dataclasses
+import warnings
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -143,6 +146,32 @@ def test_the_energy_of_a_load_on_valves_is_kept():
     gap = work - (stored - stored[0]) - seen["dissipated"]
     assert np.abs(gap).max() < 1e-7 * np.ptp(work)
     assert np.ptp(seen[f"work_{machine.tip}"]) > 100.0
+
+
+def test_recorded_loads_are_known_to_identification(tmp_path):
+    machine = crane.load("mini_forwarder")
+    motion = crane.ComputedTorque(machine, crane.task_trajectory(machine, "lift"))
+    pull = crane.Wrench(machine.tip, [[0, 0, 0], [3, 1, -6]], [[0, 0, 0], [0.5, 0, 0]], [0, 4])
+    without, pulled = (
+        crane.simulate(machine, motion, None, 4.0, 4e-3, loads=loads) for loads in ((), (pull,))
+    )
+    told = {name: x for name, x in pulled.channels.items() if not name.startswith("load_")}
+    units = {name: pulled.channel_units[name] for name in told}
+    untold = dataclasses.replace(pulled, channels=told, channel_units=units)
+    errors = []
+    for one in (pulled, untold):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the same motion twice
+            found = crane.identify(machine, one, without, prior=0.1, trust=one is untold)
+        errors.append(found.validation.rmse / np.abs(without.tau).max(axis=0))
+    assert errors[0].max() < 4e-3 and errors[1].max() > 0.2, errors
+    with pytest.raises(CraneError, match="has the load 'push', and no column tells"):
+        crane.identify(machine.under(crane.Wrench(machine.tip, name="push")), without, prior=0.1)
+    lost = pulled.channels | {"load_nix_force_x": 0 * pulled.time}
+    units = pulled.channel_units | {"load_nix_force_x": "N"}
+    nix = dataclasses.replace(pulled, channels=lost, channel_units=units)
+    with pytest.raises(CraneError, match="'load_nix_force_x' acts on no link of 'mini_forw"):
+        crane.identify(machine, nix, prior=0.1)
 
 
 def test_what_a_function_in_python_raises_comes_out():

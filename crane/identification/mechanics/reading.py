@@ -16,6 +16,7 @@ from crane.identification.mechanics.checks import (
 )
 from crane.identification.mechanics.delays import motion_frequency
 from crane.identification.mechanics.equations import Progress
+from crane.identification.mechanics.outside import from_outside
 from crane.identification.signals.motion import Derivatives, Motion, differentiate, evenly
 from crane.identification.signals.outliers import outliers, repaired
 from crane.machine import Machine
@@ -37,7 +38,8 @@ def smoothed_motion(
 ) -> Motion:
     """Velocities and accelerations of a recording, which is checked first.
 
-    Outliers are bridged by lines between their neighbours, before anything is filtered.
+    Outliers are bridged by lines between their neighbours, before anything is filtered. Forces
+    are those of the joints and of recorded loads together.
 
     Args:
         machine: What was recorded.
@@ -60,6 +62,7 @@ def smoothed_motion(
     names = [x + suffix for suffix in ("", FORCE) for x in machine.active]
     columns = without_outliers(time, names, np.hstack([recording.q, recording.tau]), trust)
     _check(machine, time, columns, recording.v, trust)
+    columns[:, n:] += from_outside(machine, given, columns[:, :n], trust)
     time, columns = evenly(time, columns)
     step = float(np.median(np.diff(time)))
     lowest = _HUM * motion_frequency(columns[:, :n], step)
