@@ -41,9 +41,8 @@ def from_outside(machine: Machine, recording: Recording, q_a: Array, trust: bool
         if unit != _UNITS[part[:-2]]:
             raise RecordingError(f"'{column}' is recorded in {unit}, give {_UNITS[part[:-2]]}")
         if name not in frames and name not in machine.tree.links:
-            raise RecordingError(
-                f"'{column}' acts on no link of '{machine.name}', {known(machine.tree.links, name)}"
-            )
+            links = known(machine.tree.links, name)
+            raise RecordingError(f"'{column}' acts on no link of '{machine.name}', {links}")
         rows = wrenches.setdefault(name, np.zeros((len(values), len(PARTS))))
         rows[:, PARTS.index(part)] = values
     for name in frames:
