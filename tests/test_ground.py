@@ -94,6 +94,51 @@ def test_above_it_slides_as_coulomb_says(block):
     assert gained == pytest.approx(9.81 * (np.sin(slope) - friction * np.cos(slope)), rel=1e-3)
 
 
+@pytest.mark.parametrize("method", ["DOP853", "rosenbrock"])
+def test_what_gives_way_along_the_ground_stands_still(block, method):
+    slope, stiffness = 0.3, 2e5
+    tyre = {"lateral_stiffness": stiffness, "lateral_damping": 2e3, "friction": 0.4}
+    loads = feet(slope, stiffness=1e5, damping=2.0, **tyre)
+    q = start(block, slope)
+    found = run(block, loads, q, 3.0, step=1e-3, method=method)
+    assert balance(found, loads) < 1e-6
+    assert np.abs(found.v[-1]).max() < 1e-8
+    assert np.linalg.norm(found.q[-1, :3] - found.q[0, :3]) < 0.02
+    along = forces(found, loads).sum(axis=0) @ [np.cos(slope), 0.0, np.sin(slope)]
+    assert along == pytest.approx(MASS * 9.81 * np.sin(slope), rel=1e-7)
+    # pulled across the slope it gives way by as much as the spring says, and comes back
+    pull = crane.Wrench(
+        "block", [[0, 0, 0], [0, 40, 0], [0, 40, 0], [0, 0, 0]], times=[3, 4, 6, 7]
+    )
+    found = run(block, [*loads, pull], q, 9.0, step=5e-3, method=method)
+    still, pulled, back = (found.q[int(t / 5e-3)] for t in (2.9, 5.9, 8.9))
+    lower = loads[0].stiffness * 4 * 0.8**2  # of rolling: the pull acts HIGH above the feet
+    given = 40 / (4 * stiffness) + 40 * HIGH**2 / lower
+    assert pulled[1] - still[1] == pytest.approx(given, rel=2e-2)
+    assert back == pytest.approx(still, abs=1e-6)
+
+
+def test_a_tyre_slides_as_coulomb_says(block):
+    slope, friction = 0.5, 0.4
+    tyre = {"lateral_stiffness": 2e5, "lateral_damping": 2e3, "friction": friction}
+    loads = feet(slope, stiffness=1e5, damping=2.0, **tyre)
+    found = run(block, loads, start(block, slope), 3.0, step=0.01)
+    assert balance(found, loads) < 1e-6
+    way = np.linalg.norm(found.q[:, :3] - found.q[0, :3], axis=1)
+    gained = np.diff(way, 2)[-50:].mean() / 0.01**2
+    assert gained == pytest.approx(9.81 * (np.sin(slope) - friction * np.cos(slope)), rel=1e-4)
+
+
+def test_python_follows_tyres_as_machine_code_does(block):
+    tyre = {"lateral_stiffness": 2e5, "lateral_damping": 2e3, "friction": 0.4}
+    loads = feet(0.3, stiffness=1e5, damping=2.0, **tyre)
+    both = [
+        run(block, loads, start(block, 0.3), 0.1, method="rk4", backend=backend).q
+        for backend in ("compiled", "pinocchio")
+    ]
+    assert both[1] == pytest.approx(both[0], abs=1e-9)
+
+
 def test_it_tips_where_its_weight_leaves_its_feet(block):
     """tan(slope) = WIDE / HIGH, to 1 % of the angle, on rough and stiff ground."""
     angle = np.arctan(WIDE / HIGH)
@@ -182,6 +227,11 @@ def test_machine_files_stand_on_the_ground(block, tmp_path):
     written = crane.load(crane.write_machine(machine, tmp_path / "written"))
     again = crane.simulate(written, None, None, 3.0, 0.01)
     assert again.q == pytest.approx(found.q, abs=1e-12)
+    path.write_text(
+        STANDING.replace("{frame: c0}", "{frame: c0, lateral_stiffness: 1e5, lateral_damping: 9}")
+    )
+    (tyre, *_) = crane.load(crane.write_machine(crane.load(path), tmp_path / "tyre")).external
+    assert (tyre.lateral_stiffness, tyre.lateral_damping, tyre.states) == (1e5, 9.0, 2)
     for old, new, text in (
         ("ground:", "#", "yaml:7: contacts without a ground"),
         ("{frame: c0}", "{frame: nix}", "yaml:7: .*'nix'"),
@@ -241,6 +291,13 @@ def test_what_is_no_ground_is_refused(block):
         (lambda: crane.Ground(profile=((0, 0, 1),)), "no list"),
         (lambda: crane.Contact("c0", stiffness=0.0), "stiffness"),
         (lambda: crane.Contact("c0", friction=-1.0), "must not be negative"),
+        (lambda: crane.Contact("c0", lateral_damping=1.0), "no lateral stiffness, give both"),
+        (
+            lambda: run(
+                block, feet(lateral_stiffness=1e5), start(block, 0.0), 0.1, method="Radau"
+            ),
+            "take DOP853",
+        ),
         (lambda: run(block, [crane.Contact("c9")], None, 0.1), "'c9'"),
     ):
         with pytest.raises(CraneError, match=text):

@@ -23,6 +23,7 @@ class Here(NamedTuple):
         velocity: (3,) of the origin, in the world [m/s].
         spin: (3,) angular velocity, in the world [rad/s].
         reference: (c,) its row of `references`.
+        states: (s,) its own, see `ExternalForce.states`.
     """
 
     place: list[Number]
@@ -30,6 +31,7 @@ class Here(NamedTuple):
     velocity: list[Number]
     spin: list[Number]
     reference: list[Number]
+    states: Sequence[Number] = ()
 
 
 class ExternalForce:
@@ -71,6 +73,15 @@ class ExternalForce:
 
     def look(self, here: Here) -> Sequence[Number]:
         """What is recorded besides the wrench, in the order of `channels`."""
+        return ()
+
+    @property
+    def states(self) -> int:
+        """How many lengths [m] it remembers, which are 0 at the start; none yet."""
+        return 0
+
+    def rates(self, here: Here) -> Sequence[Number]:
+        """How fast those change [m/s]."""
         return ()
 
     def wrench(self, here: Here) -> tuple[Sequence[Number], Sequence[Number]]:

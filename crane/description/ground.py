@@ -21,6 +21,8 @@ from crane.common.samples import as_number
 from crane.description.external import ExternalForce, Here
 
 STIFFNESS, DAMPING, FRICTION, SMOOTHING = 1e7, 1.0, 0.6, 1e-2
+_RELAXATION = 1e-3  # [s]
+_LEAST = 1e-12  # [m] that is no way
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,14 @@ class Contact(ExternalForce):
 
     unilateral and compliant as an end stop (Hunt and Crossley, 1975), with Coulomb friction in
     both directions, smoothed over the velocity s: what rests on a slope creeps, at s tan(slope) /
-    sqrt(friction^2 - tan(slope)^2).
+    sqrt(friction^2 - tan(slope)^2). What gives way along the ground with a lateral stiffness k, as
+    a tyre does, stands still there. How far it has given way, s, is its state, and friction is
+
+        F_t = -min(1, friction N / |k s + c s'|) (k s + c s'),
+        s' = v_t - max(0, 1 - friction N / (k |s|)) s / tau,    tau = 1 ms,
+
+    an elastic and then viscoplastic element with the limit of Coulomb (the reset integrator of
+    Haessig and Friedland, 1991, without its jump).
 
     Args:
         frame: The link whose origin the point, or the centre of the wheel, is.
@@ -88,6 +97,8 @@ class Contact(ExternalForce):
         friction: Coefficient.
         smoothing: s [m/s].
         radius: Of the wheel or ball [m].
+        lateral_stiffness: k along the ground, in all directions [N/m]; 0 of none.
+        lateral_damping: c [N s/m].
         area: Of the foot that the point stands for [m2], 0 of none; what it presses with on the
             ground is recorded.
         name: See `ExternalForce`.
@@ -106,6 +117,8 @@ class Contact(ExternalForce):
         smoothing: float = SMOOTHING,
         radius: float = 0.0,
         area: float = 0.0,
+        lateral_stiffness: float = 0.0,
+        lateral_damping: float = 0.0,
         name: str = "",
     ):
         super().__init__(frame, name)
@@ -117,11 +130,16 @@ class Contact(ExternalForce):
         for key, unit, value in (
             ("damping", "s/m", damping), ("friction", "", friction),
             ("radius", "m", radius), ("area", "m2", area),
+            ("lateral stiffness", "N/m", lateral_stiffness),
+            ("lateral damping", "N s/m", lateral_damping),
         ):  # fmt: skip
             numbers.append(as_number(value, f"the {key} {what}", unit))
             if numbers[-1] < 0:
                 raise InputError(f"the {key} {what} is {value:g}, it must not be negative")
-        self.damping, self.friction, self.radius, self.area = numbers
+        self.damping, self.friction, self.radius, self.area = numbers[:4]
+        self.lateral_stiffness, self.lateral_damping = numbers[4:]
+        if self.lateral_damping and not self.lateral_stiffness:
+            raise InputError(f"the lateral damping {what} has no lateral stiffness, give both")
 
     def edges(self, here: Here) -> list[Number]:
         """See `ExternalForce`: the gap."""
@@ -153,4 +171,41 @@ class Contact(ExternalForce):
         pressed, normal, arm, along = self._pressed(here)
         speed = apply("sqrt", dot(along, along) + self.smoothing**2)
         force = scale(pressed, subtract(normal, scale(self.friction / speed, along)))
+        if self.lateral_stiffness:
+            force = add(scale(pressed, normal), self._held(here, pressed, normal, along)[0])
         return force, cross(arm, force)
+
+    @property
+    def states(self) -> int:
+        """See `ExternalForce`: s along the ground's two directions."""
+        return 2 if self.lateral_stiffness else 0
+
+    def rates(self, here: Here) -> Sequence[Number]:
+        """See `ExternalForce`."""
+        if not self.lateral_stiffness:
+            return ()
+        pressed, normal, _, along = self._pressed(here)
+        return self._held(here, pressed, normal, along)[1]
+
+    def _held(
+        self, here: Here, pressed: Number, normal: list[Number], along: list[Number]
+    ) -> tuple[list[Number], list[Number]]:
+        """F_t (3,) and s' (2,)."""
+        level = 1.0 / apply("sqrt", normal[0] * normal[0] + normal[2] * normal[2])
+        first: list[Number] = [level * normal[2], 0.0, -1.0 * level * normal[0]]
+        axes = first, cross(normal, first)
+        s, most = list(here.states), self.friction * pressed
+        beyond = maximum(1.0 - most / (self.lateral_stiffness * _size(s, _LEAST)), 0.0)
+        touching = where_positive(pressed, 1.0, 0.0)
+        rates = [
+            touching * dot(along, axis) - beyond * x / _RELAXATION
+            for axis, x in zip(axes, s, strict=True)
+        ]
+        pull = add(scale(self.lateral_stiffness, s), scale(self.lateral_damping, rates))
+        share = most / maximum(_size(pull, _LEAST * self.lateral_stiffness), most)
+        total = add(scale(pull[0], axes[0]), scale(pull[1], axes[1]))
+        return scale(-1.0 * share, total), rates
+
+
+def _size(vector: list[Number], least: float) -> Number:
+    return apply("sqrt", dot(vector, vector) + least**2)

@@ -37,6 +37,7 @@ class Applied(NamedTuple):
         powers: (k,) of each [W].
         edges: Lengths [m] at whose signs some of them bend.
         seen: (s,) of each its wrench in the world's axes and its channels.
+        rates: Of their states, one after the other.
         asked: What those that are functions in Python are called with, see `Asked`.
     """
 
@@ -44,7 +45,24 @@ class Applied(NamedTuple):
     powers: Vector
     edges: Vector
     seen: Vector
+    rates: Vector
     asked: Vector
+
+
+class AppliedAt(NamedTuple):
+    """The same at a state, in numbers.
+
+    Attributes:
+        forces: J^T w (nv,) of all of them together; gamma^T J^T w (n,) where a chart gives it.
+        powers: (k,) of each [W].
+        seen: See `Applied`.
+        rates: See `Applied`.
+    """
+
+    forces: Array
+    powers: Array
+    seen: Array
+    rates: Array
 
 
 def references_of(forces: Sequence[ExternalForce], times: Array) -> Array:
@@ -70,23 +88,38 @@ def form_of(machine: Machine) -> Hashable:
         parts = (tape.loads(i, 0, 3) for i in range(3))
         place, velocity, spin = parts
         turn = [tape.loads(3, 3 * row, 3) for row in range(3)]
-        here = Here(place, turn, velocity, spin, tape.loads(4, 0, count))
+        own = tape.loads(4, 0, count), tape.loads(5, 0, force.states)
+        here = Here(place, turn, velocity, spin, *own)
         outputs = [
             [x.index if isinstance(x, Expression) else float(x) for x in part]
-            for part in (*force.wrench(here), force.edges(here), force.look(here))
+            for part in (
+                *force.wrench(here),
+                force.edges(here),
+                force.look(here),
+                force.rates(here),
+            )  # fmt: skip
         ]
         joint, pose = _placed(machine, force)
-        out.append((repr((count, tape.operations, outputs)), joint, pose.homogeneous.tobytes()))
+        shape = count, force.states
+        out.append((repr((shape, tape.operations, outputs)), joint, pose.homogeneous.tobytes()))
     return tuple(out)
 
 
-def traced(machine: Machine, sweep: Sweep, references: Sequence[Number]) -> Applied:
-    """`ExternalForces` as formulas, with all their references one after the other."""
+def states_of(forces: Sequence[ExternalForce]) -> int:
+    """How many states they have together."""
+    return sum(force.states for force in forces)
+
+
+def traced(
+    machine: Machine, sweep: Sweep, references: Sequence[Number], states: Sequence[Number]
+) -> Applied:
+    """`ExternalForces` as formulas, with their references and states one after the other."""
     posture, geometry = sweep.posture, sweep.posture.geometry
     total: Vector = [0.0] * len(machine.active)
     powers: Vector = []
     edges: Vector = []
     seen: Vector = []
+    rates: Vector = []
     asked: Vector = []
     back, first = transposed(posture.rotation[0]), 0  # formulas are seen from the trunk
     for force, count in zip(machine.external, columns_of(machine.external), strict=True):
@@ -106,8 +139,10 @@ def traced(machine: Machine, sweep: Sweep, references: Sequence[Number]) -> Appl
         here = Here(
             times(back, subtract(at, posture.origin[0])), product(back, axes),
             times(back, velocity), times(back, spin), list(references[first : first + count]),
+            list(states[len(rates) : len(rates) + force.states]),
         )  # fmt: skip
         first += count
+        rates += force.rates(here)
         if not force.traced:
             axes_ = [x for row in here.turn for x in row]
             asked += [here.reference[0], *here.place, *axes_, *here.velocity, *here.spin]
@@ -120,7 +155,7 @@ def traced(machine: Machine, sweep: Sweep, references: Sequence[Number]) -> Appl
         for i in carriers:
             linear, angular = posture.columns[i]
             total = add(total, scale(dot(push, linear) + dot(about, angular), sweep.gamma[i]))
-    return Applied(total, powers, edges, seen, asked)
+    return Applied(total, powers, edges, seen, rates, asked)
 
 
 class Asked(Callback):
@@ -162,36 +197,41 @@ class ExternalForces:
     def __init__(self, machine: Machine):
         self._forces, self._jacobians = machine.external, FrameJacobians(machine)
 
-    def along(self, time: float, q: Array, v: Array) -> tuple[Array, Array, Array]:
+    def along(self, time: float, q: Array, v: Array, states: Array) -> AppliedAt:
         """J^T w along the joints.
 
         Args:
             time: [s].
             q: (nq,) closed posture.
             v: (nv,) velocities of all joints.
-
-        Returns:
-            (nv,) of all together, powers (k,) of each [W], and what is seen, see `Applied`.
+            states: Of all forces.
         """
         self._jacobians.place(q)
         total, powers = np.zeros(len(v)), np.empty(len(self._forces))
         seen: Vector = []
+        rates: Vector = []
         for k, force in enumerate(self._forces):
             jacobian = self._jacobians.of(force.frame)
-            here = self._here(force, v, force.references(np.array([time]))[0])
+            own = states[len(rates) : len(rates) + force.states].tolist()
+            here = self._here(force, v, force.references(np.array([time]))[0], own)
+            rates += force.rates(here)
             push, moment = force.wrench(here)
             seen += [*push, *moment, *force.look(here)]
             wrench = np.array([*push, *moment], dtype=np.float64)
             total += jacobian.T @ wrench
             powers[k] = wrench @ (jacobian @ v)
-        return total, powers, np.array(seen, dtype=np.float64)
+        return AppliedAt(
+            total, powers, np.array(seen, dtype=np.float64), np.array(rates, dtype=np.float64)
+        )
 
-    def _here(self, force: ExternalForce, v: Array, reference: Array) -> Here:
+    def _here(
+        self, force: ExternalForce, v: Array, reference: Array, states: list[Number]
+    ) -> Here:
         """What a force sees at the posture that was placed last."""
         pose = self._jacobians.pose(force.frame)
         rate = (self._jacobians.of(force.frame) @ v).tolist()
         place, turn = pose.translation.tolist(), pose.rotation.tolist()
-        return Here(place, turn, rate[:3], rate[3:], reference.tolist())
+        return Here(place, turn, rate[:3], rate[3:], reference.tolist(), states)
 
 
 def _placed(machine: Machine, force: ExternalForce) -> tuple[int, pin.SE3]:

@@ -25,6 +25,7 @@ from crane.control import (
 )
 from crane.description.external import ExternalForce
 from crane.dynamics import Dynamics
+from crane.dynamics.external import states_of
 from crane.formats import load
 from crane.machine import Machine
 from crane.motion.trajectories import Trajectory, beyond_limits
@@ -201,7 +202,8 @@ def integrate(
         raise SimulationError(f"at t = 0 s, where the motion starts: {error}") from None
     if text := buried(machine, posture):
         raise SimulationError(f"at t = 0 s, where the motion starts: {text}")
-    state = np.concatenate([posture, v_a, own, np.zeros(2 + len(machine.external))])
+    shear, energies = np.zeros(states_of(machine.external)), np.zeros(2 + len(machine.external))
+    state = np.concatenate([posture, v_a, shear, own, energies])
     make = integration_of(dynamics, control, len(own), method, tolerance)
     chart = chart or Chart.of(dynamics)
     integration = ChartedSteps(chart, control, len(own), make)
@@ -261,6 +263,10 @@ def integration_of(
     if isinstance(control, ValveDrive) and control.period and method != "rosenbrock":
         raise InputError(
             f"method '{method}' does not call the valves' program, leave the method out"
+        )
+    if method == "Radau" and states_of(dynamics.machine.external):
+        raise InputError(
+            "method 'Radau' does not follow how tyres give way along the ground, take DOP853"
         )
     options: dict[str, float] = {}
     if tolerance is not None:

@@ -14,6 +14,7 @@ from crane.formats.machine_file.tree_builder import TreeBuilder
 
 _SURFACE = ("height", "normal", "profile")
 _LAW = {"stiffness": STIFFNESS, "damping": DAMPING, "friction": FRICTION, "smoothing": SMOOTHING}
+_OWN = ("radius", "area", "lateral_stiffness", "lateral_damping")
 _SOIL = tuple(field.name for field in dataclasses.fields(Soil))
 _BLADE = ("width", "length", "thickness", "smoothing")
 
@@ -59,17 +60,15 @@ def _wrench(item: Section, frame: str) -> Wrench:
 def _contacts(
     top: Section, tree: TreeBuilder, ground: Ground | None, usual: dict[str, float]
 ) -> Iterator[Contact]:
-    for item in top.sections("contacts", "contact of", "frame", "radius", "area", "name", *_LAW):
+    for item in top.sections("contacts", "contact of", "frame", "name", *_OWN, *_LAW):
         with recoverable():
             frame = _frame(item, tree)
             if "ground" not in top:
                 raise item.fail(None, "contacts without a ground, add 'ground: {height: 0}'")
             numbers = {key: item.number(key, value) for key, value in usual.items()}
-            radius, area = item.number("radius", 0.0), item.number("area", 0.0)
+            numbers |= {key: item.number(key, 0.0) for key in _OWN}
             try:
-                yield Contact(
-                    frame, ground, **numbers, radius=radius, area=area, name=item.text("name", "")
-                )
+                yield Contact(frame, ground, **numbers, name=item.text("name", ""))
             except InputError as error:
                 raise item.fail(None, str(error)) from None
 
@@ -170,7 +169,7 @@ def outside_data(forces: tuple[ExternalForce, ...]) -> dict[str, Any]:
             data["loads"].append(_load(force))
         elif type(force) is Contact:
             item: dict[str, Any] = {"frame": force.frame}
-            item |= {key: getattr(force, key) for key in (*_LAW, "radius", "area")}
+            item |= {key: getattr(force, key) for key in (*_LAW, *_OWN)}
             data["contacts"].append(item | _named(force))
         elif type(force) is Cutting:
             item = {"frame": force.frame, "blade": force.blade, "cutting": force.cutting}

@@ -23,7 +23,7 @@ from crane.codegen.scalar import Expression, Number, dot
 from crane.common.errors import ClosureError, InputError, MechanismError
 from crane.common.samples import Array
 from crane.dynamics import Dynamics
-from crane.dynamics.external import ExternalForces, form_of
+from crane.dynamics.external import AppliedAt, ExternalForces, form_of
 from crane.machine import Machine
 from crane.simulation.integration.sticking import Sticking
 
@@ -102,17 +102,17 @@ class Chart:
         """Forces (n,) along the chart's coordinates of the user's at a closed posture."""
         return tau if self.own else self.turns(q).T @ tau
 
-    def outside(self, time: float, q: Array, v: Array) -> tuple[Array, Array, Array]:
-        """What forces from outside do at a time [s], a closed posture (nq,), velocities (n,).
+    def outside(self, time: float, q: Array, v: Array, states: Array) -> AppliedAt:
+        """What forces from outside do along the chart's coordinates.
 
-        Returns:
-            (n,) along the chart's coordinates, powers (k,) [W], and what is seen.
+        At a time [s], a closed posture (nq,), velocities (n,) and states of theirs.
         """
         if not self.machine.external:
-            return np.zeros(len(v)), np.zeros(0), np.zeros(0)
+            none: Array = np.zeros(0)
+            return AppliedAt(np.zeros(len(v)), none, none, none)
         gamma = self.machine.closure.gamma(q)
-        along, powers, seen = self._external.along(time, q, gamma @ v)
-        return gamma.T @ along, powers, seen
+        applied = self._external.along(time, q, gamma @ v, states)
+        return applied._replace(forces=gamma.T @ applied.forces)
 
     @cached_property
     def _external(self) -> ExternalForces:

@@ -13,6 +13,7 @@ from crane.codegen.representation import Routine
 from crane.codegen.scalar import add, apply, dot, maximum, minimum, scale, with_sign_of
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
+from crane.dynamics.external import states_of
 from crane.machine import Machine
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.sticking import NEAR
@@ -84,7 +85,8 @@ def errors_of(chart: Chart, states: int, tolerance: float) -> Array:
     closure = chart.machine.closure
     rates = closure.units[closure.active] / closure.pace
     energies = np.full(2 + len(chart.machine.external), ENERGY * energy_of(chart))
-    every = np.concatenate([closure.units, rates, np.ones(states), energies])
+    shear = np.full(states_of(chart.machine.external), closure.size)
+    every = np.concatenate([closure.units, rates, shear, np.ones(states), energies])
     return tolerance * np.append(LEAST * every, 1.0)
 
 
@@ -208,7 +210,8 @@ class ControlledStepper(Stepper):
             program.add("observe" + added, 5, {"seen": [*seen, *look], "margin": [margin]})
             machine, _, tau, own_rate = self._driven(Tape())
             moved, slopes = machine.moved(tau, rest), machine.sweep.slopes
-            rate = [*slopes, *moved.a_a, *own_rate, *machine.powers(tau)]
+            shear = machine.outside.rates
+            rate = [*slopes, *moved.a_a, *shear, *own_rate, *machine.powers(tau)]
             closure = self._chart.machine.closure
             edges = machine.sweep.edges(closure.units.tolist(), closure.size)
             edges += scale(1.0 / closure.size, machine.outside.edges)

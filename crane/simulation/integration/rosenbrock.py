@@ -8,6 +8,7 @@ from crane.codegen.derivative import derivatives
 from crane.codegen.factors import Matrix, eliminated, loaded, stored, substituted
 from crane.codegen.scalar import add, apply, minimum, scale, subtract, times
 from crane.control import TracedController, ValveDrive
+from crane.dynamics.external import states_of
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.controlled import (
     ENERGY,
@@ -89,6 +90,7 @@ class StiffStepper(ControlledStepper):
             [
                 _COORDINATE * closure.units,
                 _VELOCITY * closure.units[closure.active] / closure.pace,
+                np.full(states_of(chart.machine.external), _COORDINATE * closure.size),
                 scales,
             ]
         )
@@ -201,7 +203,9 @@ class StiffStepper(ControlledStepper):
             v_a = [w * y for w, y in zip(there["free"][0], x[stiff : stiff + n], strict=True)]
             own = [*x[:stiff], *part.own[stiff:]]
             q = add(part.q, times(there["ways"], v_a))
-            program.add(f"solve{i}{added}", 4, [*q, *v_a, *own, *part.work, *part.lost])
+            program.add(
+                f"solve{i}{added}", 4, [*q, *v_a, *part.shear, *own, *part.work, *part.lost]
+            )
 
     def _made(self, program: Program, step: Attempt) -> tuple[Way, Way]:
         """See `ControlledStepper`."""

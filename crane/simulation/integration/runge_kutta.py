@@ -44,7 +44,8 @@ class CompiledStepper(Stepper):
                 machine, _, tau, own_rate = self._driven(Tape())
                 moved = machine.moved(tau, rest)
                 slopes, powers = machine.sweep.slopes, machine.powers(tau)
-                outputs = {"rate": [*slopes, *moved.a_a, *own_rate, *powers]}
+                shear = machine.outside.rates
+                outputs = {"rate": [*slopes, *moved.a_a, *shear, *own_rate, *powers]}
                 if name == "observe":
                     outputs["seen"] = machine.observed(tau, rest)
                     outputs["margin"] = [moved.margin]

@@ -3,17 +3,20 @@
 from crane.codegen import Layout
 from crane.control import Controller, ValveDrive
 from crane.description.external import PARTS
+from crane.dynamics.external import states_of
 from crane.dynamics.joint_forces import sticking
 from crane.machine import Machine
 
 
 def state_layout(machine: Machine, own: int) -> Layout:
-    """What is integrated: q (nv), v_a (n), the controller's own, work, lost [J].
+    """What is integrated: q (nv), v_a (n), shear, the controller's own, work, lost [J].
 
+    Shear are the states of forces from outside: how far tyres have given way along the ground.
     Work is that of the active forces, then of each force from outside.
     """
     n, works = len(machine.active), 1 + len(machine.external)
-    return Layout(q=machine.model.nv, v_a=n, own=own, work=works, lost=1)
+    shear = states_of(machine.external)
+    return Layout(q=machine.model.nv, v_a=n, shear=shear, own=own, work=works, lost=1)
 
 
 def seen_layout(machine: Machine, control: Controller) -> Layout:

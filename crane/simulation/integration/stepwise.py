@@ -53,7 +53,8 @@ class PythonStepper:
             tau = np.zeros(0) if seen is None else seen[: len(chart.seen)]
             if seen is None:
                 tau, _ = self._asked(time, at, chart.velocities(at.q, at.v_a))
-            forces = chart.forces(at.q, tau) + chart.outside(time, at.q, at.v_a)[0]
+            forces = chart.forces(at.q, tau)
+            forces += chart.outside(time, at.q, at.v_a, at.shear).forces
             at.v_a[:] = chart.sticking.settle(self._dynamics, at.q, at.v_a, forces)
         except ClosureError as error:
             raise HaltedError(time, self.here(state), f": {error}") from None
@@ -77,8 +78,8 @@ class PythonStepper:
         """
         rate, tau = self._rate(time, state)
         at = self.layout.view(state)
-        outside, _, acting = self._chart.outside(time, at.q, at.v_a)
-        forces = self._chart.forces(at.q, tau) + outside
+        outside = self._chart.outside(time, at.q, at.v_a, at.shear)
+        forces = self._chart.forces(at.q, tau) + outside.forces
         seen = self._dynamics.at("observation", at.q, at.v_a, forces)
         more: Array = np.zeros(0)
         if isinstance(self._control, ValveDrive):
@@ -86,7 +87,7 @@ class PythonStepper:
             v_a = self._chart.velocities(at.q, at.v_a)
             where = control.at(time, self.here(state), v_a, at.own)
             more = np.array(control.look(where), dtype=np.float64)
-        return rate, np.concatenate([tau, seen, acting, more])
+        return rate, np.concatenate([tau, seen, outside.seen, more])
 
     def advance(self, time: float, state: Array, first: Array, step: float) -> Array:
         """The state one step later, its rate at the start given.
@@ -136,13 +137,14 @@ class PythonStepper:
         try:
             v_a = chart.velocities(at.q, at.v_a)
             tau, own_rate = self._asked(time, at, v_a)
-            outside, powers, _ = chart.outside(time, at.q, at.v_a)
-            forces = chart.forces(at.q, tau) + outside
+            outside = chart.outside(time, at.q, at.v_a, at.shear)
+            forces = chart.forces(at.q, tau) + outside.forces
             rates = self._dynamics.at("rates", at.q, at.v_a, forces)
         except ClosureError as error:
             raise HaltedError(time, self.here(state), f": {error}") from None
         self.margin = float(rates[-1])
-        return np.concatenate([rates[:-2], own_rate, [tau @ v_a, *powers, rates[-2]]]), tau
+        energies = [tau @ v_a, *outside.powers, rates[-2]]
+        return np.concatenate([rates[:-2], outside.rates, own_rate, energies]), tau
 
     def _asked(self, time: float, at: Parts, v_a: Array) -> tuple[Array, Array]:
         """What the controller answers, (n,) and (k,)."""

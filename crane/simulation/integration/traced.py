@@ -136,7 +136,7 @@ def machine_at(
     constants = Constants(tape, 1, pattern)
     sweep = Sweep(posture, loops, constants, q, parts.v_a, dynamics.form, modes=True)
     v_a = parts.v_a if chart.own else [sweep.rates[i + 1] for i in chart.seen]
-    applied = external.traced(chart.machine, sweep, outside)
+    applied = external.traced(chart.machine, sweep, outside, parts.shear)
     return Traced(chart, sweep, parts, [q[i] for i in chart.seen], v_a, applied)
 
 

@@ -10,6 +10,7 @@ from crane.common.errors import InputError, SimulationError
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.dynamics import Dynamics
+from crane.dynamics.external import states_of
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.state import row_layout
 from crane.simulation.integration.sticking import Switch
@@ -156,6 +157,11 @@ class Track:
             )
         if machine.coordinates.floating:
             raise InputError(f"'{machine.name}' floats, sensitivities are of machines that stand")
+        if states_of(machine.external):
+            raise InputError(
+                f"'{machine.name}' has contacts that give way along the ground, sensitivities "
+                "are of those without lateral stiffness"
+            )
         self.chart.sticking.switches = []
         made = (dynamics, control, motion.initial, 2 * count, 0.5 * step, motion.method)
         time, parts, self.notes = integrate(*made, progress, motion.tolerance, self.chart)
