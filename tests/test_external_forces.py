@@ -200,7 +200,7 @@ def test_what_is_no_load_is_refused():
     for load, text in (
         (lambda: crane.Wrench("nix", (1, 0, 0)), "'nix'"),
         (lambda: crane.Wrench(tip, (1, 0)), r"force has the shape \(2,\)"),
-        (lambda: crane.Wrench(tip, (1, 0, np.nan)), "no finite numbers"),
+        (lambda: crane.Wrench(tip, (1, 0, np.nan)), "no finite number"),
         (lambda: crane.Wrench(tip, [[1, 0, 0]] * 2, times=[1, 0]), "times do not rise"),
         (lambda: crane.Wrench(tip, axes="tip"), "give 'world' or 'frame'"),
         (lambda: crane.Pushing(tip, lambda *_: [np.nan] * 6), "six numbers"),
@@ -296,7 +296,7 @@ def test_loads_are_typed(pushed, tmp_path):
     for word, said in (
         ("slide", "no FRAME=WRENCH"), ("nix=1,0,0", "'nix'"), ("slide=1,0", "3 or 6 numbers"),
         ("slide=no.csv", "no.csv"), ("slide@up=1,0,0", "'world' or 'frame'"),
-        ("block=1,0,0", "two loads are called"), ("slide=1,0,nan", "no finite numbers"),
+        ("block=1,0,0", "two loads are called"), ("slide=1,0,nan", "no finite number"),
     ):  # fmt: skip
         done = typed(*command[:-1], tmp_path / "other", "--load", word)
         assert done.returncode == 2 and said in done.stderr, done.stderr

@@ -123,10 +123,10 @@ class Wrench(ExternalForce):
         if axes not in AXES:
             raise InputError(f"{what} has axes '{axes}', give 'world' or 'frame'")
         self.axes = axes
-        self.times = _numbers([0.0] if times is None else times, f"{what}: times", 1)
+        self.times = _numbers([0.0] if times is None else times, f"the list of times of {what}", 1)
         parts = []
         for name_, given in (("force", force), ("moment", moment)):
-            part = _numbers(given, f"{what}: {name_}", None)
+            part = _numbers(given, f"the {name_} of {what}", None)
             if part.shape not in ((3,), (len(self.times), 3)):
                 raise InputError(
                     f"{what}: {name_} has the shape {part.shape}, give (3,), or with times (N,) "
@@ -206,5 +206,5 @@ def _numbers(given: ArrayLike, what: str, axes: int | None) -> Array:
     except (TypeError, ValueError):
         found = np.array(np.nan)
     if not np.isfinite(found).all() or (axes is not None and found.ndim != axes):
-        raise InputError(f"{what} are no finite numbers, correct them")
+        raise InputError(f"{what} holds what is no finite number, correct it")
     return found
