@@ -418,6 +418,7 @@ class MachineSpec:
     sensors: Mapping[str, Sensor] = field(default_factory=dict)  # by quantity
     estimation: Estimation = Estimation()
     external: tuple[ExternalForce, ...] = ()  # forces from outside
+    supports: tuple[str, ...] = ()  # links that it stands on
 
     @property
     def elements(self) -> tuple[Element, ...]:

@@ -202,6 +202,7 @@ def _assembled(
         changes=MappingProxyType({name: float(value) for name, value in (changes or {}).items()}),
         free=free_joints(spec, closure.active_names),
         external=(),
+        supports=spec.supports,
         motors=motors(spec, closure.active_names),
         locks=MappingProxyType({name: float(value) for name, value in (lock or {}).items()}),
     )

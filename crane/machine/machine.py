@@ -90,6 +90,7 @@ class Machine:
         sensors: What is known of its sensors by quantity, see `crane.description.sensors`.
         free: Active joints that nothing drives: no force but friction, springs and stops.
         external: Forces from outside.
+        supports: Links that it stands on; none where those are its contacts.
         motors: What the file says that motors act on (actuators of a MJCF), or all drives where
             there are more than freedoms; empty where `drives` are the active joints.
         changes: Numbers that are not those of its files, by name.
@@ -124,6 +125,7 @@ class Machine:
     sensors: Mapping[str, Sensor]
     free: tuple[str, ...]
     external: tuple[ExternalForce, ...]
+    supports: tuple[str, ...]
     motors: tuple[Drive, ...]
     changes: Mapping[str, float]
     locks: Mapping[str, float]

@@ -9,6 +9,7 @@ from crane.common.samples import Array
 from crane.control import Controller, Free, Signals, ValveDrive, reference_of
 from crane.description.external import PARTS
 from crane.dynamics.joint_forces import sticking
+from crane.dynamics.stability import Stability, has_supports
 from crane.hydraulics.circuit import BALANCES
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
@@ -76,6 +77,7 @@ def _channels(machine: Machine, control: Controller, time: Array, rows: Parts) -
     for name, part in names.items():
         yield name, getattr(rows, part)[:, 0], "J"
     yield from _outside(machine, rows)
+    yield from _standing(machine, rows)
     if isinstance(control, ValveDrive):
         integrals = rows.own[:, -len(BALANCES) :]
         units = [*control.channels, *BALANCES.items()]
@@ -93,6 +95,26 @@ def _outside(machine: Machine, rows: Parts) -> Iterator[Column]:
         for (name, unit), values in zip(force.channels, columns, strict=False):
             yield name, values, unit
         yield f"work_{force.name}", rows.work[:, 1 + k], "J"
+
+
+def _standing(machine: Machine, rows: Parts) -> Iterator[Column]:
+    """What supports carry, and how far it is from tipping."""
+    if not has_supports(machine):
+        return
+    stability, q = Stability(machine), rows.q
+    if stability.stands:
+        v = np.einsum("nij,nj->ni", machine.closure.gamma(q), rows.v_a)
+        ground = stability.ground(q, v, rows.a, rows.outside)
+        for name, values in zip(stability.names, stability.carried(q, ground).T, strict=True):
+            yield f"support_{name}", values, "N"
+    else:
+        ground = stability.pressed(q, rows.outside)
+    still = stability.ground(q, outside=rows.outside)
+    for word, wrench in (("stability", ground), ("static_stability", still)):
+        margins = stability.margins(q, wrench)
+        for line, values in zip(stability.lines, margins.moments.T, strict=True):
+            yield f"{word}_{'_'.join(line)}", values, "N m"
+        yield word, margins.least, ""
 
 
 def _references(machine: Machine, reference: Trajectory, time: Array) -> Iterator[Column]:

@@ -52,8 +52,8 @@ Part = TypeVar("Part")
 _KEYS = (
     "name", "source", "chains", "floating", "loops", "active", "free", "drives", "home",
     "friction", "forces", "gas_springs", "ropes", "loads", "ground", "contacts", "soil",
-    "cutters", "end_stops", "rotor_inertia", "couplings", "tip", "payload", "tasks", "control",
-    "hydraulics", "sensors", "identification",
+    "cutters", "supports", "end_stops", "rotor_inertia", "couplings", "tip", "payload", "tasks",
+    "control", "hydraulics", "sensors", "identification",
 )  # fmt: skip
 
 
@@ -154,6 +154,7 @@ def _read_machine(path: Path) -> MachineSpec:
         _part(read_sensors, {}, top, tree),
         _part(read_estimation, Estimation(), top),
         _part(read_outside, (), top, tree),
+        _part(_supports, (), top, tree),
     )  # fmt: skip
 
 
@@ -168,6 +169,21 @@ def _floating(top: Section) -> tuple[str, ...]:
                 "floating", f"freedom '{name}' of the root is unknown, {known(PARTS, name)}"
             )
     return freedoms_of(names)
+
+
+def _supports(top: Section, tree: TreeBuilder) -> tuple[str, ...]:
+    """Links that the machine stands on."""
+    names = top.names("supports") if "supports" in top else ()
+    contacts = {item.text("frame", "") for item in top.sections("contacts", "contact of")}
+    for link in names:
+        tree.check_link(link, top.where("supports"), "the support")
+        if tree.moves(link) and link not in contacts:
+            raise top.fail(
+                "supports", f"support '{link}' moves, name links of the base or those of contacts"
+            )
+    if names and len(names) < 3:
+        raise top.fail("supports", f"{len(names)} supports make no area, name three or more")
+    return names
 
 
 def _free(top: Section, tree: TreeBuilder, active: Container[str]) -> tuple[str, ...]:

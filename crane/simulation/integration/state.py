@@ -23,14 +23,16 @@ def seen_layout(machine: Machine, control: Controller) -> Layout:
     """What is observed.
 
     tau (n), friction (n), kinetic, potential [J], friction of joints at rest that stick, wrench
-    and channels of each force from outside, channels of circuits.
+    and channels of each force from outside, accelerations of all joints where the machine has
+    supports to carry what they take, channels of circuits.
     """
     n, rest = len(machine.active), len(sticking(machine))
     channels = len(control.channels) if isinstance(control, ValveDrive) else 0
     outside = sum(len(PARTS) + len(force.channels) for force in machine.external)
     return Layout(
-        tau=n, friction=n, kinetic=1, potential=1, rest=rest, outside=outside, channels=channels
-    )
+        tau=n, friction=n, kinetic=1, potential=1, rest=rest, outside=outside,
+        a=machine.model.nv if machine.supports else 0, channels=channels,
+    )  # fmt: skip
 
 
 def row_layout(machine: Machine, control: Controller, own: int) -> Layout:

@@ -82,12 +82,17 @@ class PythonStepper:
         forces = self._chart.forces(at.q, tau) + outside.forces
         seen = self._dynamics.at("observation", at.q, at.v_a, forces)
         more: Array = np.zeros(0)
+        a: Array = np.zeros(0)
+        closure = self._chart.machine.closure
+        if self._chart.machine.supports:
+            gamma = closure.gamma(at.q)
+            a = gamma @ self.layout.view(rate).v_a + closure.drift(at.q, gamma @ at.v_a)
         if isinstance(self._control, ValveDrive):
             control = self._control
             v_a = self._chart.velocities(at.q, at.v_a)
             where = control.at(time, self.here(state), v_a, at.own)
             more = np.array(control.look(where), dtype=np.float64)
-        return rate, np.concatenate([tau, seen, outside.seen, more])
+        return rate, np.concatenate([tau, seen, outside.seen, a, more])
 
     def advance(self, time: float, state: Array, first: Array, step: float) -> Array:
         """The state one step later, its rate at the start given.

@@ -79,7 +79,11 @@ class Traced:
         """What is seen, but for a circuit's channels; see `seen_layout`."""
         moved, sweep = self.moved(tau, rest), self.sweep
         own = [*tau, *moved.friction, sweep.kinetic, sweep.potential, *moved.rest]
-        return [*own, *self.outside.seen]
+        a: list[Number] = []
+        if self.chart.machine.supports:
+            rows = sorted(sweep.gamma.items())
+            a = [dot(row, moved.a_a) + sweep.drift[i] for i, row in rows]
+        return [*own, *self.outside.seen, *a]
 
     def forces(self, tau: Sequence[Number]) -> list[Number]:
         """What acts along the chart's coordinates, inertia and weight apart."""
@@ -175,7 +179,7 @@ class Stepper:
         self._sticks = bool(chart.sticking.columns)
         self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
         form = form_of(control, own, chart, states, fold)
-        key = (*method, form, states, *chart.formulas)
+        key = (*method, form, states, bool(machine.supports), *chart.formulas)
         if key not in self._fast.programs:
             self._fast.programs[key] = program_of(machine, control, self._fast, key, self._build)
         self._program = self._fast.programs[key]

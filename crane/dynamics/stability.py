@@ -1,0 +1,283 @@
+"""Whether a machine tips: what its supports carry, and the moments about its tipping lines."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+from scipy.optimize import nnls
+from scipy.spatial import ConvexHull, QhullError
+
+from crane.common.errors import InputError
+from crane.common.samples import Array, as_samples
+from crane.description.external import PARTS
+from crane.description.ground import Contact
+from crane.dynamics.frames import FrameJacobians
+from crane.machine import Machine
+
+_ENOUGH = -1e-9  # of the weight, that a support carries which carries none
+
+
+class Margins(NamedTuple):
+    """How far a machine is from tipping, at N postures with k tipping lines.
+
+    Attributes:
+        moments: (N, k) about each line, that hold the machine down [N m]; below 0 it tips.
+        shares: (N, k) the same as a share of the machine's weight: what the support that is
+            farthest from the line would carry of it, if it alone held against the moment.
+    """
+
+    moments: Array
+    shares: Array
+
+    @property
+    def least(self) -> Array:
+        """(N,) the smallest share."""
+        least: Array = self.shares.min(axis=1)
+        return least
+
+
+class Stability:
+    """The tipping lines of a machine, the edges of the hull around its supports seen from above.
+
+    With G, M the force and the moment about the world's origin by which the ground holds it, and a
+    line from support i to the next one anticlockwise, j,
+
+        moment = (p_j - p_i) / |p_j - p_i| . (M - p_i x G),
+
+    which is what turns the machine about the line onto its supports: its static part is that of
+    ISO 10567 and EN 13000, inertial forces belong to it too (Ghasempoor and Sepehri, A measure of
+    machine stability for moving base manipulators, ICRA 1995). Of a machine that is fixed to the
+    world they follow from its motion,
+
+        G = d(momentum)/dt - m g - sum F,
+        M = d(angular momentum)/dt - sum r x m g - sum (r x F + M_F),
+
+    with wrenches F, M_F from outside. Of one on contacts they are what those press with.
+
+    Args:
+        machine: With `supports`, or at least three contacts.
+
+    Attributes:
+        names: Of the supports.
+        lines: Of each line the names of its two supports.
+        mass: Of the machine [kg].
+
+    Raises:
+        InputError: It has fewer than three supports, or all in one line.
+    """
+
+    def __init__(self, machine: Machine):
+        self.machine, self._frames = machine, FrameJacobians(machine)
+        held = supports(machine)
+        self.names, self._links = [name for name, _ in held], [link for _, link in held]
+        # which of the forces from outside are those of supports
+        self._pressing = [
+            k for k, force in enumerate(machine.external)
+            if isinstance(force, Contact) and (not machine.supports or force.frame in self._links)
+        ]  # fmt: skip
+        self.stands = all(
+            not machine.model.frames[machine.frame(x)].parentJoint for x in self._links
+        )
+        if not self.stands and len(self._pressing) < len(self._links):
+            raise InputError(f"'{machine.name}' has supports that move without being contacts")
+        try:
+            hull = ConvexHull(self._points(machine.home[None])[0, :, :2])
+        except (QhullError, ValueError):
+            raise InputError(
+                f"'{machine.name}' has {len(held)} supports and no area between them, name three "
+                "that are not in one line"
+            ) from None
+        around = [int(i) for i in hull.vertices]
+        self._edges = list(zip(around, around[1:] + around[:1], strict=True))
+        self.lines = [(self.names[i], self.names[j]) for i, j in self._edges]
+        self._model = pin.Model(machine.model)
+        self._data = self._model.createData()
+        self.mass = float(sum(inertia.mass for inertia in self._model.inertias))
+        self._gravity = self._model.gravity.linear.copy()
+
+    def static(self, q_a: ArrayLike) -> Margins:
+        """At rest, without forces from outside.
+
+        Args:
+            q_a: (n,) or (N, n) [m], [rad].
+        """
+        machine = self.machine
+        given = np.atleast_2d(as_samples(q_a, len(machine.active), "q_a", machine.active))
+        q = machine.closure.solve(given)
+        return self.margins(q, self.ground(q))
+
+    def tip_over_load(self, q_a: ArrayLike, frame: str | None = None) -> tuple[Array, list[str]]:
+        """The mass at a frame that tips the machine at rest: moment = -lever m g about a line.
+
+        Args:
+            q_a: (n,) or (N, n) [m], [rad].
+            frame: Where it hangs; the tip if not given.
+
+        Returns:
+            (N,) [kg], infinite where it hangs between the supports, below 0 where the machine
+            tips without it; and about which line, "A to B", "" about none.
+        """
+        machine = self.machine
+        link = machine.tip if frame is None else frame
+        if link is None:
+            raise InputError(f"'{machine.name}' has no tip, name the frame that a load hangs from")
+        given = np.atleast_2d(as_samples(q_a, len(machine.active), "q_a", machine.active))
+        q = machine.closure.solve(given)
+        moments = self.margins(q, self.ground(q)).moments
+        hanging = np.empty((len(q), 3))
+        for i, posture in enumerate(q):
+            self._frames.place(posture)
+            hanging[i] = self._frames.pose(link).translation
+        held = np.hstack([-self._gravity + 0 * hanging, np.cross(hanging, -self._gravity)])
+        levers = self._about(self._points(q), held)
+        with np.errstate(divide="ignore"):
+            every = np.where(levers < 0, moments / -levers, np.inf)
+        first = every.argmin(axis=1)
+        loads = every[np.arange(len(q)), first]
+        named = [" to ".join(self.lines[k]) for k in first.tolist()]
+        return loads, [x if np.isfinite(y) else "" for x, y in zip(named, loads, strict=True)]
+
+    def ground(
+        self,
+        q: Array,
+        v: Array | None = None,
+        a: Array | None = None,
+        outside: Array | None = None,
+    ) -> Array:
+        """The wrench by which the ground holds it (N, 6), about the world's origin.
+
+        Args:
+            q: (N, nv) closed postures.
+            v: (N, nv) velocities; at rest if not given.
+            a: (N, nv) accelerations, likewise.
+            outside: (N, .) wrench and channels of each force from outside as a run records them;
+                none act if not given. Those of contacts that are supports are left out.
+        """
+        out = np.empty((len(q), 6))
+        still = np.zeros(self._model.nv)
+        coordinates = self.machine.coordinates
+        for i, posture in enumerate(q):
+            at = coordinates.configuration(posture)
+            rate = pin.computeCentroidalMomentumTimeVariation(
+                self._model, self._data, at,
+                still if v is None else v[i], still if a is None else a[i],
+            ).vector  # fmt: skip
+            own = self._model.inertias[0]  # what stands has no momentum
+            moved = self.mass - own.mass
+            com = self._data.com[0]
+            force = rate[:3] - self.mass * self._gravity
+            # the momentum's rate counts about the centre of what moves
+            moment = rate[3:] + np.cross(com, rate[:3] - moved * self._gravity)
+            moment = moment - np.cross(own.mass * own.lever, self._gravity)
+            out[i] = [*force, *moment]
+        if outside is not None:
+            for k in range(len(self.machine.external)):
+                if k not in self._pressing:
+                    out -= self._about_origin(q, k, outside)
+        return out
+
+    def pressed(self, q: Array, outside: Array) -> Array:
+        """The wrench (N, 6) by which its contacts hold it, about the world's origin."""
+        out = np.zeros((len(q), 6))
+        for k in self._pressing:
+            out += self._about_origin(q, k, outside)
+        return out
+
+    def margins(self, q: Array, ground: Array) -> Margins:
+        """About all lines.
+
+        Args:
+            q: (N, nv) closed postures.
+            ground: (N, 6) see `ground`.
+        """
+        points = self._points(q)
+        weight = self.mass * float(np.linalg.norm(self._gravity))
+        moments = self._about(points, ground)
+        shares = np.empty_like(moments)
+        for k, (first, second) in enumerate(self._edges):
+            way = points[:, second, :2] - points[:, first, :2]
+            across = points[..., :2] - points[:, first, None, :2]
+            area = way[:, None, 0] * across[..., 1] - way[:, None, 1] * across[..., 0]
+            far = np.abs(area).max(axis=1) / np.linalg.norm(way, axis=1)
+            shares[:, k] = moments[:, k] / (weight * far)
+        return Margins(moments, shares)
+
+    def carried(self, q: Array, ground: Array) -> Array:
+        """What each support carries (N, s) [N], of equal stiffness under a rigid frame.
+
+        Of all forces above 0 that are in balance with the ground's, those with the least sum of
+        squares; where it tips, those nearest to balance.
+        """
+        points = self._points(q)
+        x, y, z = np.moveaxis(points, 2, 0)
+        force, moment = ground[:, :3], ground[:, 3:]
+        level = np.zeros_like(force)
+        level[:, 2] = z.mean(axis=1)
+        moment = moment - np.cross(level, force)
+        wanted = np.stack([force[:, 2], moment[:, 0], moment[:, 1]], axis=1)
+        balance = np.stack([np.ones_like(x), y, -x], axis=1)
+        out: Array = np.einsum("nsk,nk->ns", np.linalg.pinv(balance), wanted)
+        for i in np.flatnonzero(out.min(axis=1) < 0):
+            out[i] = _shared(balance[i], wanted[i])
+        return out
+
+    def _points(self, q: Array) -> Array:
+        """(N, s, 3) where the supports are."""
+        out = np.empty((len(q), len(self._links), 3))
+        for i, posture in enumerate(q[:1] if self.stands else q):
+            self._frames.place(posture)
+            out[i] = [self._frames.pose(link).translation for link in self._links]
+        if self.stands:
+            out[:] = out[:1]
+        return out
+
+    def _about(self, points: Array, wrench: Array) -> Array:
+        """(N, k) moments of wrenches (N, 6) about the lines."""
+        out = np.empty((len(points), len(self._edges)))
+        for k, (first, second) in enumerate(self._edges):
+            way = points[:, second] - points[:, first]
+            moment = wrench[:, 3:] - np.cross(points[:, first], wrench[:, :3])
+            out[:, k] = (way * moment).sum(axis=1) / np.linalg.norm(way, axis=1)
+        return out
+
+    def _about_origin(self, q: Array, k: int, outside: Array) -> Array:
+        """(N, 6) of force k from outside."""
+        first = sum(len(PARTS) + len(x.channels) for x in self.machine.external[:k])
+        wrench = outside[:, first : first + len(PARTS)].copy()
+        places = np.zeros((len(q), 3))
+        for i in np.flatnonzero(wrench.any(axis=1)):
+            self._frames.place(q[i])
+            places[i] = self._frames.pose(self.machine.external[k].frame).translation
+        wrench[:, 3:] += np.cross(places, wrench[:, :3])
+        return wrench
+
+
+def supports(machine: Machine) -> list[tuple[str, str]]:
+    """Names and links of what a machine stands on: `supports`, or its contacts."""
+    if machine.supports:
+        return [(link, link) for link in machine.supports]
+    return [(x.name, x.frame) for x in machine.external if isinstance(x, Contact)]
+
+
+def has_supports(machine: Machine) -> bool:
+    """Whether there is a `Stability` of it."""
+    try:
+        return len(supports(machine)) > 2 and bool(Stability(machine).lines)
+    except InputError:
+        return False
+
+
+def _shared(balance: Array, wanted: Array) -> Array:
+    """Forces of at least 0 with balance (3, s) @ forces = wanted (3,) and least squares."""
+    on: Sequence[int] = range(balance.shape[1])
+    out = np.zeros(balance.shape[1])
+    while len(on) > 2:
+        part = np.linalg.lstsq(balance[:, on], wanted, rcond=None)[0]
+        if part.min() >= _ENOUGH * np.abs(part).max():
+            out[on] = np.maximum(part, 0.0)
+            return out
+        on = [i for i, force in zip(on, part, strict=True) if force > 0]
+    found: Array = nnls(balance, wanted)[0]
+    return found
