@@ -5,10 +5,12 @@ import shutil
 import numpy as np
 import pinocchio as pin
 import pytest
+from typed import typed
 
 import crane
 from crane.common.errors import CraneError
 from crane.dynamics.stability import Stability
+from crane.studies.tipping import tipping_load
 
 G, BASE, FEET = 9.81, 900.0, ((0.9, 1.1), (1.0, -1.0), (-1.2, -1.1), (-1.1, 1.2))
 MODELS = crane.load("patu655").path.parent
@@ -154,3 +156,59 @@ def test_wrong_supports_are_told(folder):
 def test_supports_are_written(standing, tmp_path):
     again = crane.load(crane.write_machine(standing, tmp_path / "written"))
     assert again.supports == standing.supports
+
+
+def test_a_payload_tips_it_by_its_inertia_earlier(folder, standing):
+    """At rest as hand moments say, and less while it slews."""
+    found = tipping_load(standing, "swing")
+    loaded = crane.load(folder / "patu655.yaml", {"payload.mass": found.static})
+    run = crane.simulate(
+        loaded, crane.ComputedTorque(loaded, crane.task_trajectory(loaded, "swing")), step=5e-3
+    )
+    assert run.channels["static_stability"].min() == pytest.approx(0.0, abs=1e-4)
+    assert found.mass < found.static
+    assert run.channels["stability"].min() < 0
+    worst = int(run.channels["static_stability"].argmin())
+    alone, _ = Stability(standing).tip_over_load(run.q[worst])
+    # the payload's centre hangs below the tip, so only nearly
+    assert found.static == pytest.approx(alone[0], rel=0.2)
+
+
+def test_what_is_fixed_is_what_stands_on_stiff_contacts(folder):
+    """At rest both press the ground alike; supports of equal stiffness share alike."""
+    path = folder / "floats.yaml"
+    text = (folder / "patu655.yaml").read_text().replace("\nsupports: [", "\n#supports: [")
+    home = text.replace("home:\n", "home:\n  base_z: 0.6\n")
+    contacts = "".join(f"  - {{frame: foot{i}}}\n" for i in range(4))
+    path.write_text(
+        f"{home}\nfloating: [x, y, z, rx, ry, rz]\nground: {{stiffness: 2.0e+7}}\n"
+        f"contacts:\n{contacts}"
+    )
+    floats = crane.load(path)
+    hold = crane.simulate(floats, None, None, 6.0, 0.01)
+    fixed = crane.load(folder / "patu655.yaml")
+    stability = Stability(fixed)
+    q_a = hold.q[-1][[floats.active.index(x) for x in fixed.active]]
+    q = fixed.closure.solve(q_a)[None]
+    carried = stability.carried(q, stability.ground(q))[0]
+    found = [hold.channels[f"support_foot{i}"][-1] for i in range(4)]
+    assert found == pytest.approx(carried, rel=0.02)
+    shares = Stability(floats)
+    assert hold.channels["stability"][-1] == pytest.approx(
+        stability.static(q_a).least[0], rel=0.02
+    )
+    assert shares.stands is False and stability.stands
+
+
+def test_the_command_tells_both_loads(folder, tmp_path):
+    path = folder / "patu655.yaml"
+    done = typed("stability", path, "--at", "X_ext=1.0", "--task", "swing")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("N m |") == 4 and "kg at 'tip' tip it about foot" in done.stdout
+    assert "in 'swing' a payload of" in done.stdout
+    done = typed("stability", "patu655")
+    assert done.returncode == 2 and "has 0 supports and no area between them" in done.stderr
+    words = "--task", "swing", "--set", "payload.mass=2500", "--out", tmp_path / "out"
+    run = typed("simulate", path, *words)
+    assert run.returncode == 0 and "it would tip at t =" in run.stdout + run.stderr
+    assert "of the weight hold it down" in (tmp_path / "out" / "summary.md").read_text()

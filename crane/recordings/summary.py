@@ -10,6 +10,9 @@ from crane.common.units import quantity
 from crane.description.sources import unchanged
 from crane.recordings.recording import FORCE_UNITS, Recording
 
+SUPPORT = "support_"
+_LIFTED = 0.05  # [s] in the air that is worth telling
+
 # Unit to read a coordinate in, and how many of it make one rad or m.
 READING_UNITS = {"rad": ("deg", 180.0 / np.pi), "m": ("mm", 1000.0)}
 
@@ -50,12 +53,14 @@ class Summary:
         joints: One entry per active joint.
         tip_peak_error: Largest distance of the tip from its reference [m]; None without one.
         tip_rms_error: Root of the time average of its square [m]; None without one.
+        stability: How far it is from tipping, in words, "" where that is not recorded.
     """
 
     duration: float
     joints: tuple[JointSummary, ...]
     tip_peak_error: float | None
     tip_rms_error: float | None
+    stability: str = ""
 
     def to_markdown(self) -> str:
         """A table with one row per joint, in degrees and millimetres."""
@@ -88,7 +93,53 @@ class Summary:
         if self.tip_peak_error is not None:
             errors = (_measure(x, 1e3, "mm") for x in (self.tip_peak_error, self.tip_rms_error))
             rows.append(("tip", "", "", "", "", *errors))
-        return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+        table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
+        return f"{table}\n{self.stability}\n" if self.stability else table
+
+
+def tipping(recording: Recording) -> str:
+    """What to say of supports that lift, or would if they could, else nothing.
+
+    By the channels stability, stability_<line> and support_<name>, see `crane.dynamics.stability`.
+    """
+    time, seen = recording.time, recording.channels
+    if "stability" not in seen:
+        return ""
+    names = [x.removeprefix(SUPPORT) for x in seen if x.startswith(SUPPORT)]
+    if any(f"work_{name}" in seen for name in names):  # contacts
+        lifted = {name: _lifted(time, seen[SUPPORT + name]) for name in names}
+        words = [f"'{name}' at t = {at:.4g} s" for name, at in lifted.items() if at is not None]
+        return f"supports lift: {', '.join(words)}" if words else ""
+    if seen["stability"].min() >= 0:
+        return ""
+    first = int(np.argmax(seen["stability"] < 0))
+    lines = {x: seen[x] for x in seen if x.startswith("stability_")}
+    line = min(lines, key=lambda x: float(lines[x][first]))
+    return (
+        f"it would tip at t = {time[first]:.4g} s, where it is fixed all the same: {line} is "
+        f"{lines[line].min():.3g} N m at worst; let a machine that may tip float on contacts"
+    )
+
+
+def _lifted(time: Array, force: Array) -> float | None:
+    """When what has stood is in the air for a while [s]."""
+    up = (force <= 0) & np.maximum.accumulate(force > 0)
+    edges = np.flatnonzero(np.diff(up.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    long = [first for first, behind in edges.tolist() if time[behind - 1] - time[first] > _LIFTED]
+    return float(time[long[0]]) if long else None
+
+
+def _stability(recording: Recording) -> str:
+    if "stability" not in recording.channels:
+        return ""
+    shares, still = (recording.channels[x] for x in ("stability", "static_stability"))
+    least = int(np.argmin(shares))
+    text = (
+        f"stability: at least {100 * shares[least]:.1f} % of the weight hold it down, at t = "
+        f"{recording.time[least]:.4g} s (at rest {100 * still.min():.1f} %)"
+    )
+    told = tipping(recording)
+    return f"{text}; {told}" if told else text
 
 
 def title(machine: str, what: str = "") -> str:
@@ -135,6 +186,7 @@ def summarize(recording: Recording) -> Summary:
         joints=tuple(joints),
         tip_peak_error=None if distance is None else _peak(distance),
         tip_rms_error=None if distance is None else rms(time, distance),
+        stability=_stability(recording),
     )
 
 

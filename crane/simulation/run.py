@@ -30,6 +30,7 @@ from crane.formats import load
 from crane.machine import Machine
 from crane.motion.trajectories import Trajectory, beyond_limits
 from crane.recordings.recording import Recording
+from crane.recordings.summary import tipping
 from crane.simulation.integration.adaptive import ADAPTIVE, AdaptiveSteps
 from crane.simulation.integration.charted import ChartedSteps, Way
 from crane.simulation.integration.charts import Chart
@@ -161,7 +162,10 @@ def simulate(
         machine, time, rows, step, fixed(dynamics, control, method), formulation == "exact"
     ):
         warnings.warn(text, CraneWarning, stacklevel=2)
-    return recorded(machine, control, time, rows, label)
+    found = recorded(machine, control, time, rows, label)
+    if text := tipping(found):
+        warnings.warn(text, CraneWarning, stacklevel=2)
+    return found
 
 
 def integrate(

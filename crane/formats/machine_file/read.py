@@ -1,14 +1,16 @@
 """Machine files and single URDFs, read and checked into a `MachineSpec`."""
 
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from crane.common.errors import DescriptionError, known
 from crane.common.packages import given
 from crane.description.estimation import Estimation
+from crane.description.external import ExternalForce
 from crane.description.findings import Anything, FollowUpError, flag, recoverable
 from crane.description.floating import PARTS, freedoms_of
+from crane.description.ground import Contact
 from crane.description.sources import find
 from crane.description.spec import (
     LOOP_TYPES,
@@ -147,14 +149,15 @@ def _read_machine(path: Path) -> MachineSpec:
             valves = hydraulics.joints
         tasks = _part(read_tasks, tasks, top, active, tip, valves)
         control = _part(_control, control, top, active)
+    outside = _part(read_outside, (), top, tree)
     return MachineSpec(
         name, source, path, chains, with_rotors(tree.tree, rotors), loops, active, home, friction,
         forces, gas_springs, end_stops, tip, tasks, control, hydraulics, couplings, where, payload,
         free, _part(_drives, (), top, tree), _part(read_ropes, (), top, tree),
         _part(read_sensors, {}, top, tree),
         _part(read_estimation, Estimation(), top),
-        _part(read_outside, (), top, tree),
-        _part(_supports, (), top, tree),
+        outside,
+        _part(_supports, (), top, tree, outside),
     )  # fmt: skip
 
 
@@ -171,10 +174,12 @@ def _floating(top: Section) -> tuple[str, ...]:
     return freedoms_of(names)
 
 
-def _supports(top: Section, tree: TreeBuilder) -> tuple[str, ...]:
+def _supports(
+    top: Section, tree: TreeBuilder, outside: Sequence[ExternalForce]
+) -> tuple[str, ...]:
     """Links that the machine stands on."""
     names = top.names("supports") if "supports" in top else ()
-    contacts = {item.text("frame", "") for item in top.sections("contacts", "contact of")}
+    contacts = {force.frame for force in outside if isinstance(force, Contact)}
     for link in names:
         tree.check_link(link, top.where("supports"), "the support")
         if tree.moves(link) and link not in contacts:

@@ -1,0 +1,67 @@
+"""The command on whether a machine tips: stability."""
+
+from typing import Annotated
+
+import typer
+
+from crane.cli.pictures import posture
+from crane.cli.shared import (
+    Active,
+    Argument,
+    Change,
+    Free,
+    Lock,
+    MachineName,
+    Packages,
+    app,
+    load,
+    status,
+)
+
+
+@app.command()
+def stability(
+    machine: MachineName,
+    at: Annotated[
+        str | None,
+        typer.Option(metavar="JOINT=VALUE,...", help="Where it stands, if not at home."),
+    ] = None,
+    frame: Annotated[
+        str | None,
+        typer.Option(metavar="LINK", help="What a load hangs from; the tip if not given."),
+    ] = None,
+    task: Annotated[
+        str | None, typer.Option(help="A task, during which its payload may tip it.")
+    ] = None,
+    change: Change = None,
+    lock: Lock = None,
+    active: Active = None,
+    free: Free = None,
+    packages: Packages = None,
+    argument: Argument = None,
+) -> None:
+    """Tell how far a machine is from tipping, and under which load it does."""
+    from crane.dynamics.stability import Stability
+    from crane.studies.tipping import tipping_load
+
+    loaded = load(machine, lock, change, active, free, False, packages, argument)
+    stands, q_a = Stability(loaded), posture(loaded, at)
+    (moments,), (shares,) = stands.static(q_a)
+    print("| tipping line | held by | of the weight |\n| --- | ---: | ---: |")
+    for line, moment, share in zip(stands.lines, moments, shares, strict=True):
+        print(f"| {' to '.join(line)} | {moment:.4g} N m | {100 * share:.1f} % |")
+    if loaded.tip is not None or frame is not None:
+        (mass,), (about,) = stands.tip_over_load(q_a, frame)
+        name = frame or loaded.tip
+        print(
+            f"\n{mass:.5g} kg at '{name}' tip it about {about}"
+            if about
+            else f"\nno load at '{name}' tips it"
+        )
+    if task is not None:
+        with status("tipping"):
+            found = tipping_load(loaded, task)
+        print(
+            f"in '{task}' a payload of {found.mass:.5g} kg tips it, at t = {found.time:.4g} s; "
+            f"at rest {found.static:.5g} kg would"
+        )
