@@ -143,7 +143,7 @@ def _read_machine(path: Path) -> MachineSpec:
         hydraulics = _part(read_hydraulics, None, top, tree, active)
         if hydraulics is not None and not isinstance(active, Anything):
             valves = hydraulics.joints
-        tasks = _part(read_tasks, tasks, top, active, tip, valves)
+        tasks = _part(read_tasks, tasks, top, tree, active, tip, valves)
         control = _part(_control, control, top, active)
     return MachineSpec(
         name, source, path, chains, with_rotors(tree.tree, rotors), loops, active, home, friction,
