@@ -15,7 +15,7 @@ from crane.cli.shared import (
     names,
     progress_bar,
 )
-from crane.cli.simulate import control_of, duration_of
+from crane.cli.simulate import control_of, duration_of, under_task
 
 
 @app.command()
@@ -59,7 +59,7 @@ def sensitivities(
 
     if out is not None:
         check_folder(out, force)
-    loaded = load(machine, lock, change)
+    loaded = under_task(load(machine, lock, change), task)
     control = control_of(loaded, task, controller)
     with progress_bar("simulating") as progress:
         found = run(

@@ -89,7 +89,7 @@ def simulate(
 
     check_folder(out, force)
     loaded = load(machine, lock, change, active, free, floating, packages, argument)
-    loaded = loaded.under(*loads_of(load_))
+    loaded = under_task(loaded, task).under(*loads_of(load_))
     if inputs is not None:
         named = {"--task": task, "--controller": controller}
         given = [option for option, value in named.items() if value is not None]
@@ -147,6 +147,13 @@ def control_of(
             raise InputError(f"task '{task}' moves levers, leave --controller out")
         return joystick(machine, task)
     return controller(name or usual(machine), machine, task_trajectory(machine, task))
+
+
+def under_task(machine: "Machine", task: str | None) -> "Machine":
+    """A machine under what acts from outside while a task is done; others tell of unknown ones."""
+    if task not in machine.tasks:
+        return machine
+    return machine.under(*machine.tasks[task].loads)
 
 
 def duration_of(machine: "Machine", task: str | None, duration: float | None) -> float:

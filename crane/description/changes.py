@@ -13,6 +13,7 @@ import numpy as np
 from crane.common.errors import CraneWarning, InputError, known
 from crane.common.magnitudes import doubt
 from crane.common.samples import FARTHEST, as_number
+from crane.description.external import ExternalForce
 from crane.description.floating import grounded
 from crane.description.sensors import (
     SENSOR,
@@ -302,6 +303,9 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
     tree = spec.tree.replacing(*held)
     body = tree.bodies()
 
+    def moves(force: ExternalForce) -> bool:
+        return body[force.frame] != body[tree.root]
+
     def acts(item: Element) -> bool:
         if item.between is None:
             return item.joint not in lock
@@ -322,14 +326,16 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
         friction={joint: value for joint, value in spec.friction.items() if joint not in lock},
         control={joint: value for joint, value in spec.control.items() if joint not in lock},
         forces=tuple(filter(acts, spec.forces)),
-        external=tuple(x for x in spec.external if body[x.frame] != body[tree.root]),
+        external=tuple(filter(moves, spec.external)),
         hydraulics=spec.hydraulics and spec.hydraulics.only(active or ()),
         gas_springs=tuple(filter(acts, spec.gas_springs)),
         ropes=tuple(filter(acts, spec.ropes)),
         end_stops=tuple(item for item in spec.end_stops if item.joint not in lock),
         tasks={
             name: dataclasses.replace(
-                task, levers={x: lever for x, lever in task.levers.items() if x not in lock}
+                task,
+                levers={x: lever for x, lever in task.levers.items() if x not in lock},
+                loads=tuple(filter(moves, task.loads)),
             )
             for name, task in spec.tasks.items()
             if not (task.space == "active" and task.coefficients.keys() & lock.keys())

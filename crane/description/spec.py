@@ -9,7 +9,7 @@ from typing import ClassVar
 from crane.common.errors import InputError
 from crane.common.samples import as_number
 from crane.description.estimation import Estimation
-from crane.description.external import ExternalForce
+from crane.description.external import ExternalForce, Wrench
 from crane.description.sensors import Sensor
 from crane.description.tree import Joint, Tree, Vector
 from crane.hydraulics.components import Hydraulics
@@ -366,6 +366,7 @@ class Task:
             "joystick" (levers of valves).
         coefficients: Per coordinate the polynomial in time [s], lowest power first [m], [rad].
         levers: Per joint a polygon of time [s] and lever, -1 to 1.
+        loads: What acts from outside while it is done, beside what always does.
     """
 
     name: str
@@ -374,6 +375,7 @@ class Task:
     space: str
     coefficients: Mapping[str, tuple[float, ...]]
     levers: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
+    loads: tuple[Wrench, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ def read_outside(top: Section, tree: TreeBuilder) -> tuple[Wrench | Contact | Cu
     if section is not None:
         with recoverable():
             ground, usual = _ground(section)
-    return *_loads(top, tree), *_contacts(top, tree, ground, usual), *_cutters(top, tree, ground)
+    return *read_loads(top, tree), *_contacts(top, tree, ground, usual), *_cutters(top, tree, ground)
 
 
 def _frame(item: Section, tree: TreeBuilder) -> str:
@@ -37,7 +37,8 @@ def _frame(item: Section, tree: TreeBuilder) -> str:
     return frame
 
 
-def _loads(top: Section, tree: TreeBuilder) -> Iterator[Wrench]:
+def read_loads(top: Section, tree: TreeBuilder) -> Iterator[Wrench]:
+    """The section `loads` of a machine or of a task."""
     keys = ("frame", "force", "moment", "times", "axes", "name")
     for item in top.sections("loads", "load of", *keys):
         with recoverable():
@@ -166,7 +167,7 @@ def outside_data(forces: tuple[ExternalForce, ...]) -> dict[str, Any]:
         }
     for force in forces:
         if type(force) is Wrench:
-            data["loads"].append(_load(force))
+            data["loads"].append(load_data(force))
         elif type(force) is Contact:
             item: dict[str, Any] = {"frame": force.frame}
             item |= {key: getattr(force, key) for key in (*_LAW, *_OWN)}
@@ -183,7 +184,8 @@ def outside_data(forces: tuple[ExternalForce, ...]) -> dict[str, Any]:
     return data
 
 
-def _load(force: Wrench) -> dict[str, Any]:
+def load_data(force: Wrench) -> dict[str, Any]:
+    """A load as the file has it."""
     data: dict[str, Any] = {"frame": force.frame, "axes": force.axes} | _named(force)
     several = len(force.times) > 1
     for key, part in (("force", force.values[:, :3]), ("moment", force.values[:, 3:])):

@@ -147,7 +147,7 @@ def _read_machine(path: Path) -> MachineSpec:
         hydraulics = _part(read_hydraulics, None, top, tree, active)
         if hydraulics is not None and not isinstance(active, Anything):
             valves = hydraulics.joints
-        tasks = _part(read_tasks, tasks, top, active, tip, valves)
+        tasks = _part(read_tasks, tasks, top, tree, active, tip, valves)
         control = _part(_control, control, top, active)
     outside = _part(read_outside, (), top, tree)
     return MachineSpec(

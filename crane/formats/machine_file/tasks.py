@@ -1,12 +1,20 @@
 """The section `tasks` of a machine file."""
 
+import dataclasses
+
 from crane.description.findings import Anything, flag, recoverable
 from crane.description.spec import Task
+from crane.formats.machine_file.outside import read_loads
 from crane.formats.machine_file.section import Section
+from crane.formats.machine_file.tree_builder import TreeBuilder
 
 
 def read_tasks(
-    top: Section, active: tuple[str, ...], tip: str | None, valves: tuple[str, ...]
+    top: Section,
+    tree: TreeBuilder,
+    active: tuple[str, ...],
+    tip: str | None,
+    valves: tuple[str, ...],
 ) -> dict[str, Task]:
     """Named motions.
 
@@ -14,11 +22,12 @@ def read_tasks(
         DescriptionError: With file, line, and what is wrong.
     """
     tasks = {}
-    keys = ("description", "duration", "tip", "active", "joystick")
+    keys = ("description", "duration", "tip", "active", "joystick", "loads")
     for name, item in top.mappings("tasks", "task", *keys):
         with recoverable():
             spaces = {"tip": ("x", "y", "z"), "active": active, "joystick": valves}
-            tasks[name] = _task(name, item, spaces, tip)
+            task = _task(name, item, spaces, tip)
+            tasks[name] = dataclasses.replace(task, loads=tuple(read_loads(item, tree)))
     return tasks
 
 

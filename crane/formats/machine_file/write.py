@@ -14,7 +14,7 @@ from crane.common.output import file_name, staging
 from crane.description import Task
 from crane.description.sensors import unit_of
 from crane.formats.machine_file.estimation import estimation_data
-from crane.formats.machine_file.outside import outside_data
+from crane.formats.machine_file.outside import load_data, outside_data
 from crane.formats.machine_file.places import InFile, InURDF, places
 from crane.formats.machine_file.read import read
 from crane.formats.machine_file.text import Way, yaml_text
@@ -275,6 +275,8 @@ def _numbers(item: Any, *without: str) -> dict[str, Any]:
 def _task(task: Task) -> dict[str, Any]:
     data: dict[str, Any] = {"description": task.description} if task.description else {}
     data["duration"] = task.duration
+    if task.loads:
+        data["loads"] = [load_data(load) for load in task.loads]
     if task.space == "joystick":
         levers = {
             joint: [x for point in polygon for x in point]
