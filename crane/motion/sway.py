@@ -108,16 +108,24 @@ class Sway:
             Angular frequencies (f,) omega [rad/s], the slowest first, and damping ratios (f,) of
             viscous friction, phi^T C phi / (2 omega phi^T M_ff phi).
         """
-        q_a = np.asarray(q_a, dtype=np.float64)
+        omega, shapes, _ = self._modes(np.asarray(q_a, dtype=np.float64))
+        damped: Array = np.einsum("ik,i,ik->k", shapes, self._viscous, shapes) / (2.0 * omega)
+        return omega, damped
+
+    def root(self, q_a: Array) -> Array:
+        """Omega (f, f) [rad/s] with Omega^2 = M_ff^-1 G, at a posture (n,) where it hangs."""
+        omega, shapes, mass = self._modes(q_a)
+        return shapes @ (omega[:, None] * (shapes.T @ mass))
+
+    def _modes(self, q_a: Array) -> tuple[Array, Array, Array]:
+        """Frequencies (f,), shapes (f, f) of unit modal mass, and M_ff."""
         free = ~self._driven
         mass = self._dynamics.mass_matrix(q_a)[np.ix_(free, free)]
         stiffness = self.stiffness(q_a)[:, free]
         squares, shapes = eigh((stiffness + stiffness.T) / 2, mass)
         if squares[0] <= 0:
             raise InputError(f"what {', '.join(self.machine.free)} carry does not hang")
-        omega = np.sqrt(squares)
-        damped: Array = np.einsum("ik,i,ik->k", shapes, self._viscous, shapes) / (2.0 * omega)
-        return omega, damped
+        return np.sqrt(squares), shapes, mass
 
     def shifts(self, q_a: Array) -> Array:
         """Motions of the drives that leave the load where it is while it turns about itself.
