@@ -24,7 +24,7 @@ _KNOTS_PER_SECOND = 50  # of forces and gains
 _STEPS_PER_SECOND = 1000  # of openings
 _BESIDE = 1e3  # [Pa] of difference quotients
 _LEAST_DROP = 1e5  # [Pa] that an edge is taken to have
-_JUMP = 0.01  # of the valve's flow, over which the dead band is jumped
+_JUMP = 0.003  # of the valve's flow, over which the dead band is jumped
 _TURN = 0.02  # likewise, over which openings and friction change with the direction
 
 
@@ -115,9 +115,11 @@ def demanded(
         q_a = np.where(out, fed_a, c3 * np.sqrt(np.maximum(p_a - tank, LAMINAR)))
         q_b = np.where(out, c2 * np.sqrt(np.maximum(p_b - tank, LAMINAR)), fed_b)
         y = asked / (area_a * q_a / ca + area_b * q_b / cb)
-        # sucked empty: the side that the load presses on sets the speed alone
-        y = np.where(out & (p_a < tank), (area_b * w + cb * rate[i] / area_b) / q_b, y)
-        y = np.where(~out & (p_b < tank), (area_a * w + ca * rate[i] / area_a) / q_a, y)
+        # sucked empty, and not filled yet: the side that the load presses on sets the speed alone
+        by_b = (area_b * w + cb * rate[i] / area_b) / q_b
+        by_a = (area_a * w + ca * rate[i] / area_a) / q_a
+        y = np.where(out & (p_a < tank) & (q_a * by_b < area_a * w), by_b, y)
+        y = np.where(~out & (p_b < tank) & (q_b * by_a > area_b * w), by_a, y)
         return y, (area_b * w - q_b * y) / cb
 
     found = np.empty_like(v)
@@ -141,7 +143,7 @@ class ValveFeedforward(ValvePD):
     the spool's lag, g the opening per velocity of `openings` under the reference's forces,
 
         w = y + tau y' + K_p (q_ref - q) + K_d (q_ref' - q') + g(v) K theta,
-        u = (1 - d) w + d tanh(w / 0.01).
+        u = (1 - d) w + d tanh(w / 0.003).
 
     theta is the sway against the reference's: what two inclinometers on the grapple tell, less what
     is planned, theta = (q_f - q_f,ref) - E (q_d - q_d,ref) with E as in `crane.motion.sway`. In
