@@ -24,6 +24,7 @@ from crane.cli import (  # noqa: F401  register their commands
     pictures,
     sensitivities,
     simulate,
+    sway,
     workspace,
 )
 from crane.cli.shared import INTERRUPTED, app, say

@@ -1,14 +1,16 @@
 """References of machines with something that hangs, which leave no sway behind.
 
-What hangs is what free joints carry: with q_f the free joints, q_d the driven ones and q_h(q_d) the
-free joints where it hangs still, g_f(q_d, q_h) = 0, its sway is theta = q_f - q_h. In q_d and theta
-the free joints' equations of motion are, with E = dq_h/dq_d = -G^-1 dg_f/dq_d and G = dg_f/dq_f,
+What hangs is what free joints carry: with q_f the free joints, q_d the driven ones and q_h(q_d)
+the free joints where it hangs still, g_f(q_d, q_h) = 0, its sway is theta = q_f - q_h. In q_d and
+theta the free joints' equations of motion are, with E = dq_h/dq_d = -G^-1 dg_f/dq_d and
+G = dg_f/dq_f,
 
     M_ff theta'' + (M_fd + M_ff E) q_d'' + G theta + ... = 0.
 """
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -169,7 +171,9 @@ class Sway:
     def excess(self, q_a: Array, v_a: Array, a_a: Array) -> Array:
         """Forces (N, f) that the free joints would need for a motion, but for dry friction."""
         free = ~self._driven
-        found: Array = self._dynamics.inverse(q_a, v_a, a_a)[:, free] + self._viscous * v_a[:, free]
+        found: Array = (
+            self._dynamics.inverse(q_a, v_a, a_a)[:, free] + self._viscous * v_a[:, free]
+        )
         return found
 
     @cached_property
@@ -240,13 +244,10 @@ def _sampled(machine: Machine, duration: float, motion: Callable[[Array], Array]
     return _through(time, motion(time))
 
 
-def _rest(n: int) -> list[tuple[int, Array]]:
-    return [(1, np.zeros(n)), (2, np.zeros(n))]
-
-
 def _derivatives(time: Array, q_a: Array) -> tuple[Array, Array]:
     """Velocities and accelerations of the quintic spline from rest to rest."""
-    ends = _rest(q_a.shape[1])
+    rest = np.zeros(q_a.shape[1])
+    ends: Any = [(1, rest), (2, rest)]  # of which scipy's types know less than scipy
     spline = make_interp_spline(time, q_a, k=5, bc_type=(ends, ends))
     return spline(time, 1), spline(time, 2)
 
@@ -258,7 +259,9 @@ def _through(time: Array, q_a: Array) -> Trajectory:
 def _hangs(machine: Machine, reference: Trajectory) -> Trajectory:
     """The reference, its free joints hanging still all along."""
     sway = Sway(machine)
-    return _sampled(machine, reference.duration, lambda time: sway.hanging(reference.position(time)))
+    return _sampled(
+        machine, reference.duration, lambda time: sway.hanging(reference.position(time))
+    )
 
 
 def _impulses(omega: float, zeta: float, derivative: bool) -> tuple[Array, Array]:
@@ -273,9 +276,9 @@ def impulses(machine: Machine, q_a: ArrayLike, derivative: bool = False) -> tupl
     """The input shaper of all that sways: Singer and Seering's, of each mode, one after the other.
 
     With K = exp(-zeta pi / sqrt(1 - zeta^2)) and the damped half period h, a mode's impulses are
-    1, K at 0, h (ZV, zero vibration), or 1, 2 K, K^2 at 0, h, 2 h (ZVD, whose residual has no slope
-    either at the mode's frequency), in shares of their sum (J. Dyn. Syst. Meas. Control 112 (1990)
-    76-82). The shapers of several modes are convolved.
+    1, K at 0, h (ZV, zero vibration), or 1, 2 K, K^2 at 0, h, 2 h (ZVD, whose residual has no
+    slope either at the mode's frequency), in shares of their sum (J. Dyn. Syst. Meas. Control 112
+    (1990) 76-82). The shapers of several modes are convolved.
 
     Args:
         machine: The machine, with free joints.

@@ -48,8 +48,8 @@ from crane.formats.urdf.read import Urdf, read_urdf
 Part = TypeVar("Part")
 
 _KEYS = (
-    EXTENDS, "name", "source", "chains", "loops", "active", "free", "drives", "home", "friction", "forces",
-    "gas_springs", "ropes", "loads", "ground", "contacts", "soil", "cutters", "end_stops",
+    EXTENDS, "name", "source", "chains", "loops", "active", "free", "drives", "home", "friction",
+    "forces", "gas_springs", "ropes", "loads", "ground", "contacts", "soil", "cutters", "end_stops",
     "rotor_inertia", "couplings", "tip", "payload", "tasks", "control", "hydraulics", "sensors",
     "identification",
 )  # fmt: skip
