@@ -28,7 +28,8 @@ class ValveFeedforward(ValvePD):
     """Valves opened for the reference's velocities, corrected by position and by sway.
 
     With y the openings that the reference demands of the circuit (`demanded`), tau the lag
-    2 zeta / omega of the spool, g the opening per velocity of `openings` under the reference's forces,
+    2 zeta / omega of the spool, g the opening per velocity of `openings` under the reference's
+    forces,
 
         w = y + tau y' + K_p (q_ref - q) + K_d (q_ref' - q') + g(v) K theta,
         u = (1 - d) w + d tanh(w / 0.003).

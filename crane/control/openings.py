@@ -64,8 +64,8 @@ def demanded(
         C_a p_a' = q_a y + r_a - A_a v,   C_b p_b' = A_b v - q_b y + r_b,   A_a p_a - A_b p_b = F,
 
     differentiated once gives y, and one pressure is left to be integrated. Where a chamber is
-    sucked empty the other one sets the speed alone. Left out: leaks, cushions, relief and load-holding
-    valves, and that the supply's pressure falls.
+    sucked empty the other one sets the speed alone. Left out: leaks, cushions, relief and
+    load-holding valves, and that the supply's pressure falls.
 
     Args:
         circuit: The circuit.
@@ -133,8 +133,8 @@ def demanded(
 def flow_share(machine: Machine, reference: Trajectory) -> float:
     """The largest share of its flow that a motion asks of a valve or of the pump.
 
-    Of a valve A |v| over the flow at full stroke, A the area that oil flows onto: c sqrt(margin) of
-    a compensated one, and half of the supply's pressure at either edge of another; of the pump the
+    Of a valve A |v| over the flow at full stroke, A the area that oil flows onto: c sqrt(margin)
+    of a compensated one, and half of the supply's pressure at either edge of another; of the pump the
     sum of A |v| over its most, where it has one.
 
     Args:

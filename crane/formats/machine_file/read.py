@@ -49,9 +49,9 @@ Part = TypeVar("Part")
 
 _KEYS = (
     EXTENDS, "name", "source", "chains", "loops", "active", "free", "drives", "home", "friction",
-    "forces", "gas_springs", "ropes", "loads", "ground", "contacts", "soil", "cutters", "end_stops",
-    "rotor_inertia", "couplings", "tip", "payload", "tasks", "control", "hydraulics", "sensors",
-    "identification",
+    "forces", "gas_springs", "ropes", "loads", "ground", "contacts", "soil", "cutters",
+    "end_stops", "rotor_inertia", "couplings", "tip", "payload", "tasks", "control", "hydraulics",
+    "sensors", "identification",
 )  # fmt: skip
 
 
