@@ -14,7 +14,7 @@ from crane.motion.sway import METHODS, Sway, impulses, retimed, without_sway
 
 GRAVITY = 9.81
 NAME = "patu655_grapple"
-# mass, distance of the centre below the upper pin, inertias about radial, vertical, tangential axis
+# mass, centre below the upper pin, inertias about axes forward, up and across
 LINK = (15.0, 0.065, (0.06, 0.03, 0.06))
 HOUSING = (30.0, 0.265, (0.16, 0.12, 0.16))
 GRAPPLE = (105.0, 0.56, (3.7, 4.5, 6.1))
@@ -215,7 +215,7 @@ def test_a_flat_reference_leaves_no_sway(payload):
     assert np.abs(sway[run.time >= 7.0]).max() < 5e-6
     np.testing.assert_allclose(run.q[:, -2:], flat.position(run.time)[:, -2:], rtol=0, atol=5e-6)
     _, before = follow(machine, without_sway(machine, reference, "none"), tolerance=1e-9)
-    assert np.abs(before[run.time >= 7.0]).max() > 0.03
+    assert np.abs(before[run.time >= 7.0]).max() > 0.02
 
 
 def test_equations_on_paper_say_so_too(loaded, quarter):
@@ -226,77 +226,76 @@ def test_equations_on_paper_say_so_too(loaded, quarter):
     np.testing.assert_allclose(found, flat.position(times)[:, -2:], rtol=0, atol=5e-6)
 
 
-def test_a_shaper_of_the_wrong_length_leaves_what_theory_says():
-    """|V| = |cos(pi r / 2)|, of ZVD its square, r the frequency over the shaper's, of each mode."""
-    rate, size = 0.02, 5.0
-    for derivative in (False, True):
-        designed = carrying(200.0, **smooth())
-        home = designed.home[designed.closure.active]
-        delays, shares = impulses(designed, home, derivative)
-        shaped = np.sqrt(Sway(designed).modes(home)[0])
-        assert shares.sum() == pytest.approx(1.0) and delays[0] == 0
-        for payload in (200.0, 60.0, 500.0):
-            machine = carrying(payload, **smooth())
-            sway = Sway(machine)
-            omega = sway.modes(home)[0][0]  # across the plane, where slewing sends it
-            vector = (shares * np.exp(1j * omega * delays)).sum()
-            wanted = np.prod(np.abs(np.cos(np.pi / 2 * omega / shaped**2)))
-            wanted = wanted ** (2 if derivative else 1)
-            assert abs(vector) == pytest.approx(wanted, abs=1e-9)
-            end = home.copy()
-            end[0] += rate
-            base = crane.point_to_point(home, end, size)
+class Shaped(crane.Trajectory):
+    """A reference sent through impulses."""
 
-            class Shaped(crane.Trajectory):
-                duration, tip = size + delays[-1], None
+    tip = None
 
-                def __init__(self):
-                    pass
+    def __init__(self, base, delays, shares):
+        self.duration = base.duration + delays[-1]
+        self._base, self._impulses = base, list(zip(delays, shares, strict=True))
 
-                def position(self, time, base=base):
-                    return sum(
-                        share * base.position(np.asarray(time) - delay)
-                        for delay, share in zip(delays, shares, strict=True)
-                    )
+    def position(self, time):
+        return sum(x * self._base.position(np.asarray(time) - at) for at, x in self._impulses)
 
-                def _rate(self, order, time, base=base):
-                    return sum(
-                        share * base._rate(order, np.asarray(time) - delay)
-                        for delay, share in zip(delays, shares, strict=True)
-                    )
+    def _rate(self, order, time):
+        return sum(x * self._base._rate(order, np.asarray(time) - at) for at, x in self._impulses)
 
-                def breaks(self):
-                    return np.array([0.0, self.duration])
+    def breaks(self):
+        return np.array([0.0, self.duration])
 
-                def turns(self):
-                    return self.breaks()
+    turns = breaks
 
-                def bounds(self):
-                    return np.minimum(home, end), np.maximum(home, end)
+    def bounds(self):
+        return self._base.bounds()
 
-            sizes = []
-            for reference in (base, Shaped()):
-                run, theta = follow(machine, reference, 8.0, tolerance=1e-11)
-                sizes.append(np.abs(theta[run.time >= reference.duration, 1]).max())
-            assert sizes[0] > 1e-4
-            assert sizes[1] / sizes[0] == pytest.approx(wanted, abs=0.01)
+
+@pytest.mark.parametrize("derivative", [False, True])
+def test_a_shaper_of_the_wrong_length_leaves_what_theory_says(derivative):
+    """|V| = |cos(pi r / 2)|, of ZVD its square, r the frequency over each mode's of the shaper."""
+    designed = carrying(200.0, **smooth())
+    home = designed.home[designed.closure.active]
+    delays, shares = impulses(designed, home, derivative)
+    assert shares.sum() == pytest.approx(1.0) and delays[0] == 0
+    shaped = Sway(designed).modes(home)[0]
+    base = crane.point_to_point(home, home + [0.02, 0, 0, 0, 0, 0, 0], 5.0)
+    for payload in (200.0, 60.0, 500.0):
+        machine = carrying(payload, **smooth())
+        omega = Sway(machine).modes(home)[0][0]  # across the plane, where slewing sends it
+        wanted = np.prod(np.abs(np.cos(np.pi / 2 * omega / shaped))) ** (1 + derivative)
+        sizes = []
+        for reference in (base, Shaped(base, delays, shares)):
+            run, theta = follow(machine, reference, 8.0, tolerance=1e-11)
+            sizes.append(np.abs(theta[run.time >= reference.duration, 1]).max())
+        assert sizes[0] > 1e-4
+        assert sizes[1] / sizes[0] == pytest.approx(wanted, abs=0.01)
+
+
+def beside(joint):
+    """The machine with a joint locked, and a motion of its extension."""
+    machine = crane.load(NAME, lock={joint: 0.0})
+    start = machine.home[machine.closure.active][machine.driven]
+    return machine, crane.point_to_point(start, start + [0, 0, 0.3, 0], 5.0)
 
 
 @pytest.mark.parametrize(
     ("call", "line"),
     [
-        (lambda m, r: without_sway(m, r, "fast"), "method 'fast' is unknown, known: flat, none, "),
+        (lambda m, r: without_sway(m, r, "fast"), "method 'fast' is unknown, did you mean"),
         (lambda m, r: without_sway(m, retimed(r, 1.0), "zvd"), "the shaper takes 4.08 s, the "
          "motion 1 s"),
-        (lambda m, r: without_sway(m, retimed(r, 0.8)), "no motion of 0.8 s leaves what hangs "
-         "without sway"),
+        (lambda m, r: without_sway(m, retimed(r, 0.8)), "no motion of 0.8 s was found that leaves "
+         "what hangs without sway"),
         (lambda m, r: retimed(r, 0.0), "the duration is 0"),
-        (lambda m, r: crane.ValveFeedforward(m, r, sway=-0.1), "the damping ratio of sway is -0.1"),
+        (lambda m, r: crane.ValveFeedforward(m, r, sway=-0.1), "the damping ratio of sway is "
+         "-0.1"),
         (lambda m, r: Sway(crane.load("patu655")), "nothing sways on 'patu655': it has no free"),
         (lambda m, r: without_sway(crane.load("patu655"), r), "nothing sways on 'patu655'"),
-        (lambda m, r: without_sway(crane.load(NAME, lock={"slew": 0.0}), crane.task_trajectory(
-            crane.load(NAME, lock={"slew": 0.0}), "swing")), "the drives of 'patu655_grapple' do "
-         "not move what hangs on sway_radial, sway_tangential in each direction"),
+        (lambda m, r: without_sway(*beside("slew")), "the drives of 'patu655_grapple' do not move "
+         "what hangs on sway_radial, sway_tangential in each direction"),
+        (lambda m, r: without_sway(m, crane.point_to_point(
+            [0, 0.117, 0.246, 0, 0], [1.5, 0.117, 0.246, 0, 0], 6.0)), "method 'flat': the "
+         "reference of 'X_ext' goes to -0.0"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused(loaded, quarter, call, line):

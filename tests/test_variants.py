@@ -86,7 +86,8 @@ def test_errors_of_the_base_name_the_base(folder):
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        ("extends: nothing.yaml\n", "own.yaml:1: the machine file: there is no file 'nothing.yaml'"),
+        ("extends: nothing.yaml\n", "own.yaml:1: the machine file: there is no file "
+         "'nothing.yaml'"),
         ("extends: own.yaml\n", "own.yaml:1: 'own.yaml' is a variant of this file itself"),
         ("extends: base/four_bar/ground.urdf\n", "own.yaml:1: 'base/four_bar/ground.urdf' is no "
          "machine file (.yaml)"),

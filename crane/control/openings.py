@@ -134,8 +134,8 @@ def flow_share(machine: Machine, reference: Trajectory) -> float:
     """The largest share of its flow that a motion asks of a valve or of the pump.
 
     Of a valve A |v| over the flow at full stroke, A the area that oil flows onto: c sqrt(margin)
-    of a compensated one, and half of the supply's pressure at either edge of another; of the pump the
-    sum of A |v| over its most, where it has one.
+    of a compensated one, and half of the supply's pressure at either edge of another; of the pump
+    the sum of A |v| over its most, where it has one.
 
     Args:
         machine: The machine, with a circuit.

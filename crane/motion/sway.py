@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.linalg import eigh
 
-from crane.common.errors import InputError, known
+from crane.common.errors import ClosureError, InputError, LimitError, known
 from crane.common.samples import Array, as_number
 from crane.dynamics import Dynamics
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
-from crane.motion.trajectories import Trajectory, quintics, with_free
+from crane.motion.trajectories import Trajectory, beyond_limits, quintics, with_free
 
 _KNOTS_PER_SECOND = 100
 _STILL = 1e-12  # of the free joints' weight times lever, what hangs still
@@ -353,9 +353,12 @@ def _flat(machine: Machine, reference: Trajectory) -> Trajectory:
     for _ in range(_ROUNDS):
         q_a = rest.copy()
         q_a[:, driven] += np.einsum("nkf,nf->nk", shifts, theta)
-        q_a = sway.hanging(q_a)
-        q_a[:, ~driven] += theta
-        excess = sway.excess(q_a, *_derivatives(time, q_a))
+        try:
+            q_a = sway.hanging(q_a)
+            q_a[:, ~driven] += theta
+            excess = sway.excess(q_a, *_derivatives(time, q_a))
+        except ClosureError:  # farther off than the machine reaches
+            break
         move = onto @ np.linalg.solve(back, excess[:, :, None])[:, :, 0]
         moved = float(np.abs(move).max())
         if moved < _ACCURACY or (moved < _ENOUGH and moved > 0.5 * before):
@@ -364,8 +367,8 @@ def _flat(machine: Machine, reference: Trajectory) -> Trajectory:
             break
         theta, before = theta - move, moved
     raise InputError(
-        f"no motion of {duration:.3g} s leaves what hangs without sway, the last correction is "
-        f"{before:.2g} rad: give it more time"
+        f"no motion of {duration:.3g} s was found that leaves what hangs without sway, the last "
+        f"correction is {before:.2g} rad: give it more time"
     )
 
 
@@ -406,9 +409,13 @@ def without_sway(machine: Machine, reference: Trajectory, method: str = "flat") 
 
     Raises:
         InputError: Unknown method, no free joints, or too little time.
+        LimitError: What the drives have to do is beyond their limits.
     """
     if method not in _METHODS:
         raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
     if not machine.free:
         raise InputError(f"nothing sways on '{machine.name}': it has no free joints")
-    return _METHODS[method](machine, with_free(machine, reference))
+    found = _METHODS[method](machine, with_free(machine, reference))
+    if text := beyond_limits(machine, found):
+        raise LimitError(f"method '{method}': {text}")
+    return found
