@@ -17,7 +17,7 @@ def sway(
     ] = "0,100,200,300,400,500",
     damping: Annotated[
         float, typer.Option(help="Damping ratio that feedback of sway asks for; 0 for none.")
-    ] = 0.1,
+    ] = 0.2,
     change: Change = None,
 ) -> None:
     """Tell how much sway a task leaves through the valves, with and without each method."""

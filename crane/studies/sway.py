@@ -18,7 +18,7 @@ from crane.simulation import simulate
 
 _WATCHED = 10.0  # [s] after the motion
 _STEP = 1e-2  # [s]
-DAMPING = 0.1
+DAMPING = 0.2
 
 Progress = Callable[[float], None]
 
