@@ -17,7 +17,9 @@ if TYPE_CHECKING:
         Signals,
         TipVelocity,
         ValveDrive,
+        ValveFeedforward,
         ValvePD,
+        fastest,
         joystick,
     )
     from crane.description import (
@@ -51,11 +53,14 @@ if TYPE_CHECKING:
     from crane.machine import Machine, Payload
     from crane.motion import (
         Kinematics,
+        Sway,
         Trajectory,
         point_to_point,
         polynomial,
+        retimed,
         task_trajectory,
         tip_trajectory,
+        without_sway,
     )
     from crane.motion.workspaces import Workspace, workspace
     from crane.recordings import Recording
@@ -76,7 +81,7 @@ if TYPE_CHECKING:
         simulate_batch,
     )
     from crane.simulation.symbolic import casadi_function
-    from crane.studies import Study, study
+    from crane.studies import Study, SwayStudy, study, sway_study
     from crane.view.page import report
     from crane.view.sketch import sketch
 
@@ -87,7 +92,7 @@ _HOMES = {
     "crane.closure": "Closure",
     "crane.common.errors": "CraneError CraneWarning",
     "crane.control": "PI Command ComputedTorque Controller Law Sampled Signals TipVelocity "
-    "ValveDrive ValvePD joystick",
+    "ValveDrive ValveFeedforward ValvePD fastest joystick",
     "crane.description": "EndStop ForceElement Friction GasSpring PIGains Rope Sensor",
     "crane.description.external": "ExternalForce Pushing Wrench",
     "crane.description.ground": "Contact Ground",
@@ -109,15 +114,15 @@ _HOMES = {
     "crane.identification.mechanics.payload": "identify_payload",
     "crane.identification.mechanics.result": "Identification",
     "crane.machine": "Machine Payload",
-    "crane.motion": "Kinematics Trajectory point_to_point polynomial task_trajectory "
-    "tip_trajectory",
+    "crane.motion": "Kinematics Sway Trajectory point_to_point polynomial retimed "
+    "task_trajectory tip_trajectory without_sway",
     "crane.motion.workspaces": "Workspace workspace",
     "crane.recordings": "Recording",
     "crane.recordings.measured": "read_measured",
     "crane.simulation": "Batch Comparison Gradient InterruptedRun LinearModel Sensitivities "
     "gradient linear_models linearize replay sensitivities simulate simulate_batch",
     "crane.simulation.symbolic": "casadi_function",
-    "crane.studies": "Study study",
+    "crane.studies": "Study SwayStudy study sway_study",
     "crane.view.page": "report",
     "crane.view.sketch": "sketch",
 }
@@ -128,14 +133,15 @@ __all__ = [
     "ExternalForce", "ForceElement", "Friction", "GasSpring", "Gradient", "Ground",
     "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel", "Machine", "PDGains",
     "PI", "PIGains", "Payload", "Pushing", "Recording", "Rope", "SOILS", "Sampled",
-    "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study", "TipVelocity",
-    "Trajectory", "ValveDrive", "ValvePD", "Workspace", "Wrench", "add_cylinder", "add_loops",
-    "calibrate", "casadi_function", "check", "cross_validate", "excite", "excite_valves",
-    "gradient", "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
-    "identify_valve", "joystick", "linear_models", "linearize", "load", "point_to_point",
-    "polynomial", "read_measured", "replay", "report", "sensitivities", "simulate",
-    "simulate_batch", "sketch", "study", "task_trajectory", "tip_trajectory", "workspace",
-    "write_machine", "write_mjcf", "write_urdf_plus",
+    "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy",
+    "TipVelocity", "Trajectory", "ValveDrive", "ValveFeedforward", "ValvePD", "Workspace",
+    "Wrench", "add_cylinder", "add_loops", "calibrate", "casadi_function", "check",
+    "cross_validate", "excite", "excite_valves", "fastest", "gradient", "identify",
+    "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
+    "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
+    "read_measured", "replay", "report", "retimed", "sensitivities", "simulate", "simulate_batch",
+    "sketch", "study", "sway_study", "task_trajectory", "tip_trajectory", "without_sway",
+    "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 

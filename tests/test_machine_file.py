@@ -141,9 +141,10 @@ TEXT = [
     case(
         "control characters in a key",
         "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, known: "
-        "active, chains, contacts, control, couplings, cutters, drives, end_stops, floating, "
-        "forces, free, friction, gas_springs, ground, home, hydraulics, identification, loads, "
-        "loops, name, payload, ropes, rotor_inertia, sensors, soil, source, supports, tasks, tip",
+        "active, chains, contacts, control, couplings, cutters, drives, end_stops, extends, "
+        "floating, forces, free, friction, gas_springs, ground, home, hydraulics, identification, "
+        "loads, loops, name, payload, ropes, rotor_inertia, sensors, soil, source, supports, "
+        "tasks, tip",
         swap("tip: coupler_pin", '"tip\\n\\e[31m": coupler_pin'),
     ),
     case(
@@ -163,9 +164,10 @@ KEYS = [
     case(
         "unknown key far from all",
         "four_bar.yaml:29: unknown key 'gravity' in the machine file, known: "
-        "active, chains, contacts, control, couplings, cutters, drives, end_stops, floating, "
-        "forces, free, friction, gas_springs, ground, home, hydraulics, identification, loads, "
-        "loops, name, payload, ropes, rotor_inertia, sensors, soil, source, supports, tasks, tip",
+        "active, chains, contacts, control, couplings, cutters, drives, end_stops, extends, "
+        "floating, forces, free, friction, gas_springs, ground, home, hydraulics, identification, "
+        "loads, loops, name, payload, ropes, rotor_inertia, sensors, soil, source, supports, "
+        "tasks, tip",
         swap("tip: coupler_pin", "gravity: 9.81"),
     ),
     case(

@@ -25,6 +25,7 @@ from crane.cli import (  # noqa: F401  register their commands
     sensitivities,
     simulate,
     stability,
+    sway,
     workspace,
 )
 from crane.cli.shared import INTERRUPTED, app, say

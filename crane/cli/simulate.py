@@ -43,8 +43,17 @@ def simulate(
     controller: Annotated[
         str | None,
         typer.Option(
-            help="pi, computed-torque, valve-pd, tip-velocity; if not given, the one that the "
-            "machine has gains for. Without a task it holds the home posture."
+            help="pi, computed-torque, valve-pd, valve-feedforward, tip-velocity; if not given, "
+            "the one that the machine has gains for. Without a task it holds the home posture."
+        ),
+    ] = None,
+    sway: Annotated[
+        str | None,
+        typer.Option(
+            metavar="METHOD",
+            help="Change the task's reference so that what hangs does not sway after it: flat, "
+            "zv, zvd; none only lets it hang still at the start. Through valves goes with "
+            "--controller valve-feedforward.",
         ),
     ] = None,
     inputs: Annotated[
@@ -91,7 +100,7 @@ def simulate(
     loaded = load(machine, lock, change, active, free, floating, packages, argument)
     loaded = under_task(loaded, task).under(*loads_of(load_))
     if inputs is not None:
-        named = {"--task": task, "--controller": controller}
+        named = {"--task": task, "--controller": controller, "--sway": sway}
         given = [option for option, value in named.items() if value is not None]
         if given:
             raise InputError(f"{given[0]} does not go with --inputs, leave one out")
@@ -105,7 +114,7 @@ def simulate(
     of_inputs = {"--columns": columns, "--from": since, "--until": until}
     for option in [option for option, given in of_inputs.items() if given is not None]:
         raise InputError(f"{option} is for --inputs, leave it out")
-    control = control_of(loaded, task, controller)
+    control = control_of(loaded, task, controller, sway)
     duration = duration_of(loaded, task, duration)
     label = task or ("hold" if control else "free motion")
     try:
@@ -123,17 +132,20 @@ def simulate(
 
 
 def control_of(
-    machine: "Machine", task: str | None, name: str | None
+    machine: "Machine", task: str | None, name: str | None, sway: str | None = None
 ) -> "Controller | Command | None":
-    """What drives a machine along a task, by a controller's name; see `simulate`.
+    """What drives a machine along a task, by a controller's name and a method of `without_sway`.
 
     Raises:
         InputError: There is no such task or controller.
     """
     from crane.control import controller, joystick, usual
+    from crane.motion.sway import without_sway
     from crane.motion.trajectories import point_to_point, task_trajectory
 
     if task is None:
+        if sway is not None:
+            raise InputError("--sway changes a task's reference, name a --task")
         if name is None:
             return None
         home = machine.home[machine.closure.active]
@@ -145,8 +157,13 @@ def control_of(
     if machine.tasks[task].space == "joystick":
         if name is not None:
             raise InputError(f"task '{task}' moves levers, leave --controller out")
+        if sway is not None:
+            raise InputError(f"task '{task}' moves levers, leave --sway out")
         return joystick(machine, task)
-    return controller(name or usual(machine), machine, task_trajectory(machine, task))
+    reference = task_trajectory(machine, task)
+    if sway is not None:
+        reference = without_sway(machine, reference, sway)
+    return controller(name or usual(machine), machine, reference)
 
 
 def under_task(machine: "Machine", task: str | None) -> "Machine":

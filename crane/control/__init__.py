@@ -2,13 +2,16 @@
 
 from crane.control.base import At, Controller, Feedback, Free, Law, TracedController, reference_of
 from crane.control.drive import ValveDrive
+from crane.control.feedforward import ValveFeedforward
 from crane.control.forces import PI, ComputedTorque
 from crane.control.names import CONTROLLERS, controller, usual
+from crane.control.openings import fastest, flow_share
 from crane.control.tip import TipVelocity
 from crane.control.valves import Command, Sampled, Signals, ValvePD, joystick
 
 __all__ = [
     "CONTROLLERS", "PI", "At", "Command", "ComputedTorque", "Controller", "Feedback", "Free",
-    "Law", "Sampled", "Signals", "TipVelocity", "TracedController", "ValveDrive", "ValvePD",
-    "controller", "joystick", "reference_of", "usual",
+    "Law", "Sampled", "Signals", "TipVelocity", "TracedController", "ValveDrive",
+    "ValveFeedforward", "ValvePD", "controller", "fastest", "flow_share", "joystick",
+    "reference_of", "usual",
 ]  # fmt: skip

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 
 from crane.common.errors import InputError, known
 from crane.control.base import Controller
+from crane.control.feedforward import ValveFeedforward
 from crane.control.forces import PI, ComputedTorque
 from crane.control.tip import TipVelocity
 from crane.control.valves import Command, ValvePD
@@ -14,6 +15,7 @@ CONTROLLERS: Mapping[str, Callable[[Machine, Trajectory], Controller | Command]]
     "pi": PI,
     "computed-torque": ComputedTorque,
     "valve-pd": ValvePD,
+    "valve-feedforward": ValveFeedforward,
     "tip-velocity": TipVelocity,
 }
 

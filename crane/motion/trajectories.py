@@ -168,14 +168,14 @@ def tip_trajectory(
     q_a = kinematics.inverse(x, guess)
     if machine.driven.sum() > x.shape[1]:
         spline = make_interp_spline(time, q_a, k=5)
-        return Trajectory(_quintics(time, q_a, spline(time, 1), spline(time, 2)), tip)
+        return Trajectory(quintics(time, q_a, spline(time, 1), spline(time, 2)), tip)
     jacobian = np.linalg.pinv(kinematics.jacobian(q_a) * machine.driven)
     v_a = np.einsum("ijk,ik->ij", jacobian, x_rate)
     a_a = np.einsum("ijk,ik->ij", jacobian, x_second - kinematics.bias(q_a, v_a))
-    return Trajectory(_quintics(time, q_a, v_a, a_a), tip)
+    return Trajectory(quintics(time, q_a, v_a, a_a), tip)
 
 
-def _quintics(time: Array, x: Array, v: Array, a: Array) -> PPoly:
+def quintics(time: Array, x: Array, v: Array, a: Array) -> PPoly:
     """Polynomials of fifth order between knots (N,) with values and derivatives (N, n).
 
     With u = t - t_i, h = t_i+1 - t_i and what the second order misses at u = h,

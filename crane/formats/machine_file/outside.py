@@ -26,7 +26,11 @@ def read_outside(top: Section, tree: TreeBuilder) -> tuple[Wrench | Contact | Cu
     if section is not None:
         with recoverable():
             ground, usual = _ground(section)
-    return *read_loads(top, tree), *_contacts(top, tree, ground, usual), *_cutters(top, tree, ground)
+    return (
+        *read_loads(top, tree),
+        *_contacts(top, tree, ground, usual),
+        *_cutters(top, tree, ground),
+    )
 
 
 def _frame(item: Section, tree: TreeBuilder) -> str:

@@ -41,7 +41,7 @@ from crane.formats.machine_file.forces import (
 from crane.formats.machine_file.open_loops import warn_of_open_loops
 from crane.formats.machine_file.outside import read_outside
 from crane.formats.machine_file.posture import read_home
-from crane.formats.machine_file.section import Section
+from crane.formats.machine_file.section import EXTENDS, Section
 from crane.formats.machine_file.sensors import read_sensors
 from crane.formats.machine_file.tasks import read_tasks
 from crane.formats.machine_file.tree_builder import TreeBuilder
@@ -52,7 +52,7 @@ from crane.formats.urdf.read import Urdf, read_urdf
 Part = TypeVar("Part")
 
 _KEYS = (
-    "name", "source", "chains", "floating", "loops", "active", "free", "drives", "home",
+    EXTENDS, "name", "source", "chains", "floating", "loops", "active", "free", "drives", "home",
     "friction", "forces", "gas_springs", "ropes", "loads", "ground", "contacts", "soil",
     "cutters", "supports", "end_stops", "rotor_inertia", "couplings", "tip", "payload", "tasks",
     "control", "hydraulics", "sensors", "identification",
@@ -111,6 +111,15 @@ def _read_single(path: Path) -> MachineSpec:
         couplings=urdf.couplings,
         where=where,
     )
+
+
+def plain_data(path: Path) -> dict[str, Any]:
+    """What a machine file says, with what it extends.
+
+    Raises:
+        DescriptionError: As `read`.
+    """
+    return Section.read(path, _KEYS).plain()
 
 
 def _read_machine(path: Path) -> MachineSpec:

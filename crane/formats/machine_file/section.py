@@ -1,7 +1,7 @@
 """Strict reading of YAML: every key known, every value of its kind, every error with its line."""
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, overload
@@ -12,14 +12,32 @@ from crane.common.errors import DescriptionError, known
 from crane.description.findings import flag, recoverable
 from crane.description.sources import bundled
 
+EXTENDS = "extends"  # the key that names the file a machine file is a variant of
+
 
 class _Map(dict[str, Any]):
-    """A mapping that remembers the line of each key."""
+    """A mapping that remembers file and line of each key."""
 
-    def __init__(self, line: int):
+    def __init__(self, file: Path, line: int):
         super().__init__()
-        self.line = line
-        self.lines: dict[str, int] = {}
+        self.file, self.line = file, line
+        self.places: dict[str, tuple[Path, int]] = {}
+
+    def put(self, other: "_Map", key: str) -> None:
+        """Take over the value of a key, and where it stands."""
+        self[key], self.places[key] = other[key], other.places[key]
+
+    def extended(self, own: "_Map") -> None:
+        """Put a variant's keys over these: mappings key by key, all else whole, empty ones off."""
+        for key, value in own.items():
+            if isinstance(value, _Map) and isinstance(self.get(key), _Map):
+                self[key].extended(value)
+                self.places[key] = own.places[key]
+            elif value is None:
+                self.pop(key, None)
+            else:
+                self.put(own, key)
+        self.file, self.line = own.file, own.line
 
 
 class _Loader(yaml.SafeLoader):
@@ -35,10 +53,11 @@ class _Loader(yaml.SafeLoader):
 
 
 def _construct_map(loader: _Loader, node: yaml.MappingNode) -> _Map:
-    data = _Map(node.start_mark.line + 1)
+    file = Path(loader.name)
+    data = _Map(file, node.start_mark.line + 1)
     for key_node, value_node in node.value:
         line = key_node.start_mark.line + 1
-        where = f"{Path(loader.name).name}:{line}"
+        where = f"{file.name}:{line}"
         if key_node.tag == "tag:yaml.org,2002:merge":
             flag(DescriptionError(f"{where}: '<<' is not supported, write the keys out"))
             continue
@@ -50,12 +69,12 @@ def _construct_map(loader: _Loader, node: yaml.MappingNode) -> _Map:
             flag(DescriptionError(f"{where}: {problem}"))
             continue
         if key in data:
-            first = data.lines[key]
+            first = data.places[key][1]
             problem = f"key '{key}' is there twice (first in line {first}), keep one"
             flag(DescriptionError(f"{where}: {problem}"))
             continue
         data[key] = loader.construct_object(value_node, deep=True)
-        data.lines[key] = line
+        data.places[key] = file, line
     return data
 
 
@@ -63,6 +82,12 @@ _Loader.add_constructor("tag:yaml.org,2002:map", _construct_map)
 
 _MISSING: Any = object()
 _LARGEST = 2_000_000  # bytes of a file; the reader takes a minute for ten million
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list) else value
 
 
 def _shown(value: Any) -> str:
@@ -87,66 +112,104 @@ def _as_float(value: Any) -> float:
         return math.nan
 
 
+def _parsed(file: Path) -> _Map:
+    """The mapping in a YAML file.
+
+    Raises:
+        DescriptionError: The file is missing, not YAML, or no mapping.
+    """
+    try:
+        if file.stat().st_size > _LARGEST:
+            size = f"{file.stat().st_size / 1e6:.3g} MB, more than {_LARGEST / 1e6:g}"
+            raise DescriptionError(f"{file.name}: {size}, which takes too long, shorten it")
+        with file.open(encoding="utf-8") as stream:
+            data = yaml.load(stream, _Loader)  # noqa: S506 (a SafeLoader)
+    except UnicodeDecodeError:
+        raise DescriptionError(f"{file.name}: not UTF-8, save it as UTF-8 text") from None
+    except OSError as error:
+        raise DescriptionError(
+            f"{file}: cannot be read ({error.strerror}), check the path"
+        ) from None
+    except yaml.reader.ReaderError as error:
+        what = f"it holds the control character number {error.character}"
+        raise DescriptionError(f"{file.name}: not YAML, {what}, remove it") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f":{mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "broken"
+        raise DescriptionError(f"{file.name}{line}: not YAML, {problem}, mend it") from None
+    except RecursionError:
+        raise DescriptionError(f"{file.name}: nested too deep, simplify it") from None
+    if data is None:
+        raise DescriptionError(f"{file.name}: the file is empty, write a machine in it")
+    if not isinstance(data, _Map):
+        raise DescriptionError(f"{file.name}: not a machine file, write keys such as 'name:'")
+    return data
+
+
+def _merged(file: Path, above: tuple[Path, ...]) -> _Map:
+    """A machine file put over the one that it extends, which may extend another.
+
+    Args:
+        file: The machine file.
+        above: The variants that led to it, resolved.
+    """
+    own = _parsed(file)
+    if EXTENDS not in own:
+        return own
+    section = Section(own, "the machine file")
+    named = section.text(EXTENDS)
+    base = bundled().get(named) or section.file(EXTENDS)
+    if base.suffix.lower() not in (".yaml", ".yml"):
+        raise section.fail(EXTENDS, f"'{named}' is no machine file (.yaml), a variant needs one")
+    above = (*above, file.resolve())
+    if base in above:
+        raise section.fail(EXTENDS, f"'{named}' is a variant of this file itself, extend another")
+    del own[EXTENDS]
+    data = _merged(base, above)
+    data.extended(own)
+    return data
+
+
 class Section:
     """A mapping of a machine file.
 
     Args:
         data: The mapping.
         title: What it is, for errors ("loop 'A1_eye'").
-        file: The file it stands in.
-        line: Its line, if not the mapping's own.
+        place: File and line, if not the mapping's own.
 
     Attributes:
         title: See above.
         complete: Whether no item of its lists had to be left out.
     """
 
-    def __init__(self, data: _Map, title: str, file: Path, line: int | None = None):
-        self._data, self.title, self._file = data, title, file
+    def __init__(self, data: _Map, title: str, place: tuple[Path, int] | None = None):
+        self._data, self.title = data, title
         self.complete = True
-        self._line = data.line if line is None else line
+        self._place = (data.file, data.line) if place is None else place
 
     @classmethod
-    def read(cls, file: Path, keys: Iterable[str]) -> "Section":
-        """The top level of a YAML file.
+    def read(cls, file: Path, keys: Collection[str]) -> "Section":
+        """The top level of a YAML file, a variant put over what it extends.
 
         Raises:
-            DescriptionError: The file is missing, not YAML, or not a mapping of these keys.
+            DescriptionError: A file is missing, not YAML, or not a mapping of these keys.
         """
-        try:
-            if file.stat().st_size > _LARGEST:
-                size = f"{file.stat().st_size / 1e6:.3g} MB, more than {_LARGEST / 1e6:g}"
-                raise DescriptionError(f"{file.name}: {size}, which takes too long, shorten it")
-            with file.open(encoding="utf-8") as stream:
-                data = yaml.load(stream, _Loader)  # noqa: S506 (a SafeLoader)
-        except UnicodeDecodeError:
-            raise DescriptionError(f"{file.name}: not UTF-8, save it as UTF-8 text") from None
-        except OSError as error:
-            raise DescriptionError(
-                f"{file}: cannot be read ({error.strerror}), check the path"
-            ) from None
-        except yaml.reader.ReaderError as error:
-            what = f"it holds the control character number {error.character}"
-            raise DescriptionError(f"{file.name}: not YAML, {what}, remove it") from None
-        except yaml.YAMLError as error:
-            mark = getattr(error, "problem_mark", None)
-            line = f":{mark.line + 1}" if mark else ""
-            problem = getattr(error, "problem", None) or "broken"
-            raise DescriptionError(f"{file.name}{line}: not YAML, {problem}, mend it") from None
-        except RecursionError:
-            raise DescriptionError(f"{file.name}: nested too deep, simplify it") from None
-        if data is None:
-            raise DescriptionError(f"{file.name}: the file is empty, write a machine in it")
-        if not isinstance(data, _Map):
-            raise DescriptionError(f"{file.name}: not a machine file, write keys such as 'name:'")
-        section = cls(data, "the machine file", file)
+        data = _merged(file, ()) if EXTENDS in keys else _parsed(file)
+        section = cls(data, "the machine file")
         section.only(*keys)
         return section
+
+    def plain(self) -> dict[str, Any]:
+        """All keys and values, without places."""
+        found: dict[str, Any] = _plain(self._data)
+        return found
 
     @property
     def is_bundled(self) -> bool:
         """Whether it is of a machine that comes with the package, whose file says what is odd."""
-        return self._file in bundled().values()
+        return self._place[0] in bundled().values()
 
     def only(self, *keys: str) -> None:
         """Raise for any other key.
@@ -163,12 +226,12 @@ class Section:
             flag(self.fail(key, problem), harmless=True)
             if meant:
                 self._data[near[0]] = self._data[key]
-                self._data.lines[near[0]] = self._data.lines[key]
+                self._data.places[near[0]] = self._data.places[key]
 
     def where(self, key: str | None = None) -> str:
         """File and line of the section or of one of its keys."""
-        line = self._data.lines.get(key, self._line) if key else self._line
-        return f"{self._file.name}:{line}"
+        file, line = self._data.places.get(key, self._place) if key else self._place
+        return f"{file.name}:{line}"
 
     def fail(self, key: str | None, what: str) -> DescriptionError:
         """An error that points at a key."""
@@ -298,9 +361,9 @@ class Section:
         return [(one, two) for one, two in value]
 
     def file(self, key: str) -> Path:
-        """A file, named by its path from the folder of the machine file."""
+        """A file, named by its path from the folder of the file that names it."""
         text = self.text(key)
-        path = self._file.parent / text
+        path = self._data.places.get(key, self._place)[0].parent / text
         try:
             if path.is_dir():
                 raise self.fail(key, f"'{text}' of {self.title} is a folder, give a file")
@@ -320,7 +383,7 @@ class Section:
             return None
         if not isinstance(value, _Map):
             raise self.fail(key, f"{title} is {_shown(value)}, give a mapping 'name: value'")
-        return Section(value, title, self._file, self._data.lines[key])
+        return Section(value, title, self._data.places[key])
 
     def mappings(self, key: str, title: str, *keys: str) -> "Iterator[tuple[str, Section]]":
         """Names and mappings of a mapping of mappings with these keys."""
@@ -359,7 +422,7 @@ class Section:
                 flag(self.fail(key, problem))
                 self.complete = False
                 continue
-            section = Section(item, _titled(title, item), self._file)
+            section = Section(item, _titled(title, item))
             section.only(*keys)
             yield section
 

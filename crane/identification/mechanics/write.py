@@ -16,6 +16,7 @@ from crane.common.output import replacing, staging
 from crane.description import Chain, Friction, MachineSpec, locked
 from crane.dynamics import Dynamics
 from crane.formats import load, read
+from crane.formats.machine_file.read import plain_data
 from crane.formats.machine_file.text import Way, yaml_text
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base import random_samples
@@ -170,8 +171,6 @@ def _content(
     written: Mapping[str, Written],
 ) -> tuple[str, dict[str, str]]:
     """The machine file, and the URDFs of motors that turn with several joints, by name."""
-    import yaml
-
     machine = result.machine
     data: dict[str, Any]
     if machine.path.suffix.lower() == ".urdf":
@@ -184,7 +183,7 @@ def _content(
         if machine.tip is not None:
             data["tip"] = machine.tip
     else:
-        data = yaml.safe_load(machine.path.read_text(encoding="utf-8-sig"))
+        data = plain_data(machine.path)
     data["source"] = f"{how}; else {machine.source or machine.path.name}"
     for chain in data["chains"]:
         chain["urdf"] = names[chain["name"]]

@@ -1,0 +1,187 @@
+"""What a motion asks of a circuit: openings of its valves, flow of its pump, the shortest time."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from crane.common.errors import InputError
+from crane.common.samples import Array
+from crane.control.valves import circuit_of
+from crane.hydraulics import Hydraulics
+from crane.hydraulics.components import Cylinder, Valve
+from crane.hydraulics.flow import LAMINAR
+from crane.machine import Machine
+from crane.motion.sway import retimed, without_sway
+from crane.motion.trajectories import Trajectory, with_free
+
+_LEAST_DROP = 1e5  # [Pa] that an edge is taken to have
+_BESIDE = 1e3  # [Pa] of difference quotients
+_PER_SECOND = 100  # samples of a motion's flows
+_CLOSE = 1e-3  # of the shortest time
+_ROUNDS = 30
+
+
+def openings(valve: Valve, cylinder: Cylinder, supply: float, force: Array) -> tuple[Array, Array]:
+    """Opening of a valve that one metre (radian) per second takes, out and in.
+
+    Flow comes through the inlet Q = c y sqrt(dp), with dp the compensator's margin or what the
+    supply leaves; where the load pulls the piston along, through the outlet, which sets the speed.
+
+    Args:
+        valve: The valve.
+        cylinder: Its cylinder.
+        supply: Pressure of the supply [Pa].
+        force: (N,) that the cylinder exerts [N], [N m].
+
+    Returns:
+        Two arrays (N,) [s/m], [s/rad], both positive.
+    """
+    found = []
+    ways = (
+        (1.0, valve.c1, cylinder.area_a, valve.c2, cylinder.area_b),
+        (-1.0, valve.c4, cylinder.area_b, valve.c3, cylinder.area_a),
+    )
+    for sign, inlet, into, outlet, out in ways:
+        drop = supply - np.maximum(sign * force, 0.0) / into
+        if valve.margin:
+            drop = np.minimum(drop, valve.margin)
+        by_inlet = into / (inlet * np.sqrt(np.maximum(drop, _LEAST_DROP)))
+        pull = np.maximum(-sign * force, 0.0) / out
+        by_outlet = out / (outlet * np.sqrt(np.maximum(pull, _LEAST_DROP)))
+        found.append(np.where(sign * force < 0, np.minimum(by_inlet, by_outlet), by_inlet))
+    return found[0], found[1]
+
+
+def demanded(
+    circuit: Hydraulics, time: Array, x: Array, v: Array, force: Array, strokes: Array
+) -> Array:
+    """Openings of all valves that move their cylinders as is said, under the forces that takes.
+
+    The circuit turned round: with C = V / K of the chambers, r what suction valves let in, and
+    Q = q y through the edges that are open,
+
+        C_a p_a' = q_a y + r_a - A_a v,   C_b p_b' = A_b v - q_b y + r_b,   A_a p_a - A_b p_b = F,
+
+    differentiated once gives y, and one pressure is left to be integrated. Where a chamber is
+    sucked empty the other one sets the speed alone. Left out: leaks, cushions, relief and
+    load-holding valves, and that the supply's pressure falls.
+
+    Args:
+        circuit: The circuit.
+        time: (N,) [s], a millisecond or so apart.
+        x: (N, m) strokes above the lower limits [m], [rad].
+        v: (N, m) [m/s], [rad/s].
+        force: (N, m) of the cylinders [N], [N m].
+        strokes: (m,) distances between the limits.
+
+    Returns:
+        (N, m) openings y, -1 to 1 where the valve has that flow.
+    """
+
+    def of(items: Mapping[str, Any], *names: str) -> list[Array]:
+        return [np.array([getattr(items[joint], x) for joint in circuit.joints]) for x in names]
+
+    oil, tank, pump = circuit.oil, circuit.supply.tank, circuit.supply.pressure
+    area_a, area_b, hose_a, hose_b, stiffness = of(
+        circuit.cylinders, "area_a", "area_b", "hose_a", "hose_b", "stiffness"
+    )
+    c1, c2, c3, c4, margin = of(circuit.valves, "c1", "c2", "c3", "c4", "margin")
+    margin = np.where(margin > 0, margin, pump)
+    hose, steel = (1.0 / k if k else 0.0 for k in (oil.hose_modulus, oil.steel_modulus))
+    rate = np.gradient(force, time, axis=0)
+    # the spring between cylinder and joint gives way
+    give = np.where(stiffness > 0, 1.0 / np.where(stiffness > 0, stiffness, 1.0), 0.0)
+    x, v = x + give * force, v + give * rate
+    inside_a, inside_b = area_a * x, area_b * (strokes - x)
+    soft_a = hose_a * hose + inside_a * steel + (hose_a + inside_a) / oil.bulk_modulus
+    soft_b = hose_b * hose + inside_b * steel + (hose_b + inside_b) / oil.bulk_modulus
+    least = 0.5 * tank
+
+    def at(i: int, p_b: Array) -> tuple[Array, Array]:
+        """Openings, and the rate of the pressure in B."""
+        f, w, ca, cb = force[i], v[i], soft_a[i], soft_b[i]
+        p_a = (f + area_b * p_b) / area_a
+        asked = rate[i] + (area_a**2 / ca + area_b**2 / cb) * w
+        out = asked > 0
+        fed_a = c1 * np.sqrt(np.clip(pump - p_a, _LEAST_DROP, margin))
+        fed_b = c4 * np.sqrt(np.clip(pump - p_b, _LEAST_DROP, margin))
+        q_a = np.where(out, fed_a, c3 * np.sqrt(np.maximum(p_a - tank, LAMINAR)))
+        q_b = np.where(out, c2 * np.sqrt(np.maximum(p_b - tank, LAMINAR)), fed_b)
+        y = asked / (area_a * q_a / ca + area_b * q_b / cb)
+        # sucked empty, and not filled yet: the side that the load presses on sets the speed alone
+        by_b = (area_b * w + cb * rate[i] / area_b) / q_b
+        by_a = (area_a * w + ca * rate[i] / area_a) / q_a
+        y = np.where(out & (p_a < tank) & (q_a * by_b < area_a * w), by_b, y)
+        y = np.where(~out & (p_b < tank) & (q_b * by_a > area_b * w), by_a, y)
+        return y, (area_b * w - q_b * y) / cb
+
+    found = np.empty_like(v)
+    held = force[0] - tank * (area_a - area_b)
+    p_b = tank + np.maximum(-held, 0.0) / area_b
+    steps = np.diff(time, append=2.0 * time[-1] - time[-2])
+    for i in range(len(time)):
+        p_b = np.maximum(p_b, np.maximum(least, (area_a * least - force[i]) / area_b))
+        found[i], slope = at(i, p_b)
+        _, beside = at(i, p_b + _BESIDE)
+        # linearly implicit Euler: at low pressures the outlet's flow stiffens
+        stiff = np.minimum((beside - slope) / _BESIDE, 0.0)
+        p_b = p_b + steps[i] * slope / (1.0 - steps[i] * stiff)
+    return found
+
+
+def flow_share(machine: Machine, reference: Trajectory) -> float:
+    """The largest share of its flow that a motion asks of a valve or of the pump.
+
+    Of a valve A |v| over the flow at full stroke, A the area that oil flows onto: c sqrt(margin)
+    of a compensated one, and half of the supply's pressure at either edge of another; of the pump
+    the sum of A |v| over its most, where it has one.
+
+    Args:
+        machine: The machine, with a circuit.
+        reference: Of its active joints.
+    """
+    circuit = circuit_of(machine)
+    time = np.linspace(0.0, reference.duration, int(_PER_SECOND * reference.duration) + 2)
+    v = reference.velocity(time)
+    most, total = 0.0, np.zeros(len(time))
+    for joint in circuit.joints:
+        cylinder, valve = circuit.cylinders[joint], circuit.valves[joint]
+        rate = v[:, machine.active.index(joint)]
+        drop = valve.margin or 0.5 * (circuit.supply.pressure - circuit.supply.tank)
+        out = np.maximum(rate, 0.0) * cylinder.area_a
+        back = np.maximum(-rate, 0.0) * cylinder.area_b
+        shares = out / valve.c1 + back / valve.c4
+        most, total = max(most, float(shares.max()) / np.sqrt(drop)), total + out + back
+    pump = circuit.supply.flow
+    return max(most, float(total.max()) / pump) if pump else most
+
+
+def fastest(machine: Machine, reference: Trajectory, method: str = "none") -> Trajectory:
+    """The fastest motion along a reference that valves and pump have the flow for.
+
+    Flows are as 1 / T, so the reference itself takes T times its `flow_share`; where a method of
+    `without_sway` changes it in another way for each T, that is repeated until the share is 1.
+
+    Args:
+        machine: The machine, with free joints and a circuit.
+        reference: From rest to rest.
+        method: Of `without_sway`.
+
+    Returns:
+        What `without_sway` makes of it.
+
+    Raises:
+        InputError: As `without_sway`, or the reference asks for no flow.
+    """
+    base = with_free(machine, reference)
+    duration = base.duration * flow_share(machine, base)
+    if duration == 0:
+        raise InputError("the reference moves no cylinder, its time has no least")
+    for _ in range(_ROUNDS):
+        found = without_sway(machine, retimed(base, duration), method)
+        share = flow_share(machine, found)
+        if abs(share - 1.0) < _CLOSE:
+            break
+        duration *= share
+    return found
