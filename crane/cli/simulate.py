@@ -168,7 +168,7 @@ def control_of(
 
 def under_task(machine: "Machine", task: str | None) -> "Machine":
     """A machine under what acts from outside while a task is done; others tell of unknown ones."""
-    if task not in machine.tasks:
+    if task is None or task not in machine.tasks:
         return machine
     return machine.under(*machine.tasks[task].loads)
 
