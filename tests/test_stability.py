@@ -212,3 +212,25 @@ def test_the_command_tells_both_loads(folder, tmp_path):
     run = typed("simulate", path, *words)
     assert run.returncode == 0 and "it would tip at t =" in run.stdout + run.stderr
     assert "of the weight hold it down" in (tmp_path / "out" / "summary.md").read_text()
+
+
+@pytest.mark.parametrize("slew", [0.0, 0.6, np.pi / 2])
+def test_the_excavator_tips_as_by_hand(slew):
+    """The load at the bucket's lip about the tracks' edge, by sums of m g x of all bodies."""
+    machine = crane.load("excavator")
+    q_a = machine.home[machine.closure.active].copy()
+    q_a[machine.active.index("slew")] = slew
+    (load,), (line,) = Stability(machine).tip_over_load(q_a)
+    model, data = machine.model, machine.model.createData()
+    pin.framesForwardKinematics(model, data, machine.closure.solve(q_a))
+    bodies = [(x.mass, data.oMi[i].act(x.lever)) for i, x in enumerate(model.inertias)]
+    start, end = (data.oMf[machine.frame(x)].translation[:2] for x in line.split(" to "))
+    way = (end - start) / np.linalg.norm(end - start)
+
+    def inside(point):
+        return way[0] * (point[1] - start[1]) - way[1] * (point[0] - start[0])
+
+    holding = sum(mass * inside(place) for mass, place in bodies)
+    lip = data.oMf[machine.frame(machine.tip)].translation
+    assert load == pytest.approx(holding / -inside(lip), rel=1e-9)
+    assert 2e3 < load < 2e4

@@ -99,6 +99,7 @@ def _about(machine: Machine, scene: Scene, recording: "Recording | None") -> dic
         "payload": payload_place(machine),
         "pins": [place(machine, loop.predecessor) for loop in machine.closure.equations.loops],
         "actuators": [],
+        "loads": [],
         "lower": scene.lower.tolist(),
         "upper": scene.upper.tolist(),
         "ground": scene.ground,
@@ -140,6 +141,7 @@ def _runs(
     wanted = points(recording, "reference_tip")
     return {
         "actuators": _actuators(machine, recording, scene.rows),
+        "loads": _loads(machine, recording, scene.rows),
         "runs": runs,
         "groups": groups(machine, recording, grid, second),
         "reference": "" if wanted is None else packed(wanted[scene.rows], "f4"),
@@ -175,6 +177,32 @@ def _actuators(machine: Machine, recording: "Recording", rows: np.ndarray) -> li
             }
         )
     return found
+
+
+def _loads(machine: Machine, recording: "Recording", rows: np.ndarray) -> list[dict[str, Any]]:
+    """Where forces from outside act and how strongly, in shares of the largest."""
+    known = [*machine.external, *(x for task in machine.tasks.values() for x in task.loads)]
+    frames = {link: link for link in machine.tree.links} | {x.name: x.frame for x in known}
+    seen, forces = recording.channels, {}
+    for column in seen:
+        name = column.removeprefix("load_").removesuffix("_force_x")
+        if column == f"load_{name}_force_x" and name in frames:
+            axes = (seen.get(f"load_{name}_force_{axis}") for axis in "xyz")
+            forces[name] = [np.zeros(len(recording.time)) if x is None else x for x in axes]
+    for name in machine.supports:
+        if f"support_{name}" in seen and name not in forces:
+            forces[name] = [np.zeros(len(recording.time))] * 2 + [seen[f"support_{name}"]]
+    if not forces:
+        return []
+    sizes = [np.linalg.norm(force, axis=0) for force in forces.values()]
+    full = float(np.percentile(np.maximum.reduce(sizes), _FULL)) or 1.0
+    return [
+        {
+            "name": name, "place": place(machine, frames[name]), "full": full,
+            "share": [packed((x / full)[rows], "f4") for x in force],
+        }
+        for name, force in forces.items()
+    ]  # fmt: skip
 
 
 def _html(about: dict[str, Any], scene: Scene) -> str:

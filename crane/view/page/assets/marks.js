@@ -1,6 +1,6 @@
 // What is drawn on the machine: forces, the tip's way, centres of mass, pins.
 
-const COLOURS = { push: "#cf4520", pull: "#1d63c9", tip: "#0d7d72", reference: "#e39a12", mass: "#1d2733", payload: "#7a3db8", pin: "#5d6b7a" };
+const COLOURS = { push: "#cf4520", pull: "#1d63c9", tip: "#0d7d72", reference: "#e39a12", mass: "#1d2733", payload: "#7a3db8", pin: "#5d6b7a", load: "#b0257d" };
 const FULL_TURN = 1.7 * Math.PI; // what the largest torque winds
 
 // Always visible, also within a cylinder's barrel.
@@ -122,6 +122,13 @@ function pinSign(pen) {
     disc(pen, COLOURS.pin, 9);
 }
 
+// Three digits with a prefix: 12500 is "12.5 k".
+function metric(value) {
+    const steps = [[1e6, "M"], [1e3, "k"], [1, ""]];
+    const [unit, prefix] = steps.find(([least]) => value >= least) || [1, ""];
+    return `${Number((value / unit).toPrecision(3))} ${prefix}`;
+}
+
 // At most 6000 of so many frames, evenly: enough for a line on the screen.
 function some(count) {
     const kept = Math.min(count, 6000);
@@ -177,6 +184,15 @@ class Marks {
             const words = kinds.has("prismatic") ? "push, pull" : "torque +, \u2212";
             this.add("forces", words, [COLOURS.push, COLOURS.pull], this.arrows.map(({ arrow }) => arrow.object));
         }
+        this.loads = page.loads.map((load) => {
+            const arrow = new StraightArrow(size);
+            return { ...load, share: load.share.map(floats), arrow };
+        });
+        if (this.loads.length) {
+            for (const { arrow } of this.loads) arrow.material.color.set(COLOURS.load);
+            const title = `loads, ${metric(page.loads[0].full)}N at full length`;
+            this.add("loads", title, [COLOURS.load], this.loads.map(({ arrow }) => arrow.object));
+        }
         if (page.tip && motion.time.length > 1) {
             const way = some(motion.time.length).map((k) => this.tipAt(page.tip, motion.frame(k)));
             this.add("path", "tip path", [COLOURS.tip], [tube(way, 0.0022 * size, COLOURS.tip)]);
@@ -218,6 +234,11 @@ class Marks {
     update(time, poses) {
         for (const { joint, at, axis, share, arrow } of this.arrows) {
             arrow.set(moved(poses[joint], at), turned(poses[joint], axis), this.motion.read(share, time));
+        }
+        for (const { place, share, arrow } of this.loads) {
+            const force = share.map((part) => this.motion.read(part, time));
+            arrow.set(Array.from(this.tree.pose(poses, place).slice(12, 15)), force, Math.hypot(...force));
+            arrow.material.color.set(COLOURS.load);
         }
         for (const move of this.moving) move(poses);
         viewer.set_dirty();
