@@ -109,6 +109,7 @@ CALLS = {
         "slider.yaml --task swing --duration 0.1 --by crank.mass --out {out}",
         "rig.yaml --duration 0.1 --by load_x.mass --by start.x",
     ],
+    "sway": ["patu655_grapple --task swing --payload 200 --damping 0"],
     "workspace": ["slider.yaml --samples 100 --out {out}", "rig.yaml --samples 100 --out {out}"],
 }
 # Calls that once ended in a traceback, in silence or never.

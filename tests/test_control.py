@@ -75,7 +75,8 @@ def test_named_controllers(forwarder, path):
     assert isinstance(controller("computed-torque", forwarder, path), crane.ComputedTorque)
     with pytest.raises(InputError, match=r"controller 'pid' is unknown, did you mean 'pi'\?"):
         controller("pid", forwarder, path)
-    assert set(CONTROLLERS) == {"pi", "computed-torque", "valve-pd", "tip-velocity"}
+    names = {"pi", "computed-torque", "valve-pd", "valve-feedforward", "tip-velocity"}
+    assert set(CONTROLLERS) == names
 
 
 def test_errors(forwarder, path):

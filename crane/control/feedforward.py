@@ -130,13 +130,12 @@ class ValveFeedforward(ValvePD):
 
     def references(self, times: Array) -> Array:
         """See `Command`."""
-        q, v, _ = self.planned(times)
-        open_ = [_held(times, self._times, column) for column in self._opening.T]
-        known = [q[:, self._which], v[:, self._which], np.transpose(open_)]
+        q, v, last = self.planned.position(times), self.planned.velocity(times), self._knots[-1]
+        opening = _between(times, last, self._opening)
+        opening[(times < 0) | (times > last)] = 0.0
+        known = [q[:, self._which], v[:, self._which], opening]
         if self._damped:
-            inside = np.clip(times, 0.0, self._knots[-1])
-            table = [np.interp(inside, self._knots, column) for column in self._table.T]
-            known += [np.transpose(table), q[:, self._free]]
+            known += [_between(times, last, self._table), q[:, self._free]]
         return np.hstack(known)
 
     def signals(self, at: At) -> Sequence[Number]:
@@ -172,6 +171,10 @@ class ValveFeedforward(ValvePD):
         return found
 
 
-def _held(times: Array, knots: Array, values: Array) -> Array:
-    """Values between knots, nothing beyond them."""
-    return np.interp(times, knots, values, left=0.0, right=0.0)
+def _between(times: Array, last: float, table: Array) -> Array:
+    """Rows (N, c) straight between those of a table, at even times from 0 to the last [s]."""
+    at = np.clip(times / last, 0.0, 1.0) * (len(table) - 1)
+    before = np.minimum(at.astype(int), len(table) - 2)
+    share = (at - before)[:, None]
+    found: Array = (1.0 - share) * table[before] + share * table[before + 1]
+    return found

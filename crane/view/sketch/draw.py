@@ -114,6 +114,8 @@ def _legend(machine: Machine, com: bool) -> list[tuple[Line2D, ...]]:
     """One entry per sub-chain and per kind of symbol, each of lines on top of each other."""
     entries: list[tuple[Line2D, ...]] = []
     for i, chain in enumerate(machine.chains):
+        if not chain.joints:
+            continue  # nothing has its colour
         colour = CHAINS[i % len(CHAINS)]
         entries.append((Line2D([], [], color=colour, linewidth=3.0, label=plain(chain.name)),))
     symbols: dict[str, list[Any]] = {"joint": [JOINT], "loop": [RING, DOT]}
