@@ -246,8 +246,8 @@ def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
         (["fly"], "No such command 'fly'"),
         (
             ["info", "zzzzzz"],
-            "known: kr300, mini_forwarder, patu655, patu655_grapple, tx40; crane list shows all "
-            "names",
+            "known: excavator, kr300, mini_forwarder, patu655, patu655_grapple, tx40; crane list "
+            "shows all names",
         ),
         (["demo", "--out", ""], "the name after --out is empty"),
         (["demo", "--out", "/dev/null"], "/dev/null: is a file"),
@@ -299,12 +299,13 @@ def test_demo(tmp_path):
     result = typed("demo", "--out", tmp_path / "demo", "--force")
     assert result.returncode == 0, result.stderr
     names = {path.name for path in (tmp_path / "demo").iterdir()}
-    assert names == {"loading", "return", "lift", "summary.md", "notes.txt"}
+    assert names == {"loading", "return", "lift", "dig", "summary.md", "notes.txt"}
     assert (tmp_path / "demo" / "lift" / "view.html").stat().st_size > 1000
-    for task in ("loading", "return", "lift"):
+    for task in ("loading", "return", "lift", "dig"):
         names = {path.name for path in (tmp_path / "demo" / task).iterdir()}
         assert names == {"recording.csv", "summary.md", "figure.png", "view.html"}
-    assert Path(tmp_path / "demo" / "summary.md").read_text().count("# mini_forwarder: ") == 3
+    text = Path(tmp_path / "demo" / "summary.md").read_text()
+    assert (text.count("# mini_forwarder: "), text.count("# excavator: dig")) == (3, 1)
 
 
 def test_study(tmp_path):

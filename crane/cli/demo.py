@@ -1,21 +1,20 @@
-"""The demonstration: every task of a bundled machine under its PI controllers."""
+"""The demonstration: a crane under its PI controllers, and an excavator that digs."""
 
 from pathlib import Path
 
 from crane.cli.runs import SUMMARY, write_run, write_views
+from crane.cli.simulate import control_of, under_task
 from crane.common.output import staging
-from crane.control import PI
 from crane.formats import load
-from crane.motion.trajectories import task_trajectory
 from crane.simulation import Progress, simulate
 
-MACHINE = "mini_forwarder"
+MACHINES = "mini_forwarder", "excavator"
 
 _SIMULATED = 0.3  # share of a task's time when it has been simulated, but not yet drawn
 
 
 def run_demo(folder: Path, progress: Progress) -> str:
-    """Simulate the three published trajectories of the reduced-scale forwarder.
+    """Simulate the tasks of the reduced-scale forwarder and of the excavator.
 
     Args:
         folder: Where results go, one folder per task; created where there is none. Nothing
@@ -28,16 +27,19 @@ def run_demo(folder: Path, progress: Progress) -> str:
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    machine = load(MACHINE)
+    runs = [(machine, task) for machine in map(load, MACHINES) for task in machine.tasks]
     texts = []
     with staging(folder) as part:
-        for done, task in enumerate(machine.tasks):
+        for done, (machine, task) in enumerate(runs):
 
             def report(share: float, done: int = done) -> None:
-                progress((done + _SIMULATED * share) / len(machine.tasks))
+                progress((done + _SIMULATED * share) / len(runs))
 
-            control = PI(machine, task_trajectory(machine, task))
-            recording = simulate(machine, control, label=task, progress=report)
+            control = control_of(machine, task, None)
+            duration = machine.tasks[task].duration
+            recording = simulate(
+                under_task(machine, task), control, duration=duration, label=task, progress=report
+            )
             texts.append(write_run(part / task, recording))
             write_views(part / task, machine, recording)
         text = "\n".join(texts)
