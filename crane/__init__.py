@@ -55,11 +55,14 @@ if TYPE_CHECKING:
         Kinematics,
         Sway,
         Trajectory,
+        Turning,
         point_to_point,
         polynomial,
         retimed,
         task_trajectory,
         tip_trajectory,
+        via_attitudes,
+        via_points,
         without_sway,
     )
     from crane.motion.workspaces import Workspace, workspace
@@ -114,8 +117,8 @@ _HOMES = {
     "crane.identification.mechanics.payload": "identify_payload",
     "crane.identification.mechanics.result": "Identification",
     "crane.machine": "Machine Payload",
-    "crane.motion": "Kinematics Sway Trajectory point_to_point polynomial retimed "
-    "task_trajectory tip_trajectory without_sway",
+    "crane.motion": "Kinematics Sway Trajectory Turning point_to_point polynomial retimed "
+    "task_trajectory tip_trajectory via_attitudes via_points without_sway",
     "crane.motion.workspaces": "Workspace workspace",
     "crane.recordings": "Recording",
     "crane.recordings.measured": "read_measured",
@@ -134,14 +137,14 @@ __all__ = [
     "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel", "Machine", "PDGains",
     "PI", "PIGains", "Payload", "Pushing", "Recording", "Rope", "SOILS", "Sampled",
     "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy",
-    "TipVelocity", "Trajectory", "ValveDrive", "ValveFeedforward", "ValvePD", "Workspace",
+    "TipVelocity", "Trajectory", "Turning", "ValveDrive", "ValveFeedforward", "ValvePD", "Workspace",
     "Wrench", "add_cylinder", "add_loops", "calibrate", "casadi_function", "check",
     "cross_validate", "excite", "excite_valves", "fastest", "gradient", "identify",
     "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
     "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
     "read_measured", "replay", "report", "retimed", "sensitivities", "simulate", "simulate_batch",
-    "sketch", "study", "sway_study", "task_trajectory", "tip_trajectory", "without_sway",
-    "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
+    "sketch", "study", "sway_study", "task_trajectory", "tip_trajectory", "via_attitudes",
+    "via_points", "without_sway", "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 

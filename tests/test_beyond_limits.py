@@ -10,7 +10,8 @@ from rig import Rig
 import crane
 from crane.common.errors import ClosureError, CraneWarning, InputError, LimitError, SimulationError
 from crane.control import Sampled, ValvePD
-from crane.motion.trajectories import beyond_limits, polynomial
+from crane.motion.curves import polynomial
+from crane.motion.trajectories import beyond_limits
 
 TOLD = (
     "the reference of 'X1' goes to 0.06 m at t = 0.1 s, beyond its limit 0.03 m "

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 import crane
 from crane.common.errors import CraneWarning, SimulationError
 from crane.control import controller
-from crane.motion.trajectories import point_to_point
+from crane.motion.curves import point_to_point
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 GRAVITY = 9.81

@@ -10,7 +10,7 @@ from typed import typed
 import crane
 from crane.common.errors import CraneWarning
 from crane.control import controller
-from crane.motion.trajectories import point_to_point
+from crane.motion.curves import point_to_point
 
 ROBOTS = Path(__file__).parents[2] / "shared/data/third_party/parallel_robots"
 FREEDOMS = {

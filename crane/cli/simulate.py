@@ -140,8 +140,9 @@ def control_of(
         InputError: There is no such task or controller.
     """
     from crane.control import controller, joystick, usual
+    from crane.motion.curves import point_to_point
     from crane.motion.sway import without_sway
-    from crane.motion.trajectories import point_to_point, task_trajectory
+    from crane.motion.trajectories import task_trajectory
 
     if task is None:
         if sway is not None:

@@ -10,7 +10,8 @@ from crane.codegen import Number
 from crane.common.samples import Array, as_sample
 from crane.dynamics import Dynamics
 from crane.machine import Machine
-from crane.motion.trajectories import Trajectory, with_free
+from crane.motion.curves import Trajectory
+from crane.motion.trajectories import with_free
 
 
 class Controller(Protocol):

@@ -15,8 +15,8 @@ from crane.control.valves import ValvePD, circuit_of
 from crane.dynamics import Dynamics
 from crane.hydraulics import Hydraulics, PDGains
 from crane.machine import Machine
+from crane.motion.curves import Trajectory
 from crane.motion.sway import Sway, without_sway
-from crane.motion.trajectories import Trajectory
 
 _KNOTS_PER_SECOND = 50  # of forces and gains
 _STEPS_PER_SECOND = 1000  # of openings

@@ -14,7 +14,8 @@ from crane.control.base import At, Law
 from crane.description import PIGains
 from crane.dynamics.hybrid import hybrid
 from crane.machine import Machine
-from crane.motion.trajectories import Trajectory, with_free
+from crane.motion.curves import Trajectory
+from crane.motion.trajectories import with_free
 
 
 class PI(Law):

@@ -9,7 +9,7 @@ from crane.control.forces import PI, ComputedTorque
 from crane.control.tip import TipVelocity
 from crane.control.valves import Command, ValvePD
 from crane.machine import Machine
-from crane.motion.trajectories import Trajectory
+from crane.motion.curves import Trajectory
 
 CONTROLLERS: Mapping[str, Callable[[Machine, Trajectory], Controller | Command]] = {
     "pi": PI,

@@ -12,8 +12,9 @@ from crane.hydraulics import Hydraulics
 from crane.hydraulics.components import Cylinder, Valve
 from crane.hydraulics.flow import LAMINAR
 from crane.machine import Machine
+from crane.motion.curves import Trajectory
 from crane.motion.sway import retimed, without_sway
-from crane.motion.trajectories import Trajectory, with_free
+from crane.motion.trajectories import with_free
 
 _LEAST_DROP = 1e5  # [Pa] that an edge is taken to have
 _BESIDE = 1e3  # [Pa] of difference quotients

@@ -9,8 +9,8 @@ from crane.common.errors import InputError
 from crane.common.samples import Array, as_sample
 from crane.control.valves import Sampled, circuit_of
 from crane.machine import Machine
+from crane.motion.curves import Trajectory
 from crane.motion.kinematics import Kinematics
-from crane.motion.trajectories import Trajectory
 
 _EASE = 1e-3  # opening over which the dead band is jumped
 _NEAR = 1e-3  # of a stroke: a joint so close to its limit goes no further

@@ -14,7 +14,8 @@ from crane.common.samples import Array, as_number, as_sample
 from crane.control.base import At
 from crane.hydraulics import Hydraulics, PDGains
 from crane.machine import Machine
-from crane.motion.trajectories import Trajectory, with_free
+from crane.motion.curves import Trajectory
+from crane.motion.trajectories import with_free
 
 _LONGEST = 4000.0  # of levers [s], what a simulation can have of milliseconds
 _LOGGED = 0.02  # [s] between samples of a log, at most

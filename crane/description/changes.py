@@ -335,10 +335,11 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
             name: dataclasses.replace(
                 task,
                 levers={x: lever for x, lever in task.levers.items() if x not in lock},
+                start={x: value for x, value in task.start.items() if x not in lock},
                 loads=tuple(filter(moves, task.loads)),
             )
             for name, task in spec.tasks.items()
-            if not (task.space == "active" and task.coefficients.keys() & lock.keys())
+            if not (task.space == "active" and lock.keys() & set(task.coordinates))
         },
         couplings=couplings,
     )
@@ -398,7 +399,7 @@ def driven(
         tasks={
             name: task
             for name, task in spec.tasks.items()
-            if task.space == "tip" or same or not task.coefficients.keys() - set(kept)
+            if task.space == "tip" or same or not {*task.coordinates, *task.start} - set(kept)
         },
     )
 

@@ -355,8 +355,27 @@ class PIGains:
 
 
 @dataclass(frozen=True)
+class Via:
+    """A point that a task passes.
+
+    Attributes:
+        time: [s].
+        point: What is given of its coordinates [m], [rad].
+        rates: What is given of their rates there [m/s], [rad/s].
+    """
+
+    time: float
+    point: Mapping[str, float]
+    rates: Mapping[str, float] = field(default_factory=dict)
+
+
+TIP = ("x", "y", "z")  # coordinates of tasks of the tip
+ATTITUDES = (("inclination",), ("roll", "pitch", "yaw"))  # and of how its frame is turned
+
+
+@dataclass(frozen=True)
 class Task:
-    """A named motion: polynomials in time of the tip or of active joints, or levers.
+    """A named motion: of the tip or of active joints, by polynomials or via points, or levers.
 
     Attributes:
         name: The task's name.
@@ -365,8 +384,10 @@ class Task:
         space: "tip" (coordinates x, y, z of the world), "active" (the active joints), or
             "joystick" (levers of valves).
         coefficients: Per coordinate the polynomial in time [s], lowest power first [m], [rad].
+        via: Points in the place of polynomials.
         levers: Per joint a polygon of time [s] and lever, -1 to 1.
         loads: What acts from outside while it is done, beside what always does.
+        start: Active coordinates where levers begin [m], [rad]; at home where not given.
     """
 
     name: str
@@ -376,6 +397,13 @@ class Task:
     coefficients: Mapping[str, tuple[float, ...]]
     levers: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
     loads: tuple[Wrench, ...] = ()
+    via: tuple[Via, ...] = ()
+    start: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """What polynomials or via points are of."""
+        return tuple(self.via[0].point if self.via else self.coefficients)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """The tip (or any other frame) as a function of the active coordinates, and back."""
 
-import itertools
+import math
 from functools import cached_property
 
 import numpy as np
@@ -11,22 +11,39 @@ from scipy.interpolate import make_interp_spline
 from crane.closure.traced import Bodies, Constants, Loops, MovingBodies, folded
 from crane.codegen import Number, Program, Tape, TooLongError
 from crane.codegen.scalar import add, cross, dot, scale, subtract, times
-from crane.common.errors import ClosureError, InputError, UnreachableTipError
+from crane.common.errors import ClosureError, InputError, UnreachableTipError, known
 from crane.common.samples import Array, as_sample, as_samples, per_sample
 from crane.machine import Machine
+from crane.motion.attitude import INCLINATION, Attitude, Inclination, Rotation, roll_pitch_yaw
 
 # in shares of the machine's size, or of the distance of what is sought if that is farther
 _ACCURACY = 1e-11
 _ROUNDING = 1e-15
+_RANK = 1e-6  # of the machine's size, by which a stroke moves the frame
+_ORTHOGONAL = 1e-6
+_GRID = 243  # postures all over the strokes
+_STARTS = 40  # postures to start from, where an attitude is sought
 _STRIDE = 16  # samples of a path between those that are searched for one by one
 _CHUNK = 1000  # samples of a stack at once
 _BESIDE = 0.02  # share of the strokes by which a sample may miss the curve through those
+
+
+ATTITUDES = (INCLINATION, "rotation")
+
+
+def norm(vector: Array) -> float:
+    """Its length."""
+    return float(np.linalg.norm(vector))
 
 
 class Kinematics:
     """Position of one frame as a function of q_A.
 
         x = p(f(q_A)),    x' = J gamma v_A,    x'' = J gamma a_A + bias.
+
+    Where an attitude is asked for, its coordinates come after those of the position: the
+    "inclination" of the frame, or its whole "rotation", whose rates are the angular velocity; see
+    `crane.motion.attitude`.
 
     Args:
         machine: The machine.
@@ -48,6 +65,8 @@ class Kinematics:
         # free joints stay where they are
         units = machine.closure.units[machine.closure.active]
         self._scale = np.where(np.isfinite(span), span, units) * machine.driven
+        self._size = machine.closure.size
+        self._turned: dict[str, Attitude] = {}
 
     def __repr__(self) -> str:
         """What moves, of what."""
@@ -86,50 +105,94 @@ class Kinematics:
         placement = pin.updateFramePlacement(self._model, self._data, self._frame)
         return np.array(placement.translation)
 
-    def jacobian(self, q_a: ArrayLike) -> Array:
-        """Reduced Jacobian dx/dq_A = J gamma.
+    def rotation(self, q_a: ArrayLike) -> Array:
+        """Rotation matrix of the frame, seen from the world.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
 
         Returns:
-            (3, n) or (N, 3, n).
+            (3, 3) or (N, 3, 3).
         """
         q = self.machine.closure.solve(q_a)
+        return per_sample(lambda one: self._pose(one)[1], q)
+
+    def inclination(self, q_a: ArrayLike) -> Array:
+        """By how much the frame's x axis points above the horizontal, in the plane it turns in.
+
+        Args:
+            q_a: (n,) or (N, n) [m], [rad].
+
+        Returns:
+            () or (N,) [rad], within -pi to pi.
+
+        Raises:
+            InputError: The frame has none, see `crane.motion.attitude.Inclination`.
+        """
+        return Inclination(self.machine, self.frame).value(self.rotation(q_a))
+
+    def jacobian(self, q_a: ArrayLike, attitude: str | None = None) -> Array:
+        """Reduced Jacobian dx/dq_A = J gamma.
+
+        Args:
+            q_a: (n,) or (N, n) [m], [rad].
+            attitude: Whose rates come after those of the position; see the class.
+
+        Returns:
+            (3, n) or (N, 3, n); with the k coordinates of an attitude 3 + k in place of 3.
+        """
+        q = self.machine.closure.solve(q_a)
+        if attitude is not None:
+            turned = self._attitude(attitude)
+            return per_sample(lambda one: self._rows(one, turned), q)
         if q.ndim == 2 and self._fast is not None:
             return self._fast.rows(q)[:, 3:-3].reshape(len(q), 3, -1)
         return per_sample(self._jacobian, q)
 
-    def bias(self, q_a: ArrayLike, v_a: ArrayLike) -> Array:
+    def bias(self, q_a: ArrayLike, v_a: ArrayLike, attitude: str | None = None) -> Array:
         """Acceleration of the frame at a_A = 0.
 
         Args:
             q_a: (n,) or (N, n) [m], [rad].
             v_a: The same shape [m/s], [rad/s].
+            attitude: Whose second rates come after those of the position; see the class.
 
         Returns:
-            (3,) or (N, 3) [m/s2].
+            (3,) or (N, 3) [m/s2]; with the k coordinates of an attitude 3 + k in place of 3.
         """
         names = self.machine.active
+        turned = None if attitude is None else self._attitude(attitude)
 
         def one(q: Array, v_a: Array) -> Array:
             v = self.machine.closure.gamma(q) @ v_a
             drift = self.machine.closure.drift(q, v)
             at = self.machine.coordinates.configuration(q)
             pin.forwardKinematics(self._model, self._data, at, v, drift)
-            acceleration = pin.getFrameClassicalAcceleration(
-                self._model, self._data, self._frame, pin.LOCAL_WORLD_ALIGNED
-            )
-            return np.array(acceleration.linear)
+            axes = pin.LOCAL_WORLD_ALIGNED
+            second = pin.getFrameClassicalAcceleration(self._model, self._data, self._frame, axes)
+            if turned is None:
+                return np.array(second.linear)
+            rate = pin.getFrameVelocity(self._model, self._data, self._frame, axes)
+            rotation = pin.updateFramePlacement(self._model, self._data, self._frame).rotation
+            bend = turned.bend(rotation, rate.angular, second.angular)
+            return np.concatenate([second.linear, bend])
 
         v_a = as_samples(v_a, len(names), "v_a", names)
         q = self.machine.closure.solve(q_a)
-        if q.ndim == 2 and q.shape[:1] == v_a.shape[:-1] and self._fast is not None:
+        whole = q.ndim == 2 and q.shape[:1] == v_a.shape[:-1]
+        if whole and turned is None and self._fast is not None:
             return self._fast.rows(q, v_a)[:, -3:]
         return per_sample(one, q, v_a)
 
-    def inverse(self, position: ArrayLike, guess: ArrayLike | None = None) -> Array:
+    def inverse(
+        self,
+        position: ArrayLike,
+        guess: ArrayLike | None = None,
+        attitude: ArrayLike | None = None,
+    ) -> Array:
         """Active coordinates within their limits that put the frame at a position.
+
+        With an attitude, which is met as exactly: a radian counts as much as the machine's size.
 
         Levenberg-Marquardt on the reduced Jacobian with the limits as bounds, from the guess or
         the nearest of a grid of postures. A stack is tracked like a path: where its samples are
@@ -140,15 +203,32 @@ class Kinematics:
         Args:
             position: (3,) or (N, 3) in the world [m].
             guess: (n,) active coordinates to start from.
+            attitude: Of the frame, inclination () or (N,) [rad] or roll, pitch and yaw (3,) or
+                (N, 3) [rad] (R_z(yaw) R_y(pitch) R_x(roll), as URDF has it) or rotation matrices
+                (3, 3) or (N, 3, 3).
 
         Returns:
             q_A, (n,) or (N, n) [m], [rad].
 
         Raises:
-            InputError: Wrong shape or not finite.
-            UnreachableTipError: The position is out of reach.
+            InputError: Wrong shape or not finite, or the machine has no drives for the attitude.
+            UnreachableTipError: The position is out of reach, or cannot be had in this attitude.
         """
+        return self.tracked(position, guess, attitude)
+
+    def tracked(
+        self,
+        position: ArrayLike,
+        guess: ArrayLike | None = None,
+        attitude: ArrayLike | None = None,
+        time: Array | None = None,
+    ) -> Array:
+        """`inverse`, whose errors tell the time of a sample (N,) [s] as well."""
         targets = as_samples(position, 3, "position", ("x", "y", "z"))
+        turned = None
+        if attitude is not None:
+            turned, goals = self._goals(attitude, targets)
+            targets = np.concatenate([targets, goals], axis=-1)
         start = None
         if guess is not None:
             names = self.machine.active
@@ -156,15 +236,62 @@ class Kinematics:
                 as_sample(guess, len(names), "guess", names), "guess"
             )
         if targets.ndim == 1:
-            return self._inverse(targets, start, "")
+            return self._inverse(targets, start, "", turned)
         if len(targets) == 0:
             raise InputError("position is an empty stack, give at least one sample")
-        if (tracked := self._track(targets, start)) is not None:
+        places = [
+            f" (sample {i})" if time is None else f" at t = {time[i]:.4g} s (sample {i})"
+            for i in range(len(targets))
+        ]
+        if turned is None and (tracked := self._track(targets, start, places)) is not None:
             return tracked
         out = np.empty((len(targets), len(self.machine.active)))
         for i, target in enumerate(targets):
-            start = out[i] = self._inverse(target, start, f" (sample {i})")
+            start = out[i] = self._inverse(target, start, places[i], turned)
         return out
+
+    def _goals(self, attitude: ArrayLike, positions: Array) -> tuple[Attitude, Array]:
+        """What an attitude is one of, and flat targets of it beside positions."""
+        given = np.asarray(attitude)
+        beside, shape = positions.shape[:-1], np.shape(attitude)
+        if shape not in (beside, (*beside, 3), (*beside, 3, 3)):
+            wanted = ", ".join(str((*beside, *more)) for more in ((), (3,), (3, 3)))
+            raise InputError(f"attitude has the shape {shape}, give one of {wanted}")
+        flat = as_samples(given.ravel(), given.size, "attitude")
+        if shape == beside:
+            return self._attitude(INCLINATION), flat.reshape(*beside, 1)
+        turned = flat.reshape(shape)
+        if shape[-2:] != (3, 3) or shape == (*beside, 3):
+            turned = roll_pitch_yaw(turned)
+        elif np.abs(turned @ np.swapaxes(turned, -1, -2) - np.eye(3)).max() > _ORTHOGONAL:
+            raise InputError("attitude is no rotation matrix, give one")
+        return self._attitude("rotation"), turned.reshape(*beside, 9)
+
+    def _attitude(self, name: str) -> Attitude:
+        """Coordinates of the attitude, which the machine can choose beside its position.
+
+        Raises:
+            InputError: It cannot.
+        """
+        if name not in ATTITUDES:
+            raise InputError(f"attitude '{name}' is unknown, {known(ATTITUDES, name)}")
+        if name not in self._turned:
+            machine = self.machine
+            found: Attitude
+            found = Rotation() if name == "rotation" else Inclination(machine, self.frame)
+            rows = [self._rows(q, found) * self._scale for q in self._some]
+            moved, turned = (
+                max(int(np.linalg.matrix_rank(row, tol=_RANK * self._size)) for row in some)
+                for some in ([row[:3] for row in rows], rows)
+            )
+            if turned < moved + len(found.names):
+                raise InputError(
+                    f"'{machine.name}' has too few drives for {', '.join(found.names)} of "
+                    f"'{self.frame}': they move it in {moved} directions, and turn it in "
+                    f"{turned - moved} beside"
+                )
+            self._turned[name] = found
+        return self._turned[name]
 
     @cached_property
     def _data(self) -> pin.Data:
@@ -186,7 +313,7 @@ class Kinematics:
         except TooLongError:
             return None
 
-    def _track(self, targets: Array, start: Array | None) -> Array | None:
+    def _track(self, targets: Array, start: Array | None, places: list[str]) -> Array | None:
         """Strokes along a dense path (N, 3), or None where that takes a closer look.
 
         Every sample is as exact as those searched for one by one, or None is returned.
@@ -201,11 +328,11 @@ class Kinematics:
         searched = np.empty((len(knots), n))
         for i, knot in enumerate(knots):
             try:
-                start = searched[i] = self._inverse(targets[knot], start, "")
+                start = searched[i] = self._inverse(targets[knot], start, "", None)
             except UnreachableTipError:
                 # say which sample is the first one, or see that it can be reached after all
                 for k in range(knots[max(i - 1, 0)], knot + 1):
-                    start = self._inverse(targets[k], start, f" (sample {k})")
+                    start = self._inverse(targets[k], start, places[k], None)
                 return None
         try:
             curve = make_interp_spline(knots, searched)(np.arange(len(targets)))
@@ -235,15 +362,51 @@ class Kinematics:
 
     def tree_jacobian(self, q: Array) -> Array:
         """Jacobian dx/dq (3, nv) of the spanning tree at one posture (nq,)."""
+        return self._tree(q)[:3]
+
+    def _tree(self, q: Array) -> Array:
+        """The same, and the angular one below it (6, nv)."""
         at = self.machine.coordinates.configuration(q)
         tree: Array = pin.computeFrameJacobian(
             self._model, self._data, at, self._frame, pin.LOCAL_WORLD_ALIGNED
         )
-        return tree.reshape(6, -1)[:3]  # of a single joint it comes as a vector
+        return tree.reshape(6, -1)  # of a single joint it comes as a vector
 
     def _jacobian(self, q: Array) -> Array:
         reduced: Array = self.tree_jacobian(q) @ self.machine.closure.gamma(q)
         return reduced
+
+    def _rows(self, q: Array, attitude: Attitude) -> Array:
+        """The reduced Jacobian (3 + k, n) with an attitude."""
+        reduced = self._tree(q) @ self.machine.closure.gamma(q)
+        return np.vstack([reduced[:3], attitude.rows(self._pose(q)[1], reduced[3:])])
+
+    def _pose(self, q: Array) -> tuple[Array, Array]:
+        """Position (3,) and rotation (3, 3) at one posture (nq,)."""
+        pin.forwardKinematics(self._model, self._data, self.machine.coordinates.configuration(q))
+        placement = pin.updateFramePlacement(self._model, self._data, self._frame)
+        return np.array(placement.translation), np.array(placement.rotation)
+
+    def _slopes(self, q: Array, attitude: Attitude | None) -> Array:
+        """How what is missed changes: of attitudes in lengths, a radian the machine's size."""
+        if attitude is None:
+            return self._jacobian(q)
+        rows = self._rows(q, attitude)
+        rows[3:] *= self._size
+        return rows
+
+    def _miss(self, target: Array, q: Array, attitude: Attitude | None) -> Array:
+        """From a posture to a target (3,), and of attitudes likewise."""
+        if attitude is None:
+            return np.asarray(target - self.position_at(q))
+        position, rotation = self._pose(q)
+        turn = self._size * attitude.miss(target[3:], rotation)
+        return np.concatenate([target[:3] - position, turn])
+
+    @cached_property
+    def _some(self) -> list[Array]:
+        """A few postures (nq,) all over the strokes."""
+        return [q for q, _ in self._grid[:: max(1, len(self._grid) // 6)]]
 
     @cached_property
     def _grid(self) -> list[tuple[Array, Array]]:
@@ -257,51 +420,68 @@ class Kinematics:
             )
         ]
         found = [(np.array(machine.home), self.position_at(machine.home))]
-        for q_a in itertools.islice(itertools.product(*axes), 243):
+        shape = tuple(len(axis) for axis in axes)
+        if math.prod(shape) <= _GRID:
+            cells = np.stack(np.unravel_index(np.arange(math.prod(shape)), shape), axis=1)
+        else:  # of many joints some, wherever
+            cells = np.random.default_rng(0).integers(shape, size=(_GRID, len(shape)))
+        for cell in cells:
+            q_a = np.array([axis[i] for axis, i in zip(axes, cell, strict=True)])
             try:
-                q = machine.closure.solve(np.array(q_a))
+                q = machine.closure.solve(q_a)
             except ClosureError:
                 continue
             found.append((q, self.position_at(q)))
         return found
 
-    def _inverse(self, target: Array, start: Array | None, sample: str) -> Array:
+    def _inverse(
+        self, target: Array, start: Array | None, sample: str, attitude: Attitude | None
+    ) -> Array:
         closure = self.machine.closure
         best = (np.inf, self.machine.home)
         if start is not None:
-            best = self._descend(target, closure.solve(start))
-        tolerance = _ACCURACY * self._far(target)
+            best = self._descend(target, closure.solve(start), attitude)
+        tolerance = _ACCURACY * self._far(target[:3])
         if best[0] > tolerance:
-            near = sorted(self._grid, key=lambda item: float(np.sum((item[1] - target) ** 2)))
-            for q, _ in near[:5]:
-                best = min(best, self._descend(target, q), key=lambda item: item[0])
+            if attitude is None:
+                misses = [float(np.sum((tip - target) ** 2)) for _, tip in self._grid]
+            else:
+                misses = [norm(self._miss(target, q, attitude)) for q, _ in self._grid]
+            for i in np.argsort(misses, kind="stable")[: 5 if attitude is None else _STARTS]:
+                found = self._descend(target, self._grid[i][0], attitude)
+                best = min(best, found, key=lambda item: item[0])
                 if best[0] <= tolerance:
                     break
         distance, q = best
         q_a: Array = q[closure.active]
         if distance > tolerance:
-            at = ", ".join(f"{value:.4g}" for value in target)
+            at = ", ".join(f"{value:.4g}" for value in target[:3]) + ") m"
+            left = self._miss(target, q, attitude)
+            away = f"{norm(left[:3]):.3g} m"
+            if attitude is not None:
+                at += f" with {attitude.words(target[3:])}"
+                away += f" and {norm(left[3:]) / self._size:.3g} rad"
             where = ", ".join(
                 f"{name} = {value:.4g}"
                 for name, value in zip(self.machine.active, q_a, strict=True)
             )
             raise UnreachableTipError(
-                f"'{self.frame}' cannot reach ({at}) m{sample}: it stays {distance:.3g} m away, "
+                f"'{self.frame}' cannot reach ({at}{sample}: it stays {away} away, "
                 f"nearest at {where}; choose a point within reach"
             )
         return q_a
 
-    def _descend(self, target: Array, q: Array) -> tuple[float, Array]:
+    def _descend(self, target: Array, q: Array, attitude: Attitude | None) -> tuple[float, Array]:
         """Bounded Levenberg-Marquardt; the distance reached and the posture."""
         closure, machine = self.machine.closure, self.machine
-        error = target - self.position_at(q)
-        distance = float(np.linalg.norm(error))
-        damping, far = 1e-6, self._far(target)
+        error = self._miss(target, q, attitude)
+        distance = norm(error)
+        damping, far = 1e-6, self._far(target[:3])
         for _ in range(100):
             if distance < _ROUNDING * far:
                 break
             q_a = q[closure.active]
-            jacobian = self._jacobian(q) * self._scale
+            jacobian = self._slopes(q, attitude) * self._scale
             pull = jacobian.T @ error
             blocked = ((q_a <= machine.lower) & (pull < 0)) | ((q_a >= machine.upper) & (pull > 0))
             free = np.flatnonzero(~blocked)
@@ -315,8 +495,8 @@ class Kinematics:
             except ClosureError:
                 damping = max(10 * damping, 1e-4)
                 continue
-            error_new = target - self.position_at(q_new)
-            closer = float(np.linalg.norm(error_new))
+            error_new = self._miss(target, q_new, attitude)
+            closer = norm(error_new)
             if closer < distance:
                 stalled = closer > 0.999 * distance and damping < 1e-9
                 q, error, distance = q_new, error_new, closer

@@ -4,16 +4,19 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import PPoly, make_interp_spline
+from scipy.interpolate import make_interp_spline
 
 from crane.common.errors import InputError, LimitError, known
-from crane.common.samples import Array, as_number, as_samples
+from crane.common.samples import Array
+from crane.description.spec import TIP, Task, Via
 from crane.machine import Machine
+from crane.motion.attitude import INCLINATION, Turning, via_attitudes
+from crane.motion.curves import Trajectory, polynomial, via_points
 from crane.motion.kinematics import Kinematics
+from crane.motion.splines import quintics
 
 _LIMIT_SLACK = 1e-6  # [rad], [machine's size]
 _KNOTS_PER_SECOND = 100
-_JUMP = 1e-9  # of the largest value, what no jump is
 
 
 def limit_slack(machine: Machine) -> Array:
@@ -21,189 +24,65 @@ def limit_slack(machine: Machine) -> Array:
     return _LIMIT_SLACK * machine.closure.units
 
 
-class Trajectory:
-    """A motion with two derivatives; before its start and after its end it stands still.
-
-    Args:
-        curve: Piecewise polynomial of time from 0 [s], values (n,).
-        tip: The same motion of the tip, values (3,) [m], where the trajectory was given there.
-
-    Attributes:
-        duration: [s].
-        tip: See above.
-    """
-
-    def __init__(self, curve: PPoly, tip: "Trajectory | None" = None):
-        self.duration = float(curve.x[-1])
-        self.tip = tip
-        self._curves = (curve, curve.derivative(), curve.derivative(2))
-
-    def position(self, time: ArrayLike) -> Array:
-        """Coordinates alone, (n,) or (N, n) at times () or (N,) [s]."""
-        return np.asarray(self._curves[0](np.clip(time, 0.0, self.duration)))
-
-    def velocity(self, time: ArrayLike) -> Array:
-        """Velocities alone, likewise."""
-        return self._rate(1, time)
-
-    def _rate(self, order: int, time: ArrayLike) -> Array:
-        """A derivative; zero before and after it, where it stands still."""
-        inside = np.clip(time, 0.0, self.duration)
-        rate: Array = np.asarray(self._curves[order](inside))
-        rate[inside != time] = 0.0
-        return rate
-
-    def bounds(self) -> tuple[Array, Array]:
-        """Two vectors (n,) between which the coordinates stay, which may be farther apart.
-
-        A polynomial sum a_i u^i is no farther than sum |a_i| h^i, i > 0, from a_0 in 0 <= u <= h.
-        """
-        curve = self._curves[0]
-        powers = np.vander(np.diff(curve.x), len(curve.c))[:, :-1]
-        reach = np.einsum("imj,mi->mj", np.abs(curve.c[:-1]), powers)
-        return (curve.c[-1] - reach).min(axis=0), (curve.c[-1] + reach).max(axis=0)
-
-    def turns(self) -> Array:
-        """Times (k,) [s] at which a coordinate may be largest or least: knots, and rests."""
-        curve, rate = self._curves[:2]
-        rests = [np.ravel(roots) for roots in np.ravel(rate.roots(extrapolate=False))]
-        times = np.concatenate([curve.x, *rests])
-        return np.unique(times[np.isfinite(times)])
-
-    def breaks(self) -> Array:
-        """Times (k,) [s] at which coordinates, velocities or accelerations jump, and the ends."""
-        x = self._curves[0].x
-        jumps = np.zeros(len(x), dtype=bool)
-        jumps[[0, -1]] = True
-        for curve in self._curves:
-            powers = np.diff(x)[:, None] ** np.arange(len(curve.c))[::-1]
-            ends = np.einsum("imj,mi->mj", curve.c, powers)[:-1]
-            size = np.abs(curve.c[-1]).max(axis=0) + np.finfo(float).tiny
-            jumps[1:-1] |= (np.abs(ends - curve.c[-1, 1:]) > _JUMP * size).any(axis=1)
-        return np.asarray(x[jumps])
-
-    def __call__(self, time: ArrayLike) -> tuple[Array, Array, Array]:
-        """Coordinates, velocities and accelerations.
-
-        Args:
-            time: () or (N,) [s].
-
-        Returns:
-            Three arrays (n,) or (N, n).
-        """
-        return self.position(time), self._rate(1, time), self._rate(2, time)
-
-
-def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Trajectory:
-    """Polynomials in time.
-
-    Args:
-        coefficients: Per coordinate, lowest power first.
-        duration: [s].
-
-    Raises:
-        InputError: No coordinates, not finite, or no duration.
-    """
-    as_number(duration, "the trajectory's duration", "s", above=0)
-    try:
-        rows = [np.asarray(row, dtype=np.float64) for row in coefficients]
-    except (TypeError, ValueError):
-        rows = []
-    size = max((row.size for row in rows if row.ndim == 1), default=0)
-    if not size or not all(row.ndim == 1 and np.isfinite(row).all() for row in rows):
-        raise InputError(
-            "the trajectory's coefficients are not finite numbers, give a list per coordinate"
-        )
-    table = np.zeros((size, 1, len(rows)))
-    for column, row in enumerate(rows):
-        table[size - len(row) :, 0, column] = row[::-1]
-    return Trajectory(PPoly(table, [0.0, duration]))
-
-
-def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Trajectory:
-    """Straight line from rest to rest with least jerk: s = 10 u^3 - 15 u^4 + 6 u^5, u = t/T.
-
-    Args:
-        start: (n,) active coordinates or (3,) tip position.
-        end: The same shape.
-        duration: T [s].
-
-    Raises:
-        InputError: Different sizes, not finite, or no duration.
-    """
-    as_number(duration, "the trajectory's duration", "s", above=0)
-    first = as_samples(np.ravel(start), np.size(start), "start")
-    last = as_samples(np.ravel(end), len(first), "end")
-    shape = np.array([0, 0, 0, 10.0, -15.0, 6.0]) / duration ** np.arange(6)
-    return polynomial(
-        [[a, *((b - a) * shape[1:])] for a, b in zip(first, last, strict=True)], duration
-    )
-
-
 def tip_trajectory(
-    machine: Machine, tip: Trajectory, guess: ArrayLike | None = None
+    machine: Machine,
+    tip: Trajectory,
+    guess: ArrayLike | None = None,
+    attitude: Trajectory | Turning | None = None,
 ) -> Trajectory:
     """The motion of the active joints that moves the tip along a trajectory.
 
     Positions at knots every 10 ms come from inverse kinematics, and so do velocities and
     accelerations, v_A = J^-1 x', a_A = J^-1 (x'' - bias); quintics join them. A machine with more
-    than three active joints moves them as little as it can from knot to knot, and its velocities
-    and accelerations are those of the quintic spline through the knots.
+    active joints than there are coordinates moves them as little as it can from knot to knot, and
+    its velocities and accelerations are those of the quintic spline through the knots.
 
     Args:
         machine: The machine.
         tip: Trajectory of the tip in the world [m].
         guess: (n,) active coordinates near the start.
+        attitude: Of the tip's frame meanwhile: its inclination (1,) [rad], or its rotation, see
+            `via_attitudes`. Left open if not given.
 
     Returns:
-        Trajectory of q_A, with `tip` set.
+        Trajectory of q_A, with `tip` and `attitude` set.
 
     Raises:
+        InputError: The attitude takes another time, or the machine has no drives for it.
         UnreachableTipError: The trajectory leaves the reach.
     """
     kinematics = Kinematics(machine)
     count = max(6, int(np.ceil(tip.duration * _KNOTS_PER_SECOND)) + 1)
     time = np.linspace(0.0, tip.duration, count)
     x, x_rate, x_second = tip(time)
-    q_a = kinematics.inverse(x, guess)
-    if machine.driven.sum() > x.shape[1]:
+    name, goal = None, None
+    if attitude is not None:
+        if attitude.duration != tip.duration:
+            raise InputError(
+                f"the tip takes {tip.duration:g} s and its attitude {attitude.duration:g} s, give "
+                "them the same time"
+            )
+        name = "rotation" if isinstance(attitude, Turning) else INCLINATION
+        goal, rate, second = attitude(time)
+        goal = goal if isinstance(attitude, Turning) else goal[:, 0]
+        x_rate, x_second = np.hstack([x_rate, rate]), np.hstack([x_second, second])
+    q_a = kinematics.tracked(x, guess, goal, time)
+    if machine.driven.sum() > x_rate.shape[1]:
         spline = make_interp_spline(time, q_a, k=5)
-        return Trajectory(quintics(time, q_a, spline(time, 1), spline(time, 2)), tip)
-    jacobian = np.linalg.pinv(kinematics.jacobian(q_a) * machine.driven)
-    v_a = np.einsum("ijk,ik->ij", jacobian, x_rate)
-    a_a = np.einsum("ijk,ik->ij", jacobian, x_second - kinematics.bias(q_a, v_a))
-    return Trajectory(quintics(time, q_a, v_a, a_a), tip)
-
-
-def quintics(time: Array, x: Array, v: Array, a: Array) -> PPoly:
-    """Polynomials of fifth order between knots (N,) with values and derivatives (N, n).
-
-    With u = t - t_i, h = t_i+1 - t_i and what the second order misses at u = h,
-
-        d = x_i+1 - x_i - v_i h - a_i h^2/2,   e = v_i+1 - v_i - a_i h,   f = a_i+1 - a_i,
-        x = x_i + v_i u + a_i u^2/2 + (10 d - 4 e h + f h^2/2) (u/h)^3
-            + (-15 d + 7 e h - f h^2) (u/h)^4 + (6 d - 3 e h + f h^2/2) (u/h)^5.
-    """
-    h = np.diff(time)[:, None]
-    d = x[1:] - x[:-1] - h * (v[:-1] + h * a[:-1] / 2)
-    e = h * (v[1:] - v[:-1] - h * a[:-1])
-    f = h * h * (a[1:] - a[:-1])
-    rows = [
-        (6 * d - 3 * e + f / 2) / h**5,
-        (-15 * d + 7 * e - f) / h**4,
-        (10 * d - 4 * e + f / 2) / h**3,
-        a[:-1] / 2,
-        v[:-1],
-        x[:-1],
-    ]
-    return PPoly(np.array(rows), time)
+        v_a, a_a = spline(time, 1), spline(time, 2)
+    else:
+        jacobian = np.linalg.pinv(kinematics.jacobian(q_a, name) * machine.driven)
+        v_a = np.einsum("ijk,ik->ij", jacobian, x_rate)
+        a_a = np.einsum("ijk,ik->ij", jacobian, x_second - kinematics.bias(q_a, v_a, name))
+    return Trajectory(quintics(time, q_a, v_a, a_a), tip, attitude)
 
 
 class _WithFree(Trajectory):
     """A reference of the driven joints beside free joints that stay where they start."""
 
     def __init__(self, reference: Trajectory, driven: NDArray[np.bool_], start: Array):
-        self.duration, self.tip = reference.duration, reference.tip
+        self.duration = reference.duration
+        self.tip, self.attitude = reference.tip, reference.attitude
         self._reference, self._driven, self._start = reference, driven, start
 
     def position(self, time: ArrayLike) -> Array:
@@ -270,13 +149,34 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
     if chosen.space == "joystick":
         raise InputError(f"task '{task}' moves levers, it has no trajectory")
     if chosen.space == "tip":
-        rows = [chosen.coefficients[axis] for axis in ("x", "y", "z")]
-        return tip_trajectory(machine, polynomial(rows, chosen.duration))
-    rows = [chosen.coefficients[name] for name in machine.active if name not in machine.free]
-    found = with_free(machine, polynomial(rows, chosen.duration))
+        tip, attitude = _curve(chosen, TIP), None
+        names = [name for name in chosen.coordinates if name not in TIP]
+        if names == [INCLINATION]:
+            attitude = _curve(chosen, names)
+        elif names:
+            attitude = via_attitudes(*_table(chosen.via, names))
+        return tip_trajectory(machine, tip, None, attitude)
+    found = with_free(machine, _curve(chosen, machine.driven_joints))
     if text := beyond_limits(machine, found):
         raise LimitError(f"task '{task}': {text}")
     return found
+
+
+def _curve(task: Task, names: Sequence[str]) -> Trajectory:
+    """What a task says of some coordinates."""
+    if task.via:
+        return via_points(*_table(task.via, names))
+    return polynomial([task.coefficients[name] for name in names], task.duration)
+
+
+def _table(via: Sequence[Via], names: Sequence[str]) -> tuple[Array, Array, Array]:
+    """Times (N,), coordinates and rates (N, n) of points, NaN where nothing is given."""
+    time = np.array([one.time for one in via])
+    points, rates = (
+        np.array([[given.get(name, np.nan) for name in names] for given in every])
+        for every in ([one.point for one in via], [one.rates for one in via])
+    )
+    return time, points, rates
 
 
 def beyond_limits(machine: Machine, reference: Trajectory, until: float = np.inf) -> str:

@@ -12,8 +12,8 @@ from crane.dynamics.joint_forces import sticking
 from crane.dynamics.stability import Stability, has_supports
 from crane.hydraulics.circuit import BALANCES
 from crane.machine import Machine
+from crane.motion.curves import Trajectory
 from crane.motion.kinematics import Kinematics
-from crane.motion.trajectories import Trajectory
 from crane.recordings.recording import FORCE_UNITS, Recording
 
 Column = tuple[str, Array, str]  # name, values, unit

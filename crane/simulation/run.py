@@ -28,7 +28,8 @@ from crane.dynamics import Dynamics
 from crane.dynamics.external import states_of
 from crane.formats import load
 from crane.machine import Machine
-from crane.motion.trajectories import Trajectory, beyond_limits
+from crane.motion.curves import Trajectory
+from crane.motion.trajectories import beyond_limits
 from crane.recordings.recording import Recording
 from crane.recordings.summary import tipping
 from crane.simulation.integration.adaptive import ADAPTIVE, AdaptiveSteps

@@ -11,8 +11,8 @@ from lxml import etree
 
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, one_line
 from crane.common.output import file_name, staging
-from crane.description import Task
 from crane.description.sensors import unit_of
+from crane.description.spec import Task, Via
 from crane.formats.machine_file.estimation import estimation_data
 from crane.formats.machine_file.outside import load_data, outside_data
 from crane.formats.machine_file.places import InFile, InURDF, places
@@ -282,8 +282,17 @@ def _task(task: Task) -> dict[str, Any]:
             joint: [x for point in polygon for x in point]
             for joint, polygon in task.levers.items()
         }
-        return data | {"joystick": levers}
+        start = {"start": dict(task.start)} if task.start else {}
+        return data | {"joystick": levers} | start
+    if task.via:
+        del data["duration"]
+        return data | {"via": [_via(via) for via in task.via]}
     return data | {task.space: {key: list(row) for key, row in task.coefficients.items()}}
+
+
+def _via(via: Via) -> dict[str, Any]:
+    rates = {"rates": dict(via.rates)} if via.rates else {}
+    return {"time": via.time, **via.point, **rates}
 
 
 def _hydraulics(circuit: Hydraulics) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_count, as_number, as_samples
-from crane.motion.trajectories import Trajectory
+from crane.motion.curves import Trajectory
 
 _DENSE = 200  # instants in the shortest period
 

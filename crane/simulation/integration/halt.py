@@ -5,7 +5,8 @@ import numpy as np
 from crane.common.errors import SimulationError
 from crane.common.samples import Array
 from crane.machine import Machine
-from crane.motion.trajectories import Trajectory, limit_slack
+from crane.motion.curves import Trajectory
+from crane.motion.trajectories import limit_slack
 
 
 class HaltedError(SimulationError):

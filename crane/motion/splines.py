@@ -1,0 +1,224 @@
+"""Splines of fifth order: through given derivatives, with least jerk, or near noisy samples."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PPoly
+from scipy.linalg import solveh_banded
+
+from crane.common.samples import Array
+
+_PARTS = 3  # value, rate and second rate at a knot
+_NOISE_POINTS = 7  # of a divided difference that noise alone is left of
+_CLOSEST = 0.01  # [s] between knots near samples
+_SMOOTHEST = 2.5e-3  # cut-off per knot: below, rounding spoils what is left
+_ENOUGH = 1e-3  # of the scatter and of the cut-off, to which both are found
+
+
+def quintics(time: Array, x: Array, v: Array, a: Array) -> PPoly:
+    """Polynomials of fifth order between knots (N,) with values and derivatives (N, n).
+
+    With u = t - t_i, h = t_i+1 - t_i and what the second order misses at u = h,
+
+        d = x_i+1 - x_i - v_i h - a_i h^2/2,   e = v_i+1 - v_i - a_i h,   f = a_i+1 - a_i,
+        x = x_i + v_i u + a_i u^2/2 + (10 d - 4 e h + f h^2/2) (u/h)^3
+            + (-15 d + 7 e h - f h^2) (u/h)^4 + (6 d - 3 e h + f h^2/2) (u/h)^5.
+    """
+    h = np.diff(time)[:, None]
+    d = x[1:] - x[:-1] - h * (v[:-1] + h * a[:-1] / 2)
+    e = h * (v[1:] - v[:-1] - h * a[:-1])
+    f = h * h * (a[1:] - a[:-1])
+    rows = [
+        (6 * d - 3 * e + f / 2) / h**5,
+        (-15 * d + 7 * e - f) / h**4,
+        (10 * d - 4 * e + f / 2) / h**3,
+        a[:-1] / 2,
+        v[:-1],
+        x[:-1],
+    ]
+    return PPoly(np.array(rows), time)
+
+
+def _basis() -> Array:
+    """(6, 6) the powers of u in a quintic, of its (x, x', x'') at u = 0 and u = 1."""
+    d, e, f = np.array(
+        [[-1.0, -1.0, -0.5, 1.0, 0.0, 0.0], [0, -1, -1, 0, 1, 0], [0, 0, -1, 0, 0, 1]]
+    )
+    start = np.eye(6)[:3] * np.array([1.0, 1.0, 0.5])[:, None]
+    found: Array = np.vstack(
+        [start, 10 * d - 4 * e + f / 2, -15 * d + 7 * e - f, 6 * d - 3 * e + f / 2]
+    )
+    return found
+
+
+def _jerk() -> Array:
+    """(6, 6) the integral of the squared third derivative over 0 <= u <= 1, as a form of those."""
+    scale = np.array([6.0, 24.0, 60.0])  # of u^3, u^4, u^5, differentiated three times
+    gram = np.outer(scale, scale) / np.add.outer(np.arange(3.0), np.arange(1.0, 4.0))
+    form: Array = _BASIS[3:].T @ gram @ _BASIS[3:]
+    return form
+
+
+_BASIS = _basis()
+_JERK = _jerk()
+
+
+class _Knots:
+    """The jerk of all quintics between knots, as a quadratic form in what they are at these.
+
+    J(y) = sum_i h_i^-5 y_i^T K y_i = y^T H y, with y_i = (x, h x', h^2 x'') at both ends of a
+    part. At each knot rates are scaled by the parts beside it, so that H is well conditioned.
+
+    Args:
+        time: (N,) [s].
+    """
+
+    def __init__(self, time: Array):
+        self.time = time
+        h = np.diff(time)
+        self.unit = float(np.exp(np.mean(np.log(h))))
+        h = h / self.unit
+        beside = np.concatenate([h[:1], np.sqrt(h[1:] * h[:-1]), h[-1:]])
+        scale = beside[:, None] ** np.arange(_PARTS)
+        self._own = (
+            h[:, None, None] ** np.arange(_PARTS) / np.stack([scale[:-1], scale[1:]], axis=1)
+        ).reshape(-1, 2 * _PARTS)  # from scaled ones to those of a part
+        self._scale = scale * self.unit ** np.arange(_PARTS)
+        every = np.arange(len(h))
+        self.jerk = self.form(every, h[:, None, None] ** -5 * _JERK)
+
+    def form(self, parts: NDArray[np.intp], forms: Array) -> Array:
+        """Lower diagonals (6, 3 N) of a sum of forms (k, 6, 6), each of one of the parts (k,)."""
+        size = 2 * _PARTS
+        band = np.zeros((size, _PARTS * len(self.time)))
+        own = self._own[parts]
+        for k in range(size):
+            for a in range(size - k):
+                values = forms[:, a + k, a] * own[:, a + k] * own[:, a]
+                np.add.at(band[k], _PARTS * parts + a, values)
+        return band
+
+    def rows(self, time: Array) -> tuple[NDArray[np.intp], Array]:
+        """The parts (M,) that times (M,) lie in, and what (M, 6) of a part is the value there."""
+        part = np.clip(np.searchsorted(self.time, time, "right") - 1, 0, len(self.time) - 2)
+        u = (time - self.time[part]) / np.diff(self.time)[part]
+        return part, u[:, None] ** np.arange(2 * _PARTS) @ _BASIS
+
+    def onto(self, parts: NDArray[np.intp], rows: Array, values: Array) -> Array:
+        """The sum (3 N,) of rows (M, 6) times values (M,)."""
+        out = np.zeros(_PARTS * len(self.time))
+        at = _PARTS * parts[:, None] + np.arange(2 * _PARTS)
+        np.add.at(out, at, rows * self._own[parts] * values[:, None])
+        return out
+
+    def values(self, parts: NDArray[np.intp], rows: Array, y: Array) -> Array:
+        """Values (M,) at rows (M, 6) of scaled ones (3 N,)."""
+        at = _PARTS * parts[:, None] + np.arange(2 * _PARTS)
+        return np.asarray(np.einsum("ij,ij->i", rows * self._own[parts], y[at]))
+
+    def scaled(self, rows: Array) -> Array:
+        """Values and rates (N, 3) [s] in the units of H, (3 N,)."""
+        return np.asarray(rows * self._scale).ravel()
+
+    def plain(self, y: Array) -> Array:
+        """The way back."""
+        return np.asarray(y.reshape(-1, _PARTS) / self._scale)
+
+
+def _times(band: Array, y: Array) -> Array:
+    """A symmetric matrix, of its lower diagonals, times a vector."""
+    out: Array = band[0] * y
+    for k in range(1, len(band)):
+        out[k:] += band[k, :-k] * y[:-k]
+        out[:-k] += band[k, :-k] * y[k:]
+    return out
+
+
+def least_jerk(time: Array, x: Array, v: Array) -> Array:
+    """Values and rates at knots of the curve with the least integral of its squared jerk.
+
+    It is of fifth order between the knots and C4 at each; C3 where a rate is given. With what is
+    given at the ends as rates and no second rates there, it is the only one that makes
+
+        J = int (x''')^2 dt
+
+    least among all curves with these values: x^(6) = 0 between the knots (Flash and Hogan, J.
+    Neurosci. 5 (1985) 1688-1703, for one knot between the ends).
+
+    Args:
+        time: (N,) [s].
+        x: (N,) values.
+        v: (N,) rates, NaN where they follow; given at both ends.
+
+    Returns:
+        (N, 3) values, rates and second rates.
+    """
+    knots, level = _Knots(time), x[0]  # what is far from zero keeps its digits
+    given = np.column_stack([x - level, v, np.full(len(time), np.nan)])
+    given[[0, -1], 2] = 0.0
+    y = knots.scaled(given)
+    free = np.isnan(y)
+    y[free] = 0.0
+    right = np.where(free, -_times(knots.jerk, y), 0.0)
+    band = knots.jerk.copy()
+    for k in range(1, len(band)):  # rows and columns of what is given
+        band[k, :-k] *= free[k:] & free[:-k]
+    band[0] = np.where(free, band[0], 1.0)
+    found = knots.plain(y + solveh_banded(band, right, lower=True))
+    found[:, 0] = x
+    return found
+
+
+def noise(time: Array, x: Array) -> float:
+    """How much samples (N,) scatter about any smooth curve: of their sixth divided differences.
+
+    Differences of seven samples each, with weights whose squares add up to one, are left with the
+    noise of one sample: its root mean square.
+    """
+    i = np.arange(_NOISE_POINTS) + np.arange(len(x) - _NOISE_POINTS + 1)[:, None]
+    apart = time[i][:, :, None] - time[i][:, None, :]
+    apart /= np.ptp(time[i], axis=1)[:, None, None]
+    np.einsum("ijj->ij", apart)[:] = 1.0
+    weights = 1.0 / apart.prod(axis=2)
+    weights /= np.linalg.norm(weights, axis=1)[:, None]
+    return float(np.sqrt(np.mean(np.einsum("ij,ij->i", weights, x[i] - x[i[:, :1]]) ** 2)))
+
+
+def smoothed(time: Array, x: Array, scatter: float) -> tuple[Array, Array, float]:
+    """The curve with the least jerk that is as near to samples as these scatter about it.
+
+    It makes J + w sum (x - x_i)^2 least, w such that the root mean square of x - x_i is the
+    scatter (Reinsch, Numer. Math. 10 (1967) 177-183, there for cubic splines). Of samples every h
+    it is, far from the ends, the filter 1 / (1 + (f/f_c)^6) without delay, that of a Butterworth
+    filter of third order forwards and back, with (2 pi f_c)^6 = w / h. Samples that are closer
+    than 10 ms share knots.
+
+    Args:
+        time: (N,) [s].
+        x: (N,) samples.
+        scatter: See `noise`.
+
+    Returns:
+        Times (K,) of the knots, values, rates and second rates there (K, 3), and f_c [Hz].
+    """
+    grid = np.arange(time[0], time[-1], _CLOSEST)
+    first = np.searchsorted(time, grid)
+    knots = _Knots(time[np.unique(np.r_[first, len(time) - 1])])
+    parts, rows = knots.rows(time)
+    gram = knots.form(parts, rows[:, :, None] * rows[:, None, :])
+    level = float(x.mean())
+    at = x - level
+    pull = knots.onto(parts, rows, at)
+    step = float(np.ptp(time)) / (len(time) - 1) / knots.unit
+    low, high = 1.0 / float(np.ptp(time)), 0.5 / knots.unit
+    low = max(low, _SMOOTHEST / knots.unit)
+    while True:
+        cut = float(np.sqrt(low * high))
+        weight = step * (2 * np.pi * cut * knots.unit) ** 6
+        y = solveh_banded(knots.jerk + weight * gram, weight * pull, lower=True)
+        left = float(np.sqrt(np.mean((knots.values(parts, rows, y) - at) ** 2)))
+        if abs(left - scatter) < _ENOUGH * scatter or high < (1.0 + _ENOUGH) * low:
+            break
+        low, high = (cut, high) if left > scatter else (low, cut)
+    found = knots.plain(y)
+    found[:, 0] += level
+    return knots.time, found, cut
