@@ -71,6 +71,5 @@ def point_jacobian(model: pin.Model, data: pin.Data, joint: int, place: Array) -
     world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     # of a single joint it is a vector
     columns: Array = pin.getJointJacobian(model, data, joint, world).reshape(6, -1).copy()
-    arm = data.oMi[joint].rotation @ place
-    columns[:3] += np.cross(columns[3:], arm, axisa=0, axisb=0, axisc=0)
+    columns[:3] -= pin.skew(data.oMi[joint].rotation @ place) @ columns[3:]
     return columns
