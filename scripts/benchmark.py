@@ -11,6 +11,7 @@ import argparse
 import warnings
 from pathlib import Path
 
+from at_work import at_work
 from derivatives import derivatives
 from engines import work_precision
 from evaluations import agree, forward_dynamics, one_step, task
@@ -46,6 +47,7 @@ def main() -> None:
         ("Stacks", lambda: stacks(mini, few)),
         ("Threads", lambda: threads(mini, few)),
         ("A crane on its valves", lambda: hydraulic_crane(few)),
+        ("A grapple, and ground under it", lambda: at_work(few)),
         ("Gradients of a motion", gradients),
         ("Starting", lambda: starts(few)),
         ("Work and precision", lambda: work_precision(bare, few, picture)),

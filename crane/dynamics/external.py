@@ -213,25 +213,21 @@ class ExternalForces:
         for k, force in enumerate(self._forces):
             jacobian = self._jacobians.of(force.frame)
             own = states[len(rates) : len(rates) + force.states].tolist()
-            here = self._here(force, v, force.references(np.array([time]))[0], own)
+            pose, rate = self._jacobians.pose(force.frame), jacobian @ v
+            reference = force.references(np.array([time]))[0].tolist()
+            here = Here(
+                pose.translation.tolist(), pose.rotation.tolist(), rate[:3].tolist(),
+                rate[3:].tolist(), reference, own,
+            )  # fmt: skip
             rates += force.rates(here)
             push, moment = force.wrench(here)
             seen += [*push, *moment, *force.look(here)]
             wrench = np.array([*push, *moment], dtype=np.float64)
             total += jacobian.T @ wrench
-            powers[k] = wrench @ (jacobian @ v)
+            powers[k] = wrench @ rate
         return AppliedAt(
             total, powers, np.array(seen, dtype=np.float64), np.array(rates, dtype=np.float64)
         )
-
-    def _here(
-        self, force: ExternalForce, v: Array, reference: Array, states: list[Number]
-    ) -> Here:
-        """What a force sees at the posture that was placed last."""
-        pose = self._jacobians.pose(force.frame)
-        rate = (self._jacobians.of(force.frame) @ v).tolist()
-        place, turn = pose.translation.tolist(), pose.rotation.tolist()
-        return Here(place, turn, rate[:3], rate[3:], reference.tolist(), states)
 
 
 def _placed(machine: Machine, force: ExternalForce) -> tuple[int, pin.SE3]:

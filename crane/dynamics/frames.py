@@ -1,5 +1,7 @@
 """How frames of the tree move with its joints, by Pinocchio."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pinocchio as pin
 
@@ -22,6 +24,20 @@ class FrameJacobians:
         """Take up a posture (nq,)."""
         configuration = self._machine.coordinates.configuration(q)
         pin.computeJointJacobians(self._model, self._data, configuration)
+
+    def places(self, q: Array, links: Sequence[str]) -> Array:
+        """(N, k, 3) of the origins of k links' frames in the world, at postures (N, nq) [m]."""
+        held = [self._held(link) for link in links]
+        joints = [joint for joint, _ in held]
+        arms = np.array([placement.translation for _, placement in held]).reshape(-1, 3)
+        turned, origins = np.empty((len(q), len(held), 3, 3)), np.empty((len(q), len(held), 3))
+        configuration = self._machine.coordinates.configuration
+        for i, posture in enumerate(q):
+            pin.forwardKinematics(self._model, self._data, configuration(posture))
+            for k, joint in enumerate(joints):
+                placed = self._data.oMi[joint]
+                turned[i, k], origins[i, k] = placed.rotation, placed.translation
+        return np.asarray(origins + np.einsum("ikab,kb->ika", turned, arms))
 
     def pose(self, link: str) -> pin.SE3:
         """Of a link's frame in the world, at the posture."""
@@ -55,6 +71,5 @@ def point_jacobian(model: pin.Model, data: pin.Data, joint: int, place: Array) -
     world = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
     # of a single joint it is a vector
     columns: Array = pin.getJointJacobian(model, data, joint, world).reshape(6, -1).copy()
-    arm = data.oMi[joint].rotation @ place
-    columns[:3] += np.cross(columns[3:], arm, axisa=0, axisb=0, axisc=0)
+    columns[:3] -= pin.skew(data.oMi[joint].rotation @ place) @ columns[3:]
     return columns

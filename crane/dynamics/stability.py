@@ -126,10 +126,7 @@ class Stability:
         given = np.atleast_2d(as_samples(q_a, len(machine.active), "q_a", machine.active))
         q = machine.closure.solve(given)
         moments = self.margins(q, self.ground(q)).moments
-        hanging = np.empty((len(q), 3))
-        for i, posture in enumerate(q):
-            self._frames.place(posture)
-            hanging[i] = self._frames.pose(link).translation
+        hanging = self._frames.places(q, [link])[:, 0]
         held = np.hstack([-self._gravity + 0 * hanging, np.cross(hanging, -self._gravity)])
         levers = self._about(self._points(q), held)
         with np.errstate(divide="ignore"):
@@ -155,23 +152,24 @@ class Stability:
             outside: (N, .) wrench and channels of each force from outside as a run records them;
                 none act if not given. Those of contacts that are supports are left out.
         """
-        out = np.empty((len(q), 6))
+        rates, centres = np.zeros((len(q), 6)), np.empty((len(q), 3))
         still = np.zeros(self._model.nv)
-        coordinates = self.machine.coordinates
+        moves = v is not None or a is not None
         for i, posture in enumerate(q):
-            at = coordinates.configuration(posture)
-            rate = pin.computeCentroidalMomentumTimeVariation(
-                self._model, self._data, at,
-                still if v is None else v[i], still if a is None else a[i],
-            ).vector  # fmt: skip
-            own = self._model.inertias[0]  # what stands has no momentum
-            moved = self.mass - own.mass
-            com = self._data.com[0]
-            force = rate[:3] - self.mass * self._gravity
-            # the momentum's rate counts about the centre of what moves
-            moment = rate[3:] + np.cross(com, rate[:3] - moved * self._gravity)
-            moment = moment - np.cross(own.mass * own.lever, self._gravity)
-            out[i] = [*force, *moment]
+            at = self.machine.coordinates.configuration(posture)
+            if moves:
+                rates[i] = pin.computeCentroidalMomentumTimeVariation(
+                    self._model, self._data, at,
+                    still if v is None else v[i], still if a is None else a[i],
+                ).vector  # fmt: skip
+            else:
+                pin.centerOfMass(self._model, self._data, at, False)
+            centres[i] = self._data.com[0]
+        own = self._model.inertias[0]  # what stands has no momentum
+        out = rates - self.mass * np.append(self._gravity, np.zeros(3))
+        # the momentum's rate counts about the centre of what moves
+        moved = rates[:, :3] - (self.mass - own.mass) * self._gravity
+        out[:, 3:] += np.cross(centres, moved) - np.cross(own.mass * own.lever, self._gravity)
         if outside is not None:
             for k in range(len(self.machine.external)):
                 if k not in self._pressing:
@@ -225,13 +223,8 @@ class Stability:
 
     def _points(self, q: Array) -> Array:
         """(N, s, 3) where the supports are."""
-        out = np.empty((len(q), len(self._links), 3))
-        for i, posture in enumerate(q[:1] if self.stands else q):
-            self._frames.place(posture)
-            out[i] = [self._frames.pose(link).translation for link in self._links]
-        if self.stands:
-            out[:] = out[:1]
-        return out
+        found = self._frames.places(q[:1] if self.stands else q, self._links)
+        return np.broadcast_to(found, (len(q), *found.shape[1:]))
 
     def _about(self, points: Array, wrench: Array) -> Array:
         """(N, k) moments of wrenches (N, 6) about the lines."""
@@ -246,11 +239,9 @@ class Stability:
         """(N, 6) of force k from outside."""
         first = sum(len(PARTS) + len(x.channels) for x in self.machine.external[:k])
         wrench = outside[:, first : first + len(PARTS)].copy()
-        places = np.zeros((len(q), 3))
-        for i in np.flatnonzero(wrench.any(axis=1)):
-            self._frames.place(q[i])
-            places[i] = self._frames.pose(self.machine.external[k].frame).translation
-        wrench[:, 3:] += np.cross(places, wrench[:, :3])
+        acts = wrench.any(axis=1)
+        places = self._frames.places(q[acts], [self.machine.external[k].frame])[:, 0]
+        wrench[acts, 3:] += np.cross(places, wrench[acts, :3])
         return wrench
 
 
