@@ -2,20 +2,24 @@
 
 import re
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
 from rig import Rig
+from scipy.optimize import brentq
 
 import crane
 from crane.common.errors import ClosureError, CraneWarning, InputError, LimitError, SimulationError
 from crane.control import Sampled, ValvePD
+from crane.description.spec import PIGains
 from crane.motion.curves import polynomial
-from crane.motion.trajectories import beyond_limits
+from crane.motion.limits import beyond_limits, carried_beyond
 
+SLIDER = Path(__file__).parent / "data" / "slider_crank.yaml"
 TOLD = (
     "the reference of 'X1' goes to 0.06 m at t = 0.1 s, beyond its limit 0.03 m "
-    "(chain_b1.urdf:57): "
+    "(chain_b1.urdf:57) from t = 0.01584 s on: "
 )
 NAMED = r"^at t = 0\.0\d+ s[: ].*; 'X1' is at 0\.04\d+ m, beyond its limit 0\.03 m"
 
@@ -112,8 +116,40 @@ def test_short_excursions_are_found(mini):
     def peak(top):
         return polynomial([[0.0], [top - 0.1234**2, 2 * 0.1234, -1.0], [0.0108]], 0.25)
 
-    assert "'X1' goes to 0.03001 m at t = 0.1234 s" in beyond_limits(mini, peak(0.03001))
+    told = beyond_limits(mini, peak(0.03001))
+    assert "'X1' goes to 0.03001 m at t = 0.1234 s" in told
+    half = np.sqrt(1e-5)
+    assert f"from t = {0.1234 - half:.4g} to {0.1234 + half:.4g} s" in told
     assert not beyond_limits(mini, peak(0.03))
+
+
+def test_passive_joints_are_looked_at_too():
+    """The slider of a crank: s = 0.2 cos theta + sqrt(0.3^2 - (0.3 - 0.2 sin theta)^2)."""
+    machine = crane.load(SLIDER, changes={"s.upper": 0.4})
+    path = crane.point_to_point([1.4], [0.6], 2.0)
+
+    def above(t):
+        theta = path.position(t)[0]
+        return 0.2 * np.cos(theta) + np.sqrt(0.09 - (0.3 - 0.2 * np.sin(theta)) ** 2) - 0.4
+
+    begins = brentq(above, 0.5, 1.5)
+    highest = 0.4 + max(above(t) for t in np.linspace(0, 2, 20001))
+    told = (
+        rf"the reference takes 's' to {highest:.4f}\d* m at t = [\d.]+ s, beyond its limit 0\.4 m .*"
+        rf"from t = {begins:.4g} s on: keep"
+    )
+    with pytest.warns(CraneWarning, match=told):
+        crane.simulate(machine, crane.PI(machine, path, gains={"theta": PIGains(9, 9)}))
+
+
+def test_velocities_are_looked_at_too():
+    """1.875 times way over time is the fastest of a motion from rest to rest."""
+    machine = crane.load(SLIDER)
+    path = crane.point_to_point([1.4], [0.6], 0.12)
+    told = carried_beyond(machine, path)
+    assert f"moves 'theta' with up to {1.875 * 0.8 / 0.12:.4g} rad/s at t = 0.06 s" in told
+    assert "its limit is 10 rad/s (crank.urdf:15), from t = " in told
+    assert not carried_beyond(machine, crane.point_to_point([1.4], [0.6], 0.1501))
 
 
 def test_a_task_beyond_the_limits_is_an_error(tmp_path):

@@ -33,6 +33,7 @@ from crane.common.errors import InputError, known
 if TYPE_CHECKING:
     from crane.control import Command, Controller
     from crane.machine import Machine
+    from crane.motion import Trajectory
 
 
 @app.command()
@@ -54,6 +55,14 @@ def simulate(
             help="Change the task's reference so that what hangs does not sway after it: flat, "
             "zv, zvd; none only lets it hang still at the start. Through valves goes with "
             "--controller valve-feedforward.",
+        ),
+    ] = None,
+    path: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="A motion to follow in the place of a task: time and the driven joints, or x, y, "
+            "z of the tip, and inclination or roll, pitch, yaw of its frame.",
         ),
     ] = None,
     inputs: Annotated[
@@ -93,6 +102,7 @@ def simulate(
 ) -> None:
     """Simulate a task, measured inputs, or the motion from the home posture on its own."""
     from crane.cli.runs import check_folder, write_run
+    from crane.motion.paths import read_path
     from crane.simulation import InterruptedRun
     from crane.simulation import simulate as run
 
@@ -100,7 +110,7 @@ def simulate(
     loaded = load(machine, lock, change, active, free, floating, packages, argument)
     loaded = under_task(loaded, task).under(*loads_of(load_))
     if inputs is not None:
-        named = {"--task": task, "--controller": controller, "--sway": sway}
+        named = {"--task": task, "--path": path, "--controller": controller, "--sway": sway}
         given = [option for option, value in named.items() if value is not None]
         if given:
             raise InputError(f"{given[0]} does not go with --inputs, leave one out")
@@ -114,9 +124,14 @@ def simulate(
     of_inputs = {"--columns": columns, "--from": since, "--until": until}
     for option in [option for option, given in of_inputs.items() if given is not None]:
         raise InputError(f"{option} is for --inputs, leave it out")
-    control = control_of(loaded, task, controller, sway)
-    duration = duration_of(loaded, task, duration)
-    label = task or ("hold" if control else "free motion")
+    if path is not None and task is not None:
+        raise InputError("--task does not go with --path, leave one out")
+    if path is not None:
+        control = follower_of(loaded, read_path(loaded, path), controller, sway)
+    else:
+        control = control_of(loaded, task, controller, sway)
+        duration = duration_of(loaded, task, duration)
+    label = task or (path.stem if path else "hold" if control else "free motion")
     try:
         with progress_bar("simulating") as progress:
             recording = run(
@@ -139,14 +154,13 @@ def control_of(
     Raises:
         InputError: There is no such task or controller.
     """
-    from crane.control import controller, joystick, usual
+    from crane.control import controller, joystick
     from crane.motion.curves import point_to_point
-    from crane.motion.sway import without_sway
     from crane.motion.trajectories import task_trajectory
 
     if task is None:
         if sway is not None:
-            raise InputError("--sway changes a task's reference, name a --task")
+            raise InputError("--sway changes a reference, name a --task or a --path")
         if name is None:
             return None
         home = machine.home[machine.closure.active]
@@ -161,7 +175,16 @@ def control_of(
         if sway is not None:
             raise InputError(f"task '{task}' moves levers, leave --sway out")
         return joystick(machine, task)
-    reference = task_trajectory(machine, task)
+    return follower_of(machine, task_trajectory(machine, task), name, sway)
+
+
+def follower_of(
+    machine: "Machine", reference: "Trajectory", name: str | None, sway: str | None = None
+) -> "Controller | Command":
+    """What drives a machine along a reference, see `control_of`."""
+    from crane.control import controller, usual
+    from crane.motion.sway import without_sway
+
     if sway is not None:
         reference = without_sway(machine, reference, sway)
     return controller(name or usual(machine), machine, reference)

@@ -30,12 +30,14 @@ class Command(Protocol):
 
     Attributes:
         reference: The reference motion, or None.
+        start: (n,) active coordinates that it begins at, None for home or the reference's start.
         measured: Whether the last two references are the pressures of supply and tank.
         settings: (s,) its numbers.
         period: Time between calls of `update` [s]; 0 if it wants none.
     """
 
     reference: Trajectory | None = None
+    start: Array | None = None
     measured: bool = False
     settings: Array = np.zeros(0)
     period: float = 0.0
@@ -160,19 +162,27 @@ def joystick(
 ) -> Signals:
     """Signals of levers: per joint a polygon of (time [s], lever from -1 to 1), or a task's name.
 
-    The lever asks for a share of the valve's flow: beyond zero it jumps over the dead band, as the
+    A task begins at its own `start`. The lever asks for a share of the valve's flow: beyond zero it jumps over the dead band, as the
     electronics of such machines do.
 
     Raises:
         InputError: Unknown joints or task, levers beyond -1 to 1, or times that do not increase.
     """
     circuit = circuit_of(machine)
-    last = 0.0
+    last, start = 0.0, None
     if isinstance(points, str):
         task = machine.tasks.get(points)
         if task is None or task.space != "joystick":
             names = [name for name, task in machine.tasks.items() if task.space == "joystick"]
             raise InputError(f"'{points}' is no task of levers, {known(names, points)}")
+        if task.start:
+            start = machine.check_limits(
+                [
+                    task.start.get(joint, machine.home[machine.column(joint)])
+                    for joint in machine.active
+                ],
+                f"the start of task '{points}'",
+            )
         points, last = task.levers, task.duration
     corners: dict[str, tuple[Array, Array]] = {}
     for joint, polygon in points.items():
@@ -201,7 +211,7 @@ def joystick(
         u = lever * (1.0 - valve.dead_band) + valve.dead_band * np.sign(lever)
         signals[joint] = valve.neutral + (valve.full - valve.neutral) * u
     found = Signals(machine, fine, signals)
-    found.title = "joystick"
+    found.title, found.start = "joystick", start
     return found
 
 

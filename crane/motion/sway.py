@@ -23,8 +23,9 @@ from crane.dynamics import Dynamics
 from crane.machine import Machine
 from crane.motion.curves import Trajectory
 from crane.motion.kinematics import Kinematics
+from crane.motion.limits import beyond_limits
 from crane.motion.splines import quintics
-from crane.motion.trajectories import beyond_limits, with_free
+from crane.motion.trajectories import with_free
 
 _KNOTS_PER_SECOND = 100
 _STILL = 1e-12  # of the free joints' weight times lever, what hangs still

@@ -13,15 +13,10 @@ from crane.machine import Machine
 from crane.motion.attitude import INCLINATION, Turning, via_attitudes
 from crane.motion.curves import Trajectory, polynomial, via_points
 from crane.motion.kinematics import Kinematics
+from crane.motion.limits import beyond_limits
 from crane.motion.splines import quintics
 
-_LIMIT_SLACK = 1e-6  # [rad], [machine's size]
 _KNOTS_PER_SECOND = 100
-
-
-def limit_slack(machine: Machine) -> Array:
-    """(nv,) by how much a reference may pass limits between its knots [m], [rad]."""
-    return _LIMIT_SLACK * machine.closure.units
 
 
 def tip_trajectory(
@@ -149,7 +144,8 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
     if chosen.space == "joystick":
         raise InputError(f"task '{task}' moves levers, it has no trajectory")
     if chosen.space == "tip":
-        tip, attitude = _curve(chosen, TIP), None
+        tip = _curve(chosen, TIP)
+        attitude: Trajectory | Turning | None = None
         names = [name for name in chosen.coordinates if name not in TIP]
         if names == [INCLINATION]:
             attitude = _curve(chosen, names)
@@ -177,40 +173,3 @@ def _table(via: Sequence[Via], names: Sequence[str]) -> tuple[Array, Array, Arra
         for every in ([one.point for one in via], [one.rates for one in via])
     )
     return time, points, rates
-
-
-def beyond_limits(machine: Machine, reference: Trajectory, until: float = np.inf) -> str:
-    """What to say of a reference that leaves the limits of an active joint, else nothing.
-
-    Args:
-        machine: The machine.
-        reference: Reference of its active joints.
-        until: End of what is looked at [s].
-    """
-    least, most = reference.bounds()
-    if least.shape != machine.lower.shape:
-        return ""  # of another machine, which is told elsewhere
-    slack = limit_slack(machine)[machine.closure.active]
-    if (np.maximum(machine.lower - least, most - machine.upper) <= slack).all():
-        return ""  # without a look where it turns
-    times = np.unique(np.minimum(reference.turns(), until))
-    q_a = reference.position(times)
-    excess = np.maximum(machine.lower - q_a, q_a - machine.upper)
-    if not (excess > slack).any():
-        return ""
-    span = machine.upper - machine.lower
-    shares = excess / np.where(
-        np.isfinite(span), span, machine.closure.units[machine.closure.active]
-    )
-    k, i = np.unravel_index(int(shares.argmax()), shares.shape)
-    joint, value = machine.active[i], q_a[k, i]
-    limit = machine.lower[i] if value < machine.lower[i] else machine.upper[i]
-    unit = machine.unit(joint)
-    place = machine.tree.joints[joint].limits.where
-    others = int((excess > slack).any(axis=0).sum()) - 1
-    more = f" ({others} other joint{'s' * (others > 1)} likewise)" if others else ""
-    return (
-        f"the reference of '{joint}' goes to {value:.6g} {unit} at t = {times[k]:.4g} s, beyond "
-        f"its limit {limit:.6g} {unit}{f' ({place})' if place else ''}{more}: keep it within, or "
-        "widen the limits"
-    )

@@ -9,7 +9,7 @@ from crane.description.ground import Contact
 from crane.dynamics.frames import FrameJacobians
 from crane.dynamics.joint_forces import JointForces
 from crane.machine import Machine
-from crane.motion.trajectories import limit_slack
+from crane.motion.limits import limit_slack
 
 _BURIED = 3.0  # weights of the machine, with which a contact may press at the start
 _SHOWN = 3  # joints beyond their limits that are named

@@ -28,8 +28,7 @@ from crane.dynamics import Dynamics
 from crane.dynamics.external import states_of
 from crane.formats import load
 from crane.machine import Machine
-from crane.motion.curves import Trajectory
-from crane.motion.trajectories import beyond_limits
+from crane.motion.limits import beyond_limits, carried_beyond
 from crane.recordings.recording import Recording
 from crane.recordings.summary import tipping
 from crane.simulation.integration.adaptive import ADAPTIVE, AdaptiveSteps
@@ -102,7 +101,7 @@ def simulate(
             of a hydraulic machine (`ValvePD`, `joystick`, `Signals`, `Sampled`). None is no
             force, and valves at their neutral signal where the machine has any.
         initial: Active coordinates (n,) to start at rest from, or a pair (q_a, v_a); the start of
-            the controller's reference, at rest, or else the home posture.
+            the controller's reference, or of its task of levers, at rest, or else the home posture.
         duration: [s]; that of the controller's reference if not given.
         step: [s].
         label: Name of the motion to put into the recording, as its `task`.
@@ -197,8 +196,8 @@ def integrate(
         Times (N,), what `crane.simulation.integration.row_layout` names, (N, .) each, and what is
         to be said of the motion. N is smaller than there are steps where it was interrupted.
     """
-    machine, reference = dynamics.machine, reference_of(control, dynamics.machine)
-    q_a, v_a = start_of(machine, initial, reference)
+    machine = dynamics.machine
+    q_a, v_a = start_of(machine, initial, control)
     try:
         # from home, whatever was solved before: a run is the same to the last bit
         posture = machine.closure.solve(q_a, guess=machine.home)
@@ -362,17 +361,22 @@ def count_steps(control: Controller, duration: float | None, step: float) -> int
 def reference_beyond(machine: Machine, control: Controller, until: float) -> str:
     """What to say of a reference that leaves the limits before a time [s], else nothing."""
     reference = reference_of(control, machine)
-    return "" if reference is None else beyond_limits(machine, reference, until)
+    if reference is None:
+        return ""
+    return beyond_limits(machine, reference, until) or carried_beyond(machine, reference, until)
 
 
 def start_of(
     machine: Machine,
     initial: ArrayLike | tuple[ArrayLike, ArrayLike] | None,
-    reference: Trajectory | None,
+    control: Controller | None = None,
 ) -> tuple[Array, Array]:
     """Active coordinates and velocities (n,) that a simulation starts from, see `simulate`."""
     size, rest = len(machine.active), np.zeros(len(machine.active))
     if initial is None:
+        reference = None if control is None else reference_of(control, machine)
+        if isinstance(control, ValveDrive) and control.command.start is not None:
+            return np.array(control.command.start), rest
         if reference is not None:
             return machine.check_limits(
                 reference.position(0.0), "the start of the reference"

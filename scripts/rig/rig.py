@@ -22,7 +22,8 @@ from crane.formats import load
 from crane.machine import Machine
 from crane.motion.curves import Trajectory
 from crane.motion.kinematics import Kinematics
-from crane.motion.trajectories import beyond_limits, with_free
+from crane.motion.limits import beyond_limits
+from crane.motion.trajectories import with_free
 from crane.recordings.recording import FORCE_UNITS, VELOCITY_UNITS, Recording
 from crane.simulation.integration import Chart, HaltedError, Steps, explained, row_layout
 from rig.plant import Tolerances, drawn

@@ -347,7 +347,7 @@ class Problem:
         moving = [i for i in numbers if self._acts(case, self.unknowns[i].sensor)]
         moving += own.tolist()
         links = [link for link, _ in frames_of(machine, case.sensors)]
-        initial = start_of(machine, inputs.initial, None)
+        initial = start_of(machine, inputs.initial)
 
         def setup(times: Array) -> tuple[Setup, Setup]:
             base = setup_of(dynamics, drive, initial, links, times)
@@ -406,7 +406,7 @@ class Problem:
             try:
                 other = machine if starts else self.variant(there, smooth)
                 inputs = self._started(case, there)
-                initial = start_of(other, inputs.initial, None)
+                initial = start_of(other, inputs.initial)
                 dynamics, drive = Dynamics(other), inputs.drive(other)
                 found = setup_of(dynamics, drive, initial, links, times)
             except CraneError:

@@ -6,7 +6,7 @@ from crane.common.errors import SimulationError
 from crane.common.samples import Array
 from crane.machine import Machine
 from crane.motion.curves import Trajectory
-from crane.motion.trajectories import limit_slack
+from crane.motion.limits import limit_slack
 
 
 class HaltedError(SimulationError):

@@ -51,7 +51,7 @@ class Asked(NamedTuple):
             machine = load(machine)
         control = as_controller(controller, machine)
         count = count_steps(control, duration, step)
-        start = start_of(machine, initial, reference_of(control, machine))
+        start = start_of(machine, initial, control)
         programmed = isinstance(control, ValveDrive) and control.period
         if programmed or not isinstance(control, TracedController):
             raise InputError(
