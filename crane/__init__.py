@@ -58,6 +58,7 @@ if TYPE_CHECKING:
         Turning,
         point_to_point,
         polynomial,
+        read_path,
         retimed,
         task_trajectory,
         tip_trajectory,
@@ -117,8 +118,8 @@ _HOMES = {
     "crane.identification.mechanics.payload": "identify_payload",
     "crane.identification.mechanics.result": "Identification",
     "crane.machine": "Machine Payload",
-    "crane.motion": "Kinematics Sway Trajectory Turning point_to_point polynomial retimed "
-    "task_trajectory tip_trajectory via_attitudes via_points without_sway",
+    "crane.motion": "Kinematics Sway Trajectory Turning point_to_point polynomial read_path "
+    "retimed task_trajectory tip_trajectory via_attitudes via_points without_sway",
     "crane.motion.workspaces": "Workspace workspace",
     "crane.recordings": "Recording",
     "crane.recordings.measured": "read_measured",
@@ -137,14 +138,15 @@ __all__ = [
     "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel", "Machine", "PDGains",
     "PI", "PIGains", "Payload", "Pushing", "Recording", "Rope", "SOILS", "Sampled",
     "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy",
-    "TipVelocity", "Trajectory", "Turning", "ValveDrive", "ValveFeedforward", "ValvePD", "Workspace",
-    "Wrench", "add_cylinder", "add_loops", "calibrate", "casadi_function", "check",
+    "TipVelocity", "Trajectory", "Turning", "ValveDrive", "ValveFeedforward", "ValvePD",
+    "Workspace", "Wrench", "add_cylinder", "add_loops", "calibrate", "casadi_function", "check",
     "cross_validate", "excite", "excite_valves", "fastest", "gradient", "identify",
     "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
     "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
-    "read_measured", "replay", "report", "retimed", "sensitivities", "simulate", "simulate_batch",
-    "sketch", "study", "sway_study", "task_trajectory", "tip_trajectory", "via_attitudes",
-    "via_points", "without_sway", "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
+    "read_measured", "read_path", "replay", "report", "retimed", "sensitivities", "simulate",
+    "simulate_batch", "sketch", "study", "sway_study", "task_trajectory", "tip_trajectory",
+    "via_attitudes", "via_points", "without_sway", "workspace", "write_machine", "write_mjcf",
+    "write_urdf_plus",
 ]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Via points: the spline with least jerk, attitudes, and tasks of a machine file through points."""
+"""Via points: the spline with least jerk, attitudes, tasks and paths through points."""
 
 import numpy as np
 import pinocchio as pin
@@ -398,7 +398,8 @@ def test_what_cannot_be_reached_is_told_with_time_and_amount(excavator):
         ("excavator", "rotation", "too few drives for roll, pitch, yaw of 'bucket_lip'"),
         ("patu655_grapple", "inclination", "the joint that turns it is upright at home"),
         ("kr300", "inclination", "'flange' of 'kr300' has no inclination: its drives tilt"),
-        ("excavator", "inclinaton", "attitude 'inclinaton' is unknown, did you mean 'inclination'"),
+        ("excavator", "inclinaton", "attitude 'inclinaton' is unknown, did you mean "
+         "'inclination'"),
     ],
 )  # fmt: skip
 def test_attitudes_that_a_machine_does_not_have(name, attitude, line):

@@ -1,5 +1,6 @@
 """The command that simulates a machine."""
 
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -126,8 +127,12 @@ def simulate(
         raise InputError(f"{option} is for --inputs, leave it out")
     if path is not None and task is not None:
         raise InputError("--task does not go with --path, leave one out")
+    control: Controller | Command | None
     if path is not None:
-        control = follower_of(loaded, read_path(loaded, path), controller, sway)
+        reference = read_path(loaded, path)
+        control = follower_of(loaded, reference, controller, sway)
+        if duration is None and step > 0:
+            duration = math.ceil(reference.duration / step - 1e-9) * step  # whole steps
     else:
         control = control_of(loaded, task, controller, sway)
         duration = duration_of(loaded, task, duration)

@@ -162,8 +162,8 @@ def joystick(
 ) -> Signals:
     """Signals of levers: per joint a polygon of (time [s], lever from -1 to 1), or a task's name.
 
-    A task begins at its own `start`. The lever asks for a share of the valve's flow: beyond zero it jumps over the dead band, as the
-    electronics of such machines do.
+    A task begins at its own `start`. The lever asks for a share of the valve's flow: beyond zero
+    it jumps over the dead band, as the electronics of such machines do.
 
     Raises:
         InputError: Unknown joints or task, levers beyond -1 to 1, or times that do not increase.

@@ -3,6 +3,7 @@
 from crane.motion.attitude import Turning, via_attitudes
 from crane.motion.curves import Trajectory, point_to_point, polynomial, via_points
 from crane.motion.kinematics import Kinematics
+from crane.motion.paths import read_path
 from crane.motion.sway import Sway, retimed, without_sway
 from crane.motion.trajectories import task_trajectory, tip_trajectory
 
@@ -13,6 +14,7 @@ __all__ = [
     "Turning",
     "point_to_point",
     "polynomial",
+    "read_path",
     "retimed",
     "task_trajectory",
     "tip_trajectory",

@@ -1,5 +1,6 @@
 """Where a reference leaves the limits of joints, told before it is tried."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from crane.motion.curves import Trajectory
 _LIMIT_SLACK = 1e-6  # [rad], [machine's size]
 _SPEED_SLACK = 1e-6  # of a velocity limit
 _CLOSE = 1e-6  # [s]
-_PER_SECOND, _MOST = 200, 20000  # samples
+_LEAST, _PER_SECOND, _MOST = 100, 100, 20000  # samples
 
 Columns = Callable[[Array], Array]
 
@@ -126,16 +127,29 @@ class _Beyond(NamedTuple):
         scale = np.where(np.isfinite(span) & (span > 0), span, 1.0)
         shares = np.where(excess > slack, excess / scale, -np.inf)
         k, i = (int(x) for x in np.unravel_index(int(shares.argmax()), shares.shape))
-        value = float(q[k, i])
-        limit = float(lower[i] if value < lower[i] else upper[i])
+        below = bool(q[k, i] < lower[i])
+        limit, sign = float(lower[i] if below else upper[i]), -1.0 if below else 1.0
         others = int((excess > slack).any(axis=0).sum()) - 1
-        sign = -1.0 if value < lower[i] else 1.0
 
         def beyond(time: float) -> float:
             return float(sign * (at(np.array([time]))[0, i] - limit))
 
         when = _when(times, excess[:, i], k, beyond)
-        return cls(i, value, limit, float(times[k]), when, others)
+        time, most = _highest(times, excess[:, i], k, beyond)
+        return cls(i, limit + sign * most, limit, time, when, others)
+
+
+def _highest(
+    times: Array, excess: Array, k: int, at: Callable[[float], float]
+) -> tuple[float, float]:
+    """When it is farthest beyond, around sample k, and by how much."""
+    from scipy.optimize import minimize_scalar
+
+    ends = times[max(k - 1, 0)], times[min(k + 1, len(times) - 1)]
+    found = minimize_scalar(lambda t: -at(t), bounds=ends, method="bounded")
+    if -found.fun > excess[k]:
+        return float(found.x), float(-found.fun)
+    return float(times[k]), float(excess[k])
 
 
 def _when(times: Array, excess: Array, k: int, at: Callable[[float], float]) -> str:
@@ -176,4 +190,4 @@ def _more(others: int) -> str:
 
 def _times(reference: Trajectory, until: float) -> Array:
     end = min(until, reference.duration)
-    return np.linspace(0.0, end, min(int(_PER_SECOND * end) + 2, _MOST))
+    return np.linspace(0.0, end, min(int(_PER_SECOND * end) + _LEAST, _MOST))

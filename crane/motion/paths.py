@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from crane.common.errors import CraneWarning, InputError, LimitError, at, known
+from crane.common.errors import CraneWarning, InputError, LimitError, RecordingError, at, known
 from crane.common.samples import Array
 from crane.description.spec import ATTITUDES, TIP
 from crane.machine import Machine
@@ -17,7 +17,7 @@ from crane.motion.limits import beyond_limits
 from crane.motion.splines import noise, quintics, smoothed
 from crane.motion.trajectories import tip_trajectory, with_free
 from crane.recordings.recording import FORCE, VELOCITY
-from crane.recordings.timeseries import TIME, Table, read
+from crane.recordings.timeseries import TIME, Table, check_unit, read
 
 _DENSE = 50  # samples, from which on they may be noisy
 _EXACT = 1e-7  # scatter of a column, as a share of its range, that is no noise
@@ -28,11 +28,11 @@ _UNITS = {**dict.fromkeys(TIP, "m"), **dict.fromkeys(ATTITUDES[0] + ATTITUDES[1]
 def read_path(machine: Machine, path: str | Path) -> Trajectory:
     """The motion that a CSV or npz file gives as points in time.
 
-    Its columns are time [s] and all driven joints [m], [rad], as a recording has them; or the tip's
-    x, y, z [m], and `inclination` or `roll`, `pitch`, `yaw` [rad] of its frame. A few points are
-    passed with least jerk (`via_points`), from rest to rest; empty cells and nan leave a coordinate
-    open there. Columns of many samples that scatter are smoothed (`crane.motion.splines`), which a
-    warning tells with how much they scatter and up to which frequency they are followed.
+    Its columns are time [s] and all driven joints [m], [rad], as a recording has them; or the
+    tip's x, y, z [m], and `inclination` or `roll`, `pitch`, `yaw` [rad] of its frame. Points are
+    passed with least jerk (`via_points`), from rest to rest. Columns of many samples that scatter
+    are smoothed (`crane.motion.splines`), which a warning tells with how much they scatter and up
+    to which frequency they are followed.
 
     Args:
         machine: The machine.
@@ -51,9 +51,12 @@ def read_path(machine: Machine, path: str | Path) -> Trajectory:
     try:
         columns = _columns(machine, table)
         time = _times(table)
-        points = np.column_stack([_column(table, name) for name in columns.values()])
         names = list(columns)
-        curve = _curve(time, points[:, : len(names)], names, _units(machine, names), path)
+        units = [_UNITS.get(name) or machine.unit(name) for name in names]
+        for name, unit in zip(columns.values(), units, strict=True):
+            check_unit(name, table.units[name], [unit])
+        points = np.column_stack([_column(table, name) for name in columns.values()])
+        curve = _curve(time, points, names, units, path)
         if names[: len(TIP)] != list(TIP):
             found = with_free(machine, curve.of(range(len(names))))
             if text := beyond_limits(machine, found):
@@ -66,7 +69,7 @@ def read_path(machine: Machine, path: str | Path) -> Trajectory:
         elif len(names) > len(TIP):
             attitude = via_attitudes(curve.time, curve.parts[0][:, len(TIP) :])
         return tip_trajectory(machine, tip, None, attitude)
-    except InputError as error:
+    except (InputError, LimitError, RecordingError) as error:
         raise type(error)(at(str(path), error)) from None
 
 
@@ -135,10 +138,6 @@ def _times(table: Table) -> Array:
 
 def _column(table: Table, name: str) -> Array:
     return np.asarray(table.values[:, list(table.units).index(name)])
-
-
-def _units(machine: Machine, names: Sequence[str]) -> list[str]:
-    return [_UNITS.get(name) or machine.unit(name) for name in names]
 
 
 def _curve(

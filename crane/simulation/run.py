@@ -101,7 +101,7 @@ def simulate(
             of a hydraulic machine (`ValvePD`, `joystick`, `Signals`, `Sampled`). None is no
             force, and valves at their neutral signal where the machine has any.
         initial: Active coordinates (n,) to start at rest from, or a pair (q_a, v_a); the start of
-            the controller's reference, or of its task of levers, at rest, or else the home posture.
+            the controller's reference, or of its levers, at rest, or else the home posture.
         duration: [s]; that of the controller's reference if not given.
         step: [s].
         label: Name of the motion to put into the recording, as its `task`.
@@ -225,7 +225,9 @@ def integrate(
     except HaltedError as halt:
         finer, done = integration.finer(times[:-1], rows, step), integration.done
         q_a = layout.view(rows[:done]).q[:, machine.closure.active]
-        raise explained(machine, halt, times[:done], q_a, reference, finer) from None
+        raise explained(
+            machine, halt, times[:done], q_a, reference_of(control, machine), finer
+        ) from None
     except KeyboardInterrupt:
         done = integration.done
         if not done:

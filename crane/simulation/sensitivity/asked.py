@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from crane.codegen import Parts
 from crane.common.errors import InputError
 from crane.common.samples import Array
-from crane.control import Command, Controller, TracedController, ValveDrive, reference_of
+from crane.control import Command, Controller, TracedController, ValveDrive
 from crane.dynamics import Dynamics
 from crane.formats import load
 from crane.machine import Machine
