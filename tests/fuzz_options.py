@@ -73,6 +73,7 @@ RANGES = (
 
 # What each command needs, and words that it understands; {out} is a name that is free.
 CALLS = {
+    "stability": ["excavator --task dig"],
     "add cylinder": [
         "slider.yaml --between base:-0.3,0,-0.1 crank:0.15,0,0 --bore 0.02 --rod 0.01 "
         "--stroke 0.25 --out {out}.yaml",
