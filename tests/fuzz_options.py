@@ -73,7 +73,6 @@ RANGES = (
 
 # What each command needs, and words that it understands; {out} is a name that is free.
 CALLS = {
-    "stability": ["excavator --task dig"],
     "add cylinder": [
         "slider.yaml --between base:-0.3,0,-0.1 crank:0.15,0,0 --bore 0.02 --rod 0.01 "
         "--stroke 0.25 --out {out}.yaml",
@@ -110,6 +109,7 @@ CALLS = {
         "slider.yaml --task swing --duration 0.1 --by crank.mass --out {out}",
         "rig.yaml --duration 0.1 --by load_x.mass --by start.x",
     ],
+    "stability": ["excavator --task dig"],
     "sway": ["patu655_grapple --task swing --payload 200 --damping 0"],
     "workspace": ["slider.yaml --samples 100 --out {out}", "rig.yaml --samples 100 --out {out}"],
 }
