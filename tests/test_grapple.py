@@ -412,6 +412,6 @@ def test_a_run_of_the_command_line(tmp_path):
     run = crane.Recording.from_csv(out / "recording.csv")
     assert run.free == ("sway_radial", "sway_tangential")
     done = typed("simulate", NAME, "--duration", "1", "--sway", "flat", "--out", tmp_path / "x")
-    assert done.stderr == "error: --sway changes a task's reference, name a --task\n"
+    assert done.stderr == "error: --sway changes a reference, name a --task or a --path\n"
     done = typed("simulate", NAME, "--task", "stir", "--sway", "flat", "--out", tmp_path / "x")
     assert done.stderr == "error: task 'stir' moves levers, leave --sway out\n"

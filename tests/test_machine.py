@@ -142,7 +142,7 @@ def test_errors_of_limits_tell_where_they_stand(tmp_path):
     ):
         with pytest.raises(LimitError, match=place):
             call()
-    with pytest.raises(LimitError, match=rf"limit 0\.03 m \(chain_b1\.urdf:{line}\): keep"):
+    with pytest.raises(LimitError, match=rf"limit 0\.03 m \(chain_b1\.urdf:{line}\) from t"):
         crane.task_trajectory(crane.load(tmp_path / "task.yaml"), "far")
     shorter = crane.load(path, {"X1.upper": 0.025})
     with pytest.raises(LimitError, match=r"limits 0 to 0\.025 m \(changed by X1\.upper\), choose"):

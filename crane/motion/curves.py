@@ -32,6 +32,10 @@ class Trajectory:
         attitude: See above.
     """
 
+    duration: float
+    tip: "Trajectory | None" = None
+    attitude: "Trajectory | Turning | None" = None
+
     def __init__(
         self,
         curve: PPoly,

@@ -203,7 +203,7 @@ class _Retimed(Trajectory):
     """A reference in another time, from its start to its end."""
 
     def __init__(self, reference: Trajectory, duration: float):
-        self.duration, self.tip = duration, None
+        self.duration = duration
         self._reference, self._rate_of_time = reference, reference.duration / duration
 
     def position(self, time: ArrayLike) -> Array:

@@ -49,7 +49,6 @@ class Fourier(Trajectory):
         self.periods = as_count(periods, "the number of periods")
         self.lead = self.period / 2
         self.duration = self.periods * self.period + 2 * self.lead
-        self.tip = None
 
     def breaks(self) -> Array:
         """See `Trajectory`."""
