@@ -1,10 +1,13 @@
 """The bundled excavator beside what data sheets of its class print, and its cycle's balance."""
 
+import warnings
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 import crane
+from crane.studies.tipping import tipping_load
 
 PRESSURE, BUCKET, ARM = 3.5e7, 1.1309734e-2, 1.5393804e-2  # [Pa], areas of the pistons [m2]
 RADIUS = 1.47  # of the bucket's tip about its pin [m]
@@ -54,9 +57,7 @@ def test_it_weighs_and_digs_as_data_sheets_say(machine):
     assert force.max() == pytest.approx(150e3, rel=0.07)
     best = home.copy()
     best[3] = strokes[force.argmax()]  # where the arm's force is defined, too
-    tip, pin = (
-        crane.Kinematics(machine, frame).position(best) for frame in (machine.tip, "arm")
-    )
+    tip, pin = (crane.Kinematics(machine, frame).position(best) for frame in (machine.tip, "arm"))
     radius = np.linalg.norm(tip - pin)
     along = np.tile(best, (400, 1))
     along[:, 2] = np.linspace(0.001, 1.503, 400)
@@ -79,3 +80,18 @@ def test_a_cycle_ends_where_it_began_and_keeps_the_balance(machine):
     stored = seen["kinetic"] + seen["potential"]
     gap = work - (stored - stored[0]) - seen["dissipated"]
     assert np.abs(gap).max() < 1e-6 * np.ptp(stored)
+
+
+@pytest.mark.slow
+def test_levers_tip_it_with_the_load_that_is_said(machine):
+    """A little less leaves it on its tracks, a little more does not; quietly."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = tipping_load(machine, "dig")
+    least = []
+    for share in (0.98, 1.02):
+        loaded = crane.load("excavator", {"payload.mass": share * found.mass})
+        under = loaded.under(*loaded.tasks["dig"].loads)
+        run = crane.simulate(under, crane.joystick(loaded, "dig"), duration=16.0, step=5e-3)
+        least.append(run.channels["stability"].min())
+    assert least[0] > 0 > least[1] and 0 < found.mass < found.static

@@ -46,6 +46,10 @@ def stability(
 
     loaded = load(machine, lock, change, active, free, False, packages, argument)
     stands, q_a = Stability(loaded), posture(loaded, at)
+    found = None
+    if task is not None:
+        with status("tipping"):
+            found = tipping_load(loaded, task)
     (moments,), (shares,) = stands.static(q_a)
     print("| tipping line | held by | of the weight |\n| --- | ---: | ---: |")
     for line, moment, share in zip(stands.lines, moments, shares, strict=True):
@@ -58,9 +62,7 @@ def stability(
             if about
             else f"\nno load at '{name}' tips it"
         )
-    if task is not None:
-        with status("tipping"):
-            found = tipping_load(loaded, task)
+    if found is not None:
         print(
             f"in '{task}' a payload of {found.mass:.5g} kg tips it, at t = {found.time:.4g} s; "
             f"at rest {found.static:.5g} kg would"

@@ -1,12 +1,13 @@
 """The load under which a machine tips while it does a task."""
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
 
-from crane.common.errors import InputError, known
-from crane.control import ComputedTorque
+from crane.common.errors import CraneWarning, InputError, known
+from crane.control import ComputedTorque, joystick
 from crane.dynamics.stability import Stability
 from crane.formats.loading import Variants
 from crane.machine import Machine
@@ -37,8 +38,9 @@ class TippingLoad(NamedTuple):
 def tipping_load(machine: Machine, task: str) -> TippingLoad:
     """The payload with which a task brings a machine just onto a tipping line, by bisection.
 
-    The task is followed exactly (computed torque), so what tips are inertial forces of the task
-    itself, not of a controller that swings.
+    A trajectory is followed exactly (computed torque), so what tips are inertial forces of the
+    task itself, not of a controller that swings. A task of levers is what these do to the machine
+    with that payload. Loads of the task act besides.
 
     Args:
         machine: Fixed to the world, with `supports` and a payload.
@@ -59,9 +61,9 @@ def tipping_load(machine: Machine, task: str) -> TippingLoad:
 
     def least(mass: float, channel: str = "stability") -> float:
         if mass not in done:
-            loaded = variants.machine({MASS: mass})
-            motion = ComputedTorque(loaded, task_trajectory(loaded, task))
-            done[mass] = simulate(loaded, motion, step=_STEP)
+            with warnings.catch_warnings():  # that it tips is what is asked for
+                warnings.simplefilter("ignore", CraneWarning)
+                done[mass] = _run(variants.machine({MASS: mass}), task)
         return float(done[mass].channels[channel].min())
 
     found: list[float] = []
@@ -80,3 +82,12 @@ def tipping_load(machine: Machine, task: str) -> TippingLoad:
     least(mass)
     run = done[mass]
     return TippingLoad(mass, float(run.time[run.channels["stability"].argmin()]), static)
+
+
+def _run(machine: Machine, task: str) -> Recording:
+    chosen = machine.tasks[task]
+    under = machine.under(*chosen.loads)
+    if chosen.space == "joystick":
+        levers = joystick(machine, task)
+        return simulate(under, levers, duration=chosen.duration, step=_STEP)
+    return simulate(under, ComputedTorque(machine, task_trajectory(machine, task)), step=_STEP)
