@@ -195,7 +195,7 @@ def mutated(data, seed):
 IGNORED = {  # what a machine does not have
     ("geom", "contype"), ("geom", "conaffinity"), ("motor", "name"), ("mujoco", "model"),
     ("key", "name"), ("fixed", "name"),  # the only key is home, and nothing refers to the tendon
-    ("robot", "name"), ("sdf", "version"), ("model", "name"),
+    ("robot", "name"), ("model", "name"),
 }  # fmt: skip
 
 
@@ -225,6 +225,8 @@ def said_xml(data, known=None):
             value = words(value)
             if "axis" in (element.tag, key) and (length := np.hypot.reduce(value)):
                 value = tuple(np.round(np.array(value) / length, 15).tolist())
+            if (element.tag, key) == ("sdf", "version"):  # by which axes count elsewhere
+                value = tuple(isinstance(x, float) and x < 1.5 for x in value)
             if key == "polycoef":
                 value += (0.0,) * (5 - len(value))
             said.append((here, key, value))
