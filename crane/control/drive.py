@@ -39,8 +39,9 @@ class ValveDrive(Law):
         self.command, self.reference, self.period = command, command.reference, command.period
         hydraulics = circuit_of(machine)
         self._which = [machine.active.index(joint) for joint in hydraulics.joints]
-        self._lower = machine.lower[self._which]
-        strokes = machine.upper[self._which] - self._lower
+        turns = [cylinder.motor for cylinder in hydraulics.cylinders.values()]
+        self._lower = np.where(turns, 0.0, machine.lower[self._which])
+        strokes = np.where(turns, 0.0, machine.upper[self._which] - self._lower)
         self.circuit = Circuit(hydraulics, strokes.tolist(), command.measured)
         self._pressures: dict[str, tuple[float, float]] = {}
         for joint, pair in (pressures or {}).items():
@@ -98,7 +99,15 @@ class ValveDrive(Law):
         for signal, spool, sides in zip(signals, instant.spools, instant.chambers, strict=True):
             out += [signal, spool, *(side.pressure for side in sides)]
             out += [side.valve for side in sides]
-        return [*out, instant.supply, instant.tank]
+        out += [instant.supply, instant.tank]
+        own = dict(zip(self.circuit.states, at.state, strict=False))
+        out += [own[name] for name in own if name.startswith("spring_")]
+        out += [instant.pressures[name] for name in self._others]
+        for pump in instant.pumps.values():
+            out += [pump.share, pump.shaft]
+        if self.circuit.hydraulics.engine is not None and instant.pumps:
+            out.append(instant.speed * self.circuit.hydraulics.engine.speed)
+        return out
 
     def _at(self, at: At) -> tuple[Instant, Sequence[Number]]:
         """The circuit, and the signals of its valves."""
@@ -127,4 +136,17 @@ class ValveDrive(Law):
             found += [(f"voltage_{joint}", "V"), (f"spool_{joint}", "")]
             found += [(f"pressure_{joint}_{side}", "Pa") for side in "ab"]
             found += [(f"flow_{joint}_{side}", "m3/s") for side in "ab"]
-        return (*found, ("pressure_supply", "Pa"), ("pressure_tank", "Pa"))
+        found += [("pressure_supply", "Pa"), ("pressure_tank", "Pa")]
+        found += [(name, "m") for name in self.circuit.states if name.startswith("spring_")]
+        found += [(f"pressure_{name}", "Pa") for name in self._others]
+        for name in self.circuit.pumps:
+            found += [(f"share_{name}", ""), (f"shaft_{name}", "W")]
+        if self.circuit.hydraulics.engine is not None and self.circuit.pumps:
+            found.append(("engine_speed", "rad/s"))
+        return tuple(found)
+
+    @property
+    def _others(self) -> list[str]:
+        """Nodes beside tank, first pump and chambers."""
+        circuit = self.circuit.hydraulics
+        return [*circuit.supplies, *circuit.lines, *circuit.accumulators]

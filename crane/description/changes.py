@@ -34,7 +34,8 @@ from crane.description.spec import (
     MachineSpec,
 )
 from crane.description.tree import Joint, Limits, Link, Tree, limit
-from crane.hydraulics.components import Hydraulics, number_names
+from crane.hydraulics.components import Hydraulics
+from crane.hydraulics.numbers import number_names
 
 PAYLOAD = "payload.mass"
 _LISTS = ("forces", "gas_springs", "ropes", "end_stops")
@@ -199,7 +200,7 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
     for part, values in renewed.items():
         field, i, _ = acting[part]
         lists[field][i] = dataclasses.replace(lists[field][i], **values)
-    hydraulics = _circuit(circuit) if circuit else None
+    hydraulics = _circuit(spec.hydraulics, circuit) if spec.hydraulics else None
     for part, values in replaced.items():
         _warn_of_units(spec, part, values)
     return dataclasses.replace(
@@ -256,23 +257,40 @@ def _warn_of_units(spec: MachineSpec, part: str, values: Mapping[str, float]) ->
             warnings.warn(what, CraneWarning, stacklevel=2)
 
 
+CIRCUIT = {
+    "cylinder.": "cylinders", "valve.": "valves", "valve_control.": "control",
+    "supply.": "supplies", "line.": "lines", "accumulator.": "accumulators",
+    "element.": "elements",
+}  # fmt: skip
+
+
 def circuit_parts(hydraulics: Hydraulics) -> dict[str, Any]:
     """The parts of a circuit by the names that their numbers begin with."""
     return (
         {"supply": hydraulics.supply, "oil": hydraulics.oil}
+        | {f"supply.{name}": part for name, part in hydraulics.supplies.items()}
+        | ({"engine": hydraulics.engine} if hydraulics.engine is not None else {})
+        | {f"line.{name}": part for name, part in hydraulics.lines.items()}
+        | {f"accumulator.{name}": part for name, part in hydraulics.accumulators.items()}
+        | {f"element.{name}": part for name, part in hydraulics.elements.items()}
         | {f"cylinder.{joint}": part for joint, part in hydraulics.cylinders.items()}
         | {f"valve.{joint}": part for joint, part in hydraulics.valves.items()}
         | {f"valve_control.{joint}": part for joint, part in hydraulics.control.items()}
     )
 
 
-def _circuit(parts: Mapping[str, Any]) -> Hydraulics:
-    """The circuit of these parts."""
-    cylinders, valves, control = (
-        {name.removeprefix(kind): part for name, part in parts.items() if name.startswith(kind)}
-        for kind in ("cylinder.", "valve.", "valve_control.")
-    )
-    return Hydraulics(parts["supply"], parts["oil"], cylinders, valves, control)
+def _circuit(hydraulics: Hydraulics, parts: Mapping[str, Any]) -> Hydraulics:
+    """A circuit with these parts in place of its own."""
+    kinds: dict[str, Any] = {
+        field: {
+            name.removeprefix(kind): part for name, part in parts.items() if name.startswith(kind)
+        }
+        for kind, field in CIRCUIT.items()
+    }
+    own: dict[str, Any] = {
+        name: parts[name] for name in ("supply", "oil", "engine") if name in parts
+    }
+    return dataclasses.replace(hydraulics, **own, **kinds)
 
 
 def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:

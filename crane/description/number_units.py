@@ -7,7 +7,8 @@ from crane.description.tree import Tree
 _SHAPES = {"com": "m", "inertia": "kg m2"}
 _PLACES = dict.fromkeys("xyz", "m") | dict.fromkeys(("roll", "pitch", "yaw"), "rad")
 _HEADS = ("friction", "spring", "gas_spring", "end_stop", "rope", "cylinder", "valve",
-          "valve_control", "supply", "oil", "control")  # fmt: skip
+          "valve_control", "supply", "oil", "control", "engine", "line", "accumulator",
+          "element")  # fmt: skip
 
 
 def number_unit(tree: Tree, name: str) -> str:
@@ -65,8 +66,15 @@ def _of_element(head: str, word: str, length: str) -> str:
     return units.get(head, {}).get(word, "")
 
 
+_OTHERWISE = {("engine", "droop"): "rad/s", ("element", "gain"): "m3/(s Pa)",
+              ("accumulator", "line"): "m3"}  # fmt: skip
+_CIRCUIT = ("cylinder", "valve", "supply", "oil", "engine", "line", "accumulator", "element")
+
+
 def _of_circuit(head: str, word: str, turns: bool) -> str:
-    if head not in ("cylinder", "valve", "supply", "oil"):
+    if (head, word) in _OTHERWISE:
+        return _OTHERWISE[head, word]
+    if head not in _CIRCUIT:
         return ""
     usual = (TURNING if turns else {}).get(word) or USUAL.get(word)
     return usual.unit if usual is not None else ""

@@ -7,10 +7,13 @@ from crane.hydraulics.components import (
     Hydraulics,
     Oil,
     PDGains,
-    Supply,
     Valve,
 )
+from crane.hydraulics.curve import Curve
+from crane.hydraulics.elements import Accumulator, Element, Line
+from crane.hydraulics.sources import Engine, Supply
 
 __all__ = [
-    "Circuit", "Counterbalance", "Cylinder", "Hydraulics", "Oil", "PDGains", "Supply", "Valve",
+    "Accumulator", "Circuit", "Counterbalance", "Curve", "Cylinder", "Element", "Engine",
+    "Hydraulics", "Line", "Oil", "PDGains", "Supply", "Valve",
 ]  # fmt: skip

@@ -1,15 +1,28 @@
-"""A circuit as formulas: cylinders with their valves, spools, supply, and what balances."""
+"""A circuit as formulas: nodes with pressures, what flows between them, and what balances."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
 from crane.codegen import Number, maximum
 from crane.common.samples import Array
+from crane.hydraulics.books import Books, nets_of
 from crane.hydraulics.components import Hydraulics
-from crane.hydraulics.driven_cylinder import FIELDS, WIDTH, Chamber, DrivenCylinder, row_of
-from crane.hydraulics.flow import clipped
+from crane.hydraulics.driven_cylinder import (
+    INSIDE,
+    WIDTH,
+    Chamber,
+    DrivenCylinder,
+    row_of,
+    spool_of,
+)
+from crane.hydraulics.elements import Accumulator
+from crane.hydraulics.flow import Flow, clipped
+from crane.hydraulics.nodes import flow_of, gas_of, softness_of
+from crane.hydraulics.pump import Pump
+from crane.hydraulics.sources import MAIN, TANK, Engine, Supply
 
 _PRESSURE, _OIL = 1.0, 5e-13  # accuracy that matters [Pa], [m3]
 # Integrals that balance: pumped = returned + stored + volume that the joints sweep, and
@@ -19,10 +32,14 @@ BALANCES = {
     "oil_pumped": "m3", "oil_returned": "m3", "oil_stored": "m3",
     "pump_work": "J", "hydraulic_loss": "J", "oil_energy": "J",
 }  # fmt: skip
-_COMMON = (
-    "oil", "hose", "steel", "vapour", "gas_power", "pump", "tank", "pump_flow", "per_droop",
-    "line",
+_COMMON = ("oil", "hose", "steel", "vapour", "gas_power", "air", "pump", "tank")
+_PUMP = (
+    "pressure", "flow", "per_droop", "line", "margin", "standby", "signal", "throttle", "least",
+    "per_response", "power", "relief", "relief_gain", "slip", "friction", "drag",
 )  # fmt: skip
+_ENGINE = ("speed", "torque", "per_droop", "droop", "per_inertia")
+_ACCUMULATOR = ("line", "volume", "precharge", "exponent", "per_time")
+_ELEMENT = ("coefficient", "gain", "pressure")
 
 
 @dataclass
@@ -36,6 +53,13 @@ class Instant:
         chambers: (m,) pairs A, B.
         supply: Pressure [Pa].
         tank: Pressure [Pa].
+        pressures: Of all nodes [Pa].
+        flows: All between nodes.
+        pumps: By node.
+        speed: Of the engine over its set speed.
+        stored: Power that goes into each node, and into the series spring of JOINT as JOINT.spring
+            [W].
+        damped: What dampers of series springs turn into heat, by joint [W].
     """
 
     forces: list[Number]
@@ -44,14 +68,22 @@ class Instant:
     chambers: list[tuple[Chamber, Chamber]]
     supply: Number
     tank: Number
+    pressures: dict[str, Number]
+    flows: list[Flow]
+    pumps: dict[str, Pump]
+    speed: Number
+    stored: dict[str, Number]
+    damped: dict[str, Number]
 
 
 class Circuit:
-    """The formulas of one circuit.
+    """The formulas of one circuit: nodes with pressures, and what flows between them.
 
     States per cylinder: those of the pressures in A and B, the compression of the series spring
-    if there is one, position and rate of the spool if it has inertia; then that of the supply's
-    pressure if the pump's flow is limited; then `BALANCES`.
+    if there is one, the signal behind its play, position and rate of the spool if these are;
+    then per pump that of its line's pressure if its flow is limited, and of its displacement if
+    that takes time; per line and accumulator that of its pressure, and the oil in it if heat
+    leaves its gas; the engine's speed; then `BALANCES`.
 
     The state of a pressure is p - p_vapour where that is positive. Below zero the chamber holds
     vapour at p_vapour, of the volume that the state's size times a constant compressibility says:
@@ -60,7 +92,7 @@ class Circuit:
     Args:
         hydraulics: The circuit.
         strokes: (m,) distance between the limits of each joint [m], [rad].
-        measured: Whether pressures of pump and tank are given from outside.
+        measured: Whether pressures of (the first) pump and tank are given from outside.
 
     Attributes:
         joints: Those driven, in order.
@@ -70,50 +102,76 @@ class Circuit:
         states: Names and units of the stiff ones, pressures counting from that of vapour.
         starts: (m,) where the states of each cylinder begin, with the pressures of A and B.
         scales: (size,) accuracy that matters in each state.
+        pumps: Those whose flow is limited, by node.
+        ends: (m,) where the states of each cylinder end.
     """
 
     def __init__(self, hydraulics: Hydraulics, strokes: Sequence[float], measured: bool = False):
         self.hydraulics, self.joints = hydraulics, hydraulics.joints
         self.measured = measured
-        self._limited = hydraulics.supply.flow > 0 and not measured
-        parts = list(
-            zip(hydraulics.cylinders.values(), hydraulics.valves.values(), strokes, strict=True)
-        )
-        rows = [row_of(cylinder, valve, stroke) for cylinder, valve, stroke in parts]
-        self._strokes = np.array(strokes, dtype=np.float64)
-        self.numbers = np.array([*self._common(), *(x for row in rows for x in row)])
-        self._compliant = [cylinder.stiffness > 0 for cylinder, _, _ in parts]
-        self._sluggish = [valve.bandwidth > 0 for _, valve, _ in parts]
-        lengths = [
-            2 + compliant + 2 * sluggish
-            for compliant, sluggish in zip(self._compliant, self._sluggish, strict=True)
-        ]
-        self._offsets = [sum(lengths[:i]) for i in range(len(lengths) + 1)]
-        self.starts = self._offsets[:-1]
-        self.stiff = self._offsets[-1] + self._limited
-        self.size = self.stiff + len(BALANCES)
-        modulus = hydraulics.oil.bulk_modulus
-        scales: list[float] = []
-        for i, (cylinder, _, stroke) in enumerate(parts):
-            halves = (
-                cylinder.hose_a + 0.5 * cylinder.area_a * stroke,
-                cylinder.hose_b + 0.5 * cylinder.area_b * stroke,
+        self.pumps = {
+            name: pump
+            for name, pump in hydraulics.sources.items()
+            if pump.flow > 0 and not (measured and name == MAIN)
+        }
+        self._parts = [
+            (cylinder, valve, 0.0 if cylinder.motor else stroke)
+            for cylinder, valve, stroke in zip(
+                hydraulics.cylinders.values(), hydraulics.valves.values(), strokes, strict=True
             )
-            scales += [max(_PRESSURE, modulus * _OIL / volume) for volume in halves]
-            scales += [1e-10] * self._compliant[i] + [1e-7, 1e-5] * self._sluggish[i]
-        line = [max(_PRESSURE, modulus * _OIL / hydraulics.supply.volume)] * self._limited
-        self.states = self._named()
-        self.scales = np.array(scales + line + [np.inf] * len(BALANCES))
+        ]
+        self._engine = hydraulics.engine if self.pumps else None
+        rows = [
+            self._common(),
+            *(row_of(*part) for part in self._parts),
+            *(self._pump_row(pump) for pump in self.pumps.values()),
+            *([self._engine_row(self._engine)] if self._engine else []),
+            *([line.volume / hydraulics.oil.bulk_modulus] for line in hydraulics.lines.values()),
+            *(self._gas_row(item) for item in hydraulics.accumulators.values()),
+            *([x.coefficient, x.gain, x.pressure] for x in hydraulics.elements.values()),
+        ]
+        self.numbers = np.array([x for row in rows for x in row])
+        self.states: dict[str, str] = {}
+        scales: list[float] = []
+        modulus = hydraulics.oil.bulk_modulus
 
-    def _named(self) -> dict[str, str]:
-        states: dict[str, str] = {}
-        for joint, compliant, sluggish in zip(
-            self.joints, self._compliant, self._sluggish, strict=True
-        ):
-            states |= {f"pressure_{joint}_{side}": "Pa" for side in "ab"}
-            states |= {f"spring_{joint}": "m"} if compliant else {}
-            states |= {f"spool_{joint}": "", f"spool_rate_{joint}": "1/s"} if sluggish else {}
-        return states | ({"pressure_supply": "Pa"} if self._limited else {})
+        def add(name: str, unit: str, scale: float) -> None:
+            self.states[name] = unit
+            scales.append(scale)
+
+        def pressure(name: str, volume: float) -> None:
+            add(f"pressure_{name}", "Pa", max(_PRESSURE, modulus * _OIL / volume))
+
+        self.starts: list[int] = []
+        for cylinder, valve, stroke in self._parts:
+            joint = cylinder.joint
+            self.starts.append(len(scales))
+            pressure(f"{joint}_a", cylinder.hose_a + 0.5 * cylinder.area_a * stroke)
+            pressure(f"{joint}_b", cylinder.hose_b + 0.5 * cylinder.area_b * stroke)
+            if cylinder.stiffness > 0:
+                add(f"spring_{joint}", "m", 1e-10)
+            if valve.hysteresis > 0:
+                add(f"play_{joint}", "", 1e-7)
+            if valve.bandwidth > 0:
+                add(f"spool_{joint}", "", 1e-7)
+                add(f"spool_rate_{joint}", "1/s", 1e-5)
+        self.ends = [*self.starts[1:], len(scales)]
+        for name, pump in self.pumps.items():
+            pressure(name, pump.volume)
+            if pump.response > 0:
+                add(f"share_{name}", "", 1e-7)
+        for name, line in hydraulics.lines.items():
+            pressure(name, line.volume)
+        for name, item in hydraulics.accumulators.items():
+            pressure(name, item.volume)
+            if item.time_constant > 0:
+                add(f"oil_{name}", "m3", 1e-9 * item.volume)
+        if self._engine is not None:
+            add("engine", "", 1e-7)
+        self.stiff = len(scales)
+        self.size = self.stiff + len(BALANCES)
+        self.scales = np.array(scales + [np.inf] * len(BALANCES))
+        self._place = {name: i for i, name in enumerate(self.states)}
 
     def _common(self) -> list[float]:
         oil, supply = self.hydraulics.oil, self.hydraulics.supply
@@ -123,12 +181,30 @@ class Circuit:
             1.0 / oil.steel_modulus if oil.steel_modulus else 0.0,
             oil.vapour_pressure,
             1.0 + 1.0 / oil.gas_exponent,
+            oil.air,
             supply.pressure,
             supply.tank,
-            supply.flow if self._limited else 0.0,
-            1.0 / supply.droop,
-            supply.volume / oil.bulk_modulus,
         ]
+
+    def _pump_row(self, pump: Supply) -> list[float]:
+        modulus = self.hydraulics.oil.bulk_modulus
+        return [
+            pump.pressure, pump.flow, 1.0 / pump.droop, pump.volume / modulus,
+            pump.margin, pump.standby, pump.signal, pump.throttle,
+            pump.least, 1.0 / pump.response if pump.response else 0.0, pump.power, pump.relief,
+            pump.relief_gain, pump.slip, pump.friction, pump.drag,
+        ]  # fmt: skip
+
+    def _engine_row(self, engine: Engine) -> list[float]:
+        over = engine.droop / engine.speed
+        return [
+            engine.speed, engine.torque, 1.0 / over, over, 1.0 / (engine.inertia * engine.speed),
+        ]  # fmt: skip
+
+    def _gas_row(self, item: Accumulator) -> list[float]:
+        per_time = 1.0 / item.time_constant if item.time_constant else 0.0
+        line = item.line / self.hydraulics.oil.bulk_modulus
+        return [line, item.volume, item.precharge, item.exponent, per_time]
 
     def start(
         self,
@@ -147,28 +223,40 @@ class Circuit:
                 carries it bears the tank's pressure on the other side, too.
             pressures: Those of A and B [Pa] where they are known, by joint.
             signals: (m,) of the valves [V], to which the spools have come.
-            supply: Pressure of the supply line [Pa].
+            supply: Pressure of the first pump's line [Pa].
             tank: Of the tank's [Pa].
         """
         state = np.zeros(self.size)
         least, vapour = tank, self.hydraulics.oil.vapour_pressure
-        for i, (cylinder, valve) in enumerate(
-            zip(self.hydraulics.cylinders.values(), self.hydraulics.valves.values(), strict=True)
-        ):
+        for i, (cylinder, valve, _) in enumerate(self._parts):
             held = forces[i] - least * (cylinder.area_a - cylinder.area_b)
             a = least + max(held, 0.0) / cylinder.area_a
             b = least + max(-held, 0.0) / cylinder.area_b
             a, b = pressures.get(cylinder.joint, (a, b))
-            at = self._offsets[i]
+            at, joint = self.starts[i], cylinder.joint
             state[at : at + 2] = max(a - vapour, 0.0), max(b - vapour, 0.0)
-            if self._compliant[i]:
+            if cylinder.stiffness > 0:
                 force = cylinder.area_a * a - cylinder.area_b * b
                 state[at + 2] = force / cylinder.stiffness
-            if self._sluggish[i]:
-                u = (signals[i] - valve.neutral) / (valve.full - valve.neutral)
-                state[self._offsets[i + 1] - 2] = np.clip(u, -1.0, 1.0)
-        if self._limited:
-            state[self.stiff - 1] = supply - vapour
+            u = (signals[i] - valve.neutral) / (valve.full - valve.neutral)
+            for name in (f"play_{joint}", f"spool_{joint}"):
+                if name in self._place:
+                    state[self._place[name]] = np.clip(u, -1.0, 1.0)
+        for name, pump in self.pumps.items():
+            p = supply if name == MAIN else pump.rest
+            state[self._place[f"pressure_{name}"]] = p - vapour
+            if pump.response > 0:
+                state[self._place[f"share_{name}"]] = pump.least
+        for name, line in self.hydraulics.lines.items():
+            state[self._place[f"pressure_{name}"]] = (line.pressure or tank) - vapour
+        for name, item in self.hydraulics.accumulators.items():
+            p = item.pressure or item.precharge
+            state[self._place[f"pressure_{name}"]] = p - vapour
+            if item.time_constant > 0:
+                oil = item.volume * (1.0 - item.precharge / max(p, item.precharge))
+                state[self._place[f"oil_{name}"]] = oil
+        if self._engine is not None:
+            state[self._place["engine"]] = 1.0 + self._engine.droop / self._engine.speed
         return state
 
     def at(
@@ -190,64 +278,126 @@ class Circuit:
             signals: (m,) of the valves [V].
             given: Pressures of supply and tank where they are measured, else nothing.
         """
-        common = dict(zip(_COMMON, numbers[: len(_COMMON)], strict=True))
+        taken = iter(numbers)
+
+        def row(names: Sequence[str]) -> dict[str, Number]:
+            return {name: next(taken) for name in names}
+
+        common = row(_COMMON)
+        rows = [list(islice(taken, WIDTH)) for _ in self._parts]
+        pump_rows = {name: row(_PUMP) for name in self.pumps}
+        engine = row(_ENGINE) if self._engine is not None else {}
+        lines = {name: next(taken) for name in self.hydraulics.lines}
+        gases = {name: row(_ACCUMULATOR) for name in self.hydraulics.accumulators}
+        others = {name: row(_ELEMENT) for name in self.hydraulics.elements}
+        own = {name: state[i] for i, name in enumerate(self.states)}
         supply, tank = common["pump"], common["tank"]
         if self.measured:
             supply, tank = given
-        elif self._limited:
-            supply = common["vapour"] + maximum(state[self.stiff - 1], 0.0)
-        forces: list[Number] = []
-        rates: list[Number] = []
+        pressures: dict[str, Number] = {TANK: tank, MAIN: supply}
+        pressures |= {name: pump.pressure for name, pump in self.hydraulics.supplies.items()}
+        for name in (*self.pumps, *lines, *gases):
+            pressures[name] = common["vapour"] + maximum(own[f"pressure_{name}"], 0.0)
+        functions: list[DrivenCylinder] = []
         spools: list[Number] = []
-        chambers: list[tuple[Chamber, Chamber]] = []
-        drawn: Number = 0.0
-        returned: Number = 0.0
-        stored: Number = 0.0
-        lost: Number = 0.0
-        kept: Number = 0.0
-        for i in range(len(self.joints)):
-            start = len(_COMMON) + WIDTH * i
-            row = numbers[start : start + WIDTH]
-            own = state[self._offsets[i] : self._offsets[i + 1]]
-            part = dict(zip(FIELDS, row, strict=False))
-            spool, spool_rates = self._spool(i, part, own, signals[i])
-            function = DrivenCylinder(
-                common, row, supply, tank, spool, x[i], v[i], own, self._compliant[i]
-            )
+        moved: list[list[Number]] = []
+        for i, (cylinder, valve, _) in enumerate(self._parts):
+            spool, rate = spool_of(valve, rows[i], own, signals[i])
             spools.append(spool)
-            forces.append(function.force)
-            chambers.append(function.chambers)
-            rates += [*(side.slope for side in function.chambers), *function.spring_rate]
-            rates += spool_rates
-            drawn, returned = drawn + function.drawn, returned + function.returned
-            lost = lost + function.lost
-            for side in function.chambers:
-                stored, kept = stored + side.net, kept + side.pressure * side.net
-            stored, kept = stored + function.spring_flow, kept + function.spring_power
-        pumped = drawn
-        if self._limited:
-            pumped = common["pump_flow"] * clipped(
-                (common["pump"] - supply) * common["per_droop"], 0.0, 1.0
+            moved.append(rate)
+            mine = state[self.starts[i] : self.ends[i]]
+            functions.append(
+                DrivenCylinder(common, rows[i], cylinder, valve, spool, x[i], v[i], mine)
             )
-            net = pumped - drawn
-            rates.append(net / common["line"])
-            stored, kept = stored + net, kept + supply * net
-        work = supply * pumped - tank * returned
-        rates += [pumped, returned, stored, work, lost, kept]
-        return Instant(forces, rates, spools, chambers, supply, tank)
+            pressures |= functions[i].nodes
+        fed = {name: [one for one in functions if one.valve.supply == name] for name in pressures}
+        loads = {
+            name: _highest(functions, tank)
+            for name, functions in fed.items()
+            if functions and self._senses(name, functions)
+        }
+        opened = {one.joint: one.opened for one in functions}
+        books = Books(pressures)
+        for name, element in self.hydraulics.elements.items():
+            books.enter([flow_of(name, element, others[name], pressures, opened)])
+        rates: list[Number] = []
+        stored: dict[str, Number] = {}
+        oil: Number = 0.0
+        heat: Number = 0.0
+        chambers: list[tuple[Chamber, Chamber]] = []
+        for one, rate in zip(functions, moved, strict=True):
+            backs = [pressures[one.valve.return_a], pressures[one.valve.return_b]]
+            load = loads.get(one.valve.supply, tank)
+            through = one.flows(pressures[one.valve.supply], backs, load)
+            through += one.around(tank)
+            books.enter(through)
+            hoses = nets_of((x for x in through if x.through not in INSIDE), one.nodes)
+            pair = [
+                one.chamber(side, hoses[node], books.nets[node])
+                for side, node in enumerate(one.nodes)
+            ]
+            chambers.append((pair[0], pair[1]))
+            rates += [*(side.slope for side in pair), *one.spring_rate, *rate]
+            for node, side in zip(one.nodes, pair, strict=True):
+                stored[node] = side.pressure * side.net
+                oil = oil + side.net
+            if one.spring_rate:
+                stored[f"{one.joint}.spring"] = one.spring_power
+                oil, heat = oil + one.spring_flow, heat + one.damped
+        speed: Number = own["engine"] if self._engine is not None else 1.0
+        pumps = {
+            name: Pump(
+                name, pump, pump_rows[name], pressures, loads.get(name, tank), fed[name], speed,
+                own.get(f"share_{name}"),
+            )
+            for name, pump in self.pumps.items()
+        }  # fmt: skip
+        for pump in pumps.values():
+            books.enter(pump.flows)
+        for name in self.hydraulics.sources:
+            if name not in pumps:  # that keeps its pressure whatever is drawn
+                books.enter([Flow(TANK, name, -books.nets[name], "pump")])
+        for name in (*pumps, *lines):
+            soft, net = pump_rows[name]["line"] if name in pumps else lines[name], books.nets[name]
+            if self.hydraulics.oil.air > 0:
+                soft = softness_of(common, soft / common["oil"], 0.0, 0.0, pressures[name])
+            rates += [net / soft, *(pumps[name].share_rate if name in pumps else ())]
+            stored[name], oil = pressures[name] * net, oil + net
+        for name, gas in gases.items():
+            net = books.nets[name]
+            slopes, cooled = gas_of(gas, pressures[name], net, own.get(f"oil_{name}"))
+            rates += slopes
+            stored[name], oil = pressures[name] * net - cooled, oil + net
+            heat = heat + cooled
+        if self._engine is not None:
+            turned: Number = 0.0
+            for pump in pumps.values():
+                turned = turned + pump.torque
+            share = clipped((1.0 + engine["droop"] - speed) * engine["per_droop"], 0.0, 1.0)
+            left = engine["torque"] * share - turned / engine["speed"]
+            rates.append(left * engine["per_inertia"])
+        kept: Number = 0.0
+        for power in stored.values():
+            kept = kept + power
+        work = books.work - tank * books.returned
+        rates += [books.pumped, books.returned, oil, work, books.lost + heat, kept]
+        return Instant(
+            [one.force for one in functions], rates, spools, chambers, pressures[MAIN], tank,
+            pressures, books.flows, pumps, speed, stored,
+            {one.joint: one.damped for one in functions if one.spring_rate},
+        )  # fmt: skip
 
-    def _spool(
-        self, i: int, part: dict[str, Number], own: Sequence[Number], signal: Number
-    ) -> tuple[Number, list[Number]]:
-        """Position u and the rates of its states: u'' = w^2 (wanted - u) - 2 d w u'."""
-        wanted = clipped((signal - part["neutral"]) * part["per_signal"], -1.0, 1.0)
-        if not self._sluggish[i]:
-            return wanted, []
-        spool, speed = own[-2:]
-        w = part["bandwidth"]
-        rate = part["rate"]
-        moved = speed
-        if rate != 0.0:
-            moved = clipped(speed, -rate, rate)
-        pull = w * (w * (wanted - spool) - 2.0 * part["spool_damping"] * speed)
-        return spool, [moved, pull]
+    def _senses(self, name: str, functions: Sequence[DrivenCylinder]) -> bool:
+        """Whether somebody asks for the highest load of a pump's valves."""
+        pump = self.hydraulics.sources.get(name)
+        return any(one.valve.sharing for one in functions) or (
+            pump is not None and pump.control == "load-sensing"
+        )
+
+
+def _highest(functions: Sequence[DrivenCylinder], tank: Number) -> Number:
+    loads = [one.sensed(tank) for one in functions]
+    out = loads[0]
+    for load in loads[1:]:
+        out = maximum(out, load)
+    return out

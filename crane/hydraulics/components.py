@@ -2,67 +2,16 @@
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 
-from crane.common.errors import InputError
+from crane.common.errors import InputError, known
 from crane.common.magnitudes import meant
-from crane.common.samples import as_number
+from crane.hydraulics.curve import Curve
+from crane.hydraulics.elements import Accumulator, Element, Line
+from crane.hydraulics.numbers import PartError, above, check_numbers, positive, signed
+from crane.hydraulics.sources import MAIN, TANK, Engine, Supply, check_summed
 
 HOLDING = ("counterbalance_a", "counterbalance_b")  # valves of a cylinder that hold its load
-_NOT_NUMBERS = ("joint", *HOLDING)
-_LEAST = 1e-50  # of what must be positive: one over its square is still a number
-
-
-class PartError(InputError):
-    """A number of a part of the circuit that cannot be.
-
-    Args:
-        key: Its name.
-        message: See `CraneError`.
-    """
-
-    def __init__(self, key: str, message: str):
-        super().__init__(message)
-        self.key = key
-
-
-def number_names(kind: type) -> list[str]:
-    """Names of the numbers of a kind of part."""
-    return [entry.name for entry in fields(kind) if entry.name not in _NOT_NUMBERS]
-
-
-def check_numbers(item: object, what: str) -> None:
-    """Raise for numbers of a part that are not finite, negative, or zero where that cannot be.
-
-    What a field allows is in its metadata: "above" (0) or "signed"; anything else is at least 0.
-    """
-    for entry in fields(item):  # type: ignore[arg-type]
-        value = getattr(item, entry.name)
-        if not isinstance(value, int | float):
-            continue
-        number = as_number(value, f"{entry.name} of {what}", "")
-        positive = bool(entry.metadata.get("positive"))
-        if entry.metadata.get("signed") or number >= (_LEAST if positive else 0.0):
-            continue
-        wanted = "must be positive" if positive else "must not be < 0"
-        if number > 0:
-            wanted = f"must be at least {_LEAST:g}"
-        raise PartError(entry.name, f"{entry.name} of {what} is {number:g}, it {wanted}")
-
-
-def positive() -> float:
-    """A field without a default that must be above 0."""
-    return field(metadata={"positive": True})
-
-
-def above(default: float) -> float:
-    """A field with a default that must be above 0."""
-    return field(default=default, metadata={"positive": True})
-
-
-def signed(default: float) -> float:
-    """A field with a default, of either sign."""
-    return field(default=default, metadata={"signed": True})
 
 
 @dataclass(frozen=True)
@@ -75,6 +24,7 @@ class Oil:
         steel_modulus: The same of the cylinders' walls [Pa]; 0 for rigid ones.
         vapour_pressure: Below which no chamber falls [Pa].
         gas_exponent: Of the polytropic change of entrapped gas.
+        air: Share of a volume that free air in the oil has at 1e5 Pa.
     """
 
     bulk_modulus: float = above(1.65e9)
@@ -82,41 +32,10 @@ class Oil:
     steel_modulus: float = 0.0
     vapour_pressure: float = 1.0e3
     gas_exponent: float = above(1.4)
+    air: float = 0.0
 
     def __post_init__(self) -> None:
         check_numbers(self, "the oil")
-
-
-@dataclass(frozen=True)
-class Supply:
-    """Pump and tank.
-
-    Attributes:
-        pressure: That the pump keeps [Pa].
-        tank: Pressure of the return line [Pa].
-        flow: The most that the pump delivers [m3/s]; 0 for as much as is asked for.
-        droop: By how much the pressure falls from no flow to all of it [Pa].
-        volume: Of the line between pump and valves [m3].
-    """
-
-    pressure: float
-    tank: float = 1.0e5
-    flow: float = 0.0
-    droop: float = above(2.0e5)
-    volume: float = above(2.0e-3)
-
-    def __post_init__(self) -> None:
-        check_numbers(self, "the supply")
-        if self.pressure <= self.tank:
-            raise PartError(
-                "pressure",
-                f"pressure of the supply is {self.pressure:g} Pa, not above the tank's "
-                f"{self.tank:g} Pa, so that nothing would flow"
-                + (
-                    meant("pressure", self.pressure)
-                    or ", give a little more for a pump that rests"
-                ),
-            )
 
 
 @dataclass(frozen=True)
@@ -172,6 +91,12 @@ class Cylinder:
         damping: Of a damper beside that spring [N s/m] or [N m s/rad].
         counterbalance_a: Load-holding valve at chamber A.
         counterbalance_b: At chamber B.
+        cross_relief: Pressure of one chamber over the other at which the one is relieved into it
+            [Pa], by `relief_gain`; 0 for no such valves.
+        rupture_a: Flow out of chamber A at which its hose rupture valve holds [m3/s]; 0 for none.
+        rupture_b: Of chamber B.
+        motor: Whether it is a motor: its volumes do not change with the angle, and the joint needs
+            no limits.
     """
 
     joint: str
@@ -193,6 +118,10 @@ class Cylinder:
     damping: float = above(1.0e5)
     counterbalance_a: Counterbalance | None = None
     counterbalance_b: Counterbalance | None = None
+    cross_relief: float = 0.0
+    rupture_a: float = 0.0
+    rupture_b: float = 0.0
+    motor: bool = False
 
     def __post_init__(self) -> None:
         check_numbers(self, f"the cylinder of '{self.joint}'")
@@ -212,7 +141,14 @@ class Valve:
 
     With a margin the inlets c1, c4 are pressure compensated: the pressure drop is at most that
     margin, so the flow is c1 y sqrt(margin) until the supply no longer suffices; nothing flows
-    back into the supply.
+    back into the supply. With `sharing` the compensator stands behind the inlet and takes the
+    pressure there to that of the highest load of the supply's valves, p_LS: the flow is
+    c1 y sqrt(p_S - p_LS), which falls by one share in all such valves when the pump has no more.
+
+    Edges may have curves: c1 is the coefficient of the wide open edge then, and c1 curve(|u|)
+    stands for c1 y. An open centre lets the pump's flow pass while the spool rests; those of a
+    supply's valves are in series. Beyond `float_from` of the negative stroke both chambers are
+    joined to the tank and the inlet closes. Regeneration leads what leaves B into A while y > 0.
 
     Attributes:
         joint: Its cylinder's joint.
@@ -227,6 +163,17 @@ class Valve:
         bandwidth: Natural frequency of the spool [rad/s]; 0 for a spool without inertia.
         damping: Its damping ratio.
         rate: The fastest it moves, in strokes (of u from 0 to 1) per second; 0 for no limit.
+        hysteresis: Width of the play between signal and spool, as a share of the stroke.
+        centre: Coefficient of the open centre at rest [m3/(s Pa^0.5)]; 0 for a closed one.
+        regeneration: Coefficient of the check valve from B to A [m3/(s Pa^0.5)]; 0 for none.
+        float_from: |u| beyond which a negative spool floats; 0 for none.
+        float_coefficient: Of either way to the tank then [m3/(s Pa^0.5)].
+        demand: Share of the pump's flow that the wide open valve asks of a positive control.
+        sharing: Whether the compensator stands behind the inlet.
+        supply: Name of the pump that feeds it.
+        return_a: Node that chamber A is drained to.
+        return_b: Chamber B.
+        curves: By "c1" to "c4" and "centre", share of the coefficient over |u|.
     """
 
     joint: str
@@ -241,10 +188,32 @@ class Valve:
     bandwidth: float = 0.0
     damping: float = above(1.0)
     rate: float = 0.0
+    hysteresis: float = 0.0
+    centre: float = 0.0
+    regeneration: float = 0.0
+    float_from: float = 0.0
+    float_coefficient: float = 0.0
+    demand: float = 1.0
+    sharing: bool = False
+    supply: str = MAIN
+    return_a: str = TANK
+    return_b: str = TANK
+    curves: Mapping[str, Curve] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         what = f"the valve of '{self.joint}'"
         check_numbers(self, what)
+        if self.sharing and self.margin:
+            raise PartError("margin", f"{what} shares its flow, leave 'margin' to the pump")
+        if (self.float_from > 0) != (self.float_coefficient > 0) or self.float_from >= 1:
+            raise PartError(
+                "float_from",
+                f"{what} floats from {self.float_from:g} with the coefficient "
+                f"{self.float_coefficient:g}, give both, from below 1",
+            )
+        if self.hysteresis >= 0.5:
+            raise PartError("hysteresis", f"hysteresis of {what} is {self.hysteresis:g}, give a "
+                            "share of the stroke, below 0.5")  # fmt: skip
         if self.full == self.neutral:
             text = f"full and neutral of {what} are both {self.full:g}, give two"
             raise PartError("full", text)
@@ -291,6 +260,11 @@ class Hydraulics:
         cylinders: By joint, in the order of the active joints.
         valves: By joint, in the same order.
         control: Gains of the valves' controllers, by joint; of all or of none.
+        supplies: Further pumps, by their nodes' names.
+        engine: That turns all pumps; they have constant speed without.
+        lines: Further nodes by name.
+        accumulators: Likewise.
+        elements: Between nodes, by name.
     """
 
     supply: Supply
@@ -298,11 +272,46 @@ class Hydraulics:
     cylinders: Mapping[str, Cylinder]
     valves: Mapping[str, Valve]
     control: Mapping[str, PDGains] = field(default_factory=dict)
+    supplies: Mapping[str, Supply] = field(default_factory=dict)
+    engine: Engine | None = None
+    lines: Mapping[str, Line] = field(default_factory=dict)
+    accumulators: Mapping[str, Accumulator] = field(default_factory=dict)
+    elements: Mapping[str, Element] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         check_tank(self.supply, self.oil)
         for cylinder in self.cylinders.values():
             check_relief(self.supply, cylinder)
+        check_summed(self.sources)
+        nodes = self.nodes
+        if len({*nodes}) < len(nodes):
+            twice = next(name for name in nodes if nodes.count(name) > 1)
+            raise InputError(f"two nodes are called '{twice}', give them names")
+        for joint, valve in self.valves.items():
+            if valve.supply not in self.sources:
+                raise InputError(
+                    f"valve of '{joint}' is fed by '{valve.supply}', "
+                    f"{known(self.sources, valve.supply)}"
+                )
+            _known_nodes(nodes, f"valve of '{joint}'", valve.return_a, valve.return_b)
+        for name, element in self.elements.items():
+            _known_nodes(nodes, f"element '{name}'", element.source, element.target)
+            for joint in element.joints:
+                if joint not in self.valves:
+                    raise InputError(
+                        f"element '{name}' is opened by '{joint}', {known(self.valves, joint)}"
+                    )
+
+    @property
+    def sources(self) -> dict[str, Supply]:
+        """All pumps by their nodes' names."""
+        return {MAIN: self.supply, **self.supplies}
+
+    @property
+    def nodes(self) -> list[str]:
+        """Names of all nodes: tank, pumps, lines, accumulators, chambers JOINT.a and JOINT.b."""
+        own = [*self.sources, *self.lines, *self.accumulators]
+        return [TANK, *own, *(f"{joint}.{side}" for joint in self.cylinders for side in "ab")]
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -314,13 +323,27 @@ class Hydraulics:
         kept = [joint for joint in joints if joint in self.cylinders]
         if not kept:
             return None
-        return Hydraulics(
-            self.supply,
-            self.oil,
-            {joint: self.cylinders[joint] for joint in kept},
-            {joint: self.valves[joint] for joint in kept},
-            {joint: self.control[joint] for joint in kept if self.control},
+        gone = {
+            f"{joint}.{side}" for joint in self.cylinders if joint not in kept for side in "ab"
+        }
+        return replace(
+            self,
+            cylinders={joint: self.cylinders[joint] for joint in kept},
+            valves={joint: self.valves[joint] for joint in kept},
+            control={joint: self.control[joint] for joint in kept if self.control},
+            elements={
+                name: replace(x, joints=tuple(joint for joint in x.joints if joint in kept))
+                for name, x in self.elements.items()
+                if not gone & {x.source, x.target}
+                and (not x.joints or any(joint in kept for joint in x.joints))
+            },
         )
+
+
+def _known_nodes(nodes: list[str], what: str, *names: str) -> None:
+    for name in names:
+        if name not in nodes:
+            raise InputError(f"{what} leads to '{name}', {known(nodes, name)}")
 
 
 def check_tank(supply: Supply, oil: Oil) -> None:

@@ -1,20 +1,25 @@
 """One valve and its cylinder: flows, pressures, force, equations (20) to (23)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from crane.codegen import Number, maximum
-from crane.codegen.scalar import apply, where_positive
+from crane.codegen.scalar import minimum, where_positive
 from crane.hydraulics.components import Counterbalance, Cylinder, Valve
-from crane.hydraulics.flow import clipped, in_series, root, through
+from crane.hydraulics.flow import Flow, clipped, in_series, root, through
+from crane.hydraulics.nodes import softness_of
+from crane.hydraulics.sources import TANK
 
-GAS_PRESSURE = 1.0e5  # at which volumes of entrapped gas are given [Pa]
+INSIDE = ("piston", "cross")  # flows that pass no hose
+_PER_SENSED = 100.0  # one over the opening at which a valve reports all of its load
+_PLAY = 500.0  # [1/s], at which a signal takes its play along
 _SLIGHT = 0.1  # of the hose's volume, the least that a chamber holds
 FIELDS = (
     "area_a", "area_b", "hose_a", "hose_b", "gas_a", "gas_b", "leakage", "leakage_a", "leakage_b",
     "relief", "relief_gain", "refill", "cushion", "cushion_resistance", "stiffness", "damping",
     "stroke", "c1", "c2", "c3", "c4", "margin", "neutral", "per_signal", "dead_band", "per_stroke",
-    "bandwidth", "spool_damping", "rate",
+    "bandwidth", "spool_damping", "rate", "cross_relief", "rupture_a", "rupture_b", "centre",
+    "regeneration", "float_from", "per_float", "float_coefficient", "demand", "hysteresis",
 )  # fmt: skip
 _HOLDING = ("pressure", "pilot_ratio", "per_range", "coefficient")
 WIDTH = len(FIELDS) + 2 * len(_HOLDING)
@@ -28,7 +33,7 @@ class Chamber:
         pressure: [Pa].
         volume: [m3].
         area: [m2], [m3/rad].
-        valve: Flow through the valve into it [m3/s].
+        valve: Flow through its hose into it [m3/s].
         net: Flow into it less what its volume grows by [m3/s].
         slope: Rate of the state that stands for its pressure [Pa/s].
     """
@@ -42,43 +47,44 @@ class Chamber:
 
 
 class DrivenCylinder:
-    """One valve and its cylinder at an instant.
+    """One valve and its cylinder or motor at an instant.
 
     Args:
-        common: Numbers of oil and supply.
+        common: Numbers of the oil.
         numbers: `row_of` the parts, as floats or traced.
-        supply: Pressure [Pa].
-        tank: Pressure [Pa].
+        cylinder: What it is.
+        valve: Likewise.
         spool: Position u.
         x: Coordinate above the lower limit [m], [rad].
         v: Its rate [m/s], [rad/s].
         own: States: those of the pressures in A and B, then the series spring's compression.
-        compliant: Whether there is such a spring.
 
     Attributes:
+        joint: Whose cylinder it is.
+        valve: Its valve.
+        pressures: Of A and B [Pa].
+        opened: Openings y of the spool on its positive and its negative side.
         force: Of the cylinder, equation (20) [N], [N m].
-        chambers: A and B.
-        drawn: Flow from the supply [m3/s].
-        returned: Flow to the tank [m3/s].
-        lost: Power that throttles, leaks and the series damper turn into heat [W].
         spring_rate: Rate of the series spring's compression, if there is one.
         spring_power: What goes into it [W].
         spring_flow: What both chambers grow by as it gives way [m3/s].
+        damped: What its damper turns into heat [W].
     """
 
     def __init__(
         self,
         common: dict[str, Number],
         numbers: Sequence[Number],
-        supply: Number,
-        tank: Number,
+        cylinder: Cylinder,
+        valve: Valve,
         spool: Number,
         x: Number,
         v: Number,
         own: Sequence[Number],
-        compliant: bool,
     ):
         self._common, width = common, len(_HOLDING)
+        self._cylinder, self.valve, self._own, self._spool = cylinder, valve, own, spool
+        self.joint = cylinder.joint
         part = self._part = dict(zip(FIELDS, numbers[: len(FIELDS)], strict=True))
         ends = [len(FIELDS) + side * width for side in range(3)]
         self._holding = [
@@ -86,14 +92,14 @@ class DrivenCylinder:
             for start, end in zip(ends, ends[1:], strict=False)
         ]
         vapour = common["vapour"]
-        pressures = [vapour + maximum(own[side], 0.0) for side in range(2)]
-        areas = [part["area_a"], part["area_b"]]
+        pressures = self.pressures = [vapour + maximum(own[side], 0.0) for side in range(2)]
+        areas = self._areas = [part["area_a"], part["area_b"]]
         self.force = areas[0] * pressures[0] - areas[1] * pressures[1]
         self.spring_rate: list[Number] = []
         self.spring_power: Number = 0.0
         self.spring_flow: Number = 0.0
-        damped: Number = 0.0
-        if compliant:
+        self.damped: Number = 0.0
+        if cylinder.stiffness > 0:
             # massless: the spring and its damper carry the cylinder's force
             pressing = part["stiffness"] * own[2]
             squeezed = (self.force - pressing) / part["damping"]
@@ -101,77 +107,180 @@ class DrivenCylinder:
             self.spring_rate = [squeezed]
             self.spring_power = pressing * squeezed
             self.spring_flow = (areas[0] - areas[1]) * squeezed
-            damped = part["damping"] * squeezed * squeezed
-        open_positive = clipped((spool - part["dead_band"]) * part["per_stroke"], 0.0, 1.0)
-        open_negative = clipped((-spool - part["dead_band"]) * part["per_stroke"], 0.0, 1.0)
-        past = part["leakage"] * (pressures[0] - pressures[1])
-        self.drawn: Number = 0.0
-        self.returned: Number = 0.0
-        self.lost = past * (pressures[0] - pressures[1]) + damped
-        sides: list[Chamber] = []
+            self.damped = part["damping"] * squeezed * squeezed
+        self._left = [x, part["stroke"] - x]
+        self._v = v
+        self.opened = [
+            clipped((side - part["dead_band"]) * part["per_stroke"], 0.0, 1.0)
+            for side in (spool, -spool)
+        ]
+
+    @property
+    def nodes(self) -> dict[str, Number]:
+        """Pressures of its chambers by their nodes' names."""
+        return {f"{self.joint}.{side}": p for side, p in zip("ab", self.pressures, strict=True)}
+
+    @property
+    def demand(self) -> Number:
+        """Share of its pump's flow that a positive control gives for it."""
+        return self._part["demand"] * maximum(*self.opened)
+
+    def sensed(self, tank: Number) -> Number:
+        """Pressure that its valve reports as its load, the tank's while it is closed [Pa]."""
+        shares = [clipped(y * _PER_SENSED, 0.0, 1.0) for y in self.opened]
+        loads = [share * (p - tank) for share, p in zip(shares, self.pressures, strict=True)]
+        return tank + maximum(*loads)
+
+    def centre(self) -> Number:
+        """Coefficient of its open centre."""
+        size = maximum(self._spool, -self._spool)
+        if (curve := self.valve.curves.get("centre")) is not None:
+            return self._part["centre"] * curve.at(size)
+        return self._part["centre"] * (1.0 - maximum(*self.opened))
+
+    def flows(self, supply: Number, backs: Sequence[Number], load: Number) -> list[Flow]:
+        """All through its valve and past its piston.
+
+        Args:
+            supply: Pressure of what feeds it [Pa].
+            backs: Those of what A and B are drained to [Pa].
+            load: Highest load of the valves beside it, where it shares its flow [Pa].
+        """
+        part, valve = self._part, self.valve
+        nodes = list(self.nodes)
+        node_a, node_b = nodes
+        one, other = self.pressures
+        across = one - other
+        found = [Flow(node_a, node_b, part["leakage"] * across, "piston")]
+        if self._cylinder.cross_relief > 0:
+            for source, target, sign in ((node_a, node_b, 1.0), (node_b, node_a, -1.0)):
+                over = maximum(sign * across - part["cross_relief"], 0.0)
+                found.append(Flow(source, target, part["relief_gain"] * over, "cross"))
+        if valve.regeneration > 0:
+            rate = part["regeneration"] * self.opened[0] * root(maximum(-across, 0.0))
+            found.append(Flow(node_b, node_a, rate, "regeneration"))
+        floats: Number = 0.0
+        if valve.float_from > 0:
+            floats = clipped((-self._spool - part["float_from"]) * part["per_float"], 0.0, 1.0)
         for side, name in enumerate("ab"):
-            p, other, area = pressures[side], pressures[1 - side], areas[side]
-            left = x if side == 0 else part["stroke"] - x
-            inlet = part["c1"] * open_positive if side == 0 else part["c4"] * open_negative
-            outlet = part["c3"] * open_negative if side == 0 else part["c2"] * open_positive
-            fed = self._inflow(supply - p, inlet, side, p, other, left)
-            drained = -through(
-                tank - p, outlet, in_series(outlet, *self._obstacles(side, p, other, left))
-            )
-            drained = drained + part[f"leakage_{name}"] * (p - tank)
-            if part["relief"] != 0.0:
-                drained = drained + part["relief_gain"] * maximum(p - part["relief"], 0.0)
-            if part["refill"] != 0.0:
-                drained = drained - part["refill"] * root(maximum(tank - p, 0.0))
-            self.drawn, self.returned = self.drawn + fed, self.returned + drained
-            self.lost = self.lost + fed * (supply - p) + drained * (p - tank)
-            sign = 1.0 if side == 0 else -1.0
-            net = fed - drained - sign * past - sign * area * v
-            hose = part[f"hose_{name}"]
-            volume = maximum(hose + area * left, _SLIGHT * hose)
-            softness = self._softness(volume, hose, part[f"gas_{name}"], p)
-            middle = common["oil"] * (hose + 0.5 * area * part["stroke"])
-            slope = net / where_positive(own[side], softness, middle)
-            sides.append(Chamber(p, volume, area, fed - drained, net, slope))
-        self.chambers = (sides[0], sides[1])
+            p, back, node = self.pressures[side], backs[side], nodes[side]
+            to = valve.return_a if side == 0 else valve.return_b
+            inlet = self._edge(*(("c1", 0) if side == 0 else ("c4", 1)))
+            if valve.float_from > 0 and side == 1:
+                inlet = inlet * (1.0 - floats)
+            outlet = self._edge(*(("c3", 1) if side == 0 else ("c2", 0)))
+            fed, drop = self._inflow(supply, inlet, side, load)
+            found.append(Flow(valve.supply, node, fed, "inlet", drop))
+            drained = -through(back - p, outlet, in_series(outlet, *self._obstacles(side)))
+            if (self._cylinder.rupture_a, self._cylinder.rupture_b)[side] > 0:
+                drained = minimum(drained, part[f"rupture_{name}"])
+            found.append(Flow(node, to, drained, "outlet"))
+            if valve.float_from > 0:
+                rate = part["float_coefficient"] * floats * root(p - back)
+                found.append(Flow(node, to, rate, "float"))
+        return found
+
+    def around(self, tank: Number) -> list[Flow]:
+        """Leaks, relief and suction valves of both chambers."""
+        part, found = self._part, []
+        for side, name in enumerate("ab"):
+            p, node = self.pressures[side], f"{self.joint}.{name}"
+            found.append(Flow(node, TANK, part[f"leakage_{name}"] * (p - tank), "leak"))
+            if self._cylinder.relief > 0:
+                rate = part["relief_gain"] * maximum(p - part["relief"], 0.0)
+                found.append(Flow(node, TANK, rate, "relief"))
+            if self._cylinder.refill > 0:
+                rate = part["refill"] * root(maximum(tank - p, 0.0))
+                found.append(Flow(TANK, node, rate, "refill"))
+        return found
+
+    def chamber(self, side: int, valve: Number, inflow: Number) -> Chamber:
+        """A chamber that gets flows.
+
+        Args:
+            side: 0 of A, 1 of B.
+            valve: Through its hose [m3/s].
+            inflow: In all [m3/s].
+        """
+        part, p, area = self._part, self.pressures[side], self._areas[side]
+        sign = 1.0 if side == 0 else -1.0
+        net = inflow - sign * area * self._v
+        hose = part["hose_a" if side == 0 else "hose_b"]
+        gas = part["gas_a" if side == 0 else "gas_b"]
+        volume, half = hose, hose
+        if not self._cylinder.motor:
+            volume = maximum(hose + area * self._left[side], _SLIGHT * hose)
+            half = hose + 0.5 * area * part["stroke"]
+        softness = softness_of(self._common, volume, hose, gas, p)
+        slope = net / where_positive(self._own[side], softness, self._common["oil"] * half)
+        return Chamber(p, volume, area, valve, net, slope)
+
+    def _edge(self, name: str, side: int) -> Number:
+        """Coefficient of an edge as far as it is open."""
+        if (curve := self.valve.curves.get(name)) is not None:
+            stroke = clipped(self._spool if side == 0 else -self._spool, 0.0, 1.0)
+            return self._part[name] * where_positive(stroke, curve.at(stroke), 0.0)
+        return self._part[name] * self.opened[side]
 
     def _inflow(
-        self, drop: Number, inlet: Number, side: int, p: Number, other: Number, left: Number
-    ) -> Number:
-        """From the supply; a compensator keeps the pressure drop and lets nothing back."""
-        margin = self._part["margin"]
-        if margin != 0.0:
-            return inlet * root(clipped(drop, 0.0, margin))
-        back = in_series(inlet, *self._obstacles(side, p, other, left))
-        return through(drop, inlet, back)
+        self, supply: Number, inlet: Number, side: int, load: Number
+    ) -> tuple[Number, Number | None]:
+        """From the supply, and the drop at the edge that meters it where another one follows.
 
-    def _obstacles(
-        self, side: int, p: Number, other: Number, left: Number
-    ) -> tuple[Number | None, Number]:
+        A compensator keeps the pressure drop and lets nothing back.
+        """
+        p, margin = self.pressures[side], self._part["margin"]
+        if self.valve.sharing:
+            drop = maximum(supply - maximum(load, p), 0.0)
+            return inlet * root(drop), drop
+        if self.valve.margin > 0:
+            drop = clipped(supply - p, 0.0, margin)
+            return inlet * root(drop), drop
+        return through(supply - p, inlet, in_series(inlet, *self._obstacles(side))), None
+
+    def _obstacles(self, side: int) -> tuple[Number | None, Number]:
         """In the way of the outflow: coefficient of the holding valve, 1 / c^2 of the cushion."""
-        holding = None
+        holding, p, other = None, self.pressures[side], self.pressures[1 - side]
         valve = self._holding[side]
-        if valve["coefficient"] != 0.0:
+        if (self._cylinder.counterbalance_a, self._cylinder.counterbalance_b)[side] is not None:
             raised = p + valve["pilot_ratio"] * other - valve["pressure"]
             holding = valve["coefficient"] * clipped(raised * valve["per_range"], 0.0, 1.0)
         cushion: Number = 0.0
-        if self._part["cushion"] != 0.0:
-            near = clipped(1.0 - left / self._part["cushion"], 0.0, 1.0)
+        if self._cylinder.cushion > 0:
+            near = clipped(1.0 - self._left[side] / self._part["cushion"], 0.0, 1.0)
             cushion = self._part["cushion_resistance"] * near * near
         return holding, cushion
 
-    def _softness(self, volume: Number, hose: Number, gas: Number, p: Number) -> Number:
-        """Volume per pressure, V / K = V / B_oil + (V - V_h) / B_steel + V_h / B_hose + gas's."""
-        common = self._common
-        soft = volume * common["oil"] + hose * common["hose"]
-        if common["steel"] != 0.0:
-            soft = soft + common["steel"] * maximum(volume - hose, 0.0)
-        if gas != 0.0:
-            # V = gas (p0 / p)^(1/n), -dV/dp = gas / (n p0) (p0 / p)^(1 + 1/n)
-            power = common["gas_power"]
-            thin = apply("log", maximum(p, 1.0) * (1.0 / GAS_PRESSURE))
-            soft = soft + gas * (power - 1.0) * (1.0 / GAS_PRESSURE) * apply("exp", -power * thin)
-        return soft
+
+def spool_of(
+    valve: Valve, numbers: Sequence[Number], own: Mapping[str, Number], signal: Number
+) -> tuple[Number, list[Number]]:
+    """A spool's position u, and the rates of its states: u'' = w^2 (wanted - u) - 2 d w u'.
+
+    With a play of width h what is wanted follows the signal by z' = rate (|signal - z| - h / 2)
+    beyond the play.
+
+    Args:
+        valve: What it is.
+        numbers: `row_of` it.
+        own: States by name.
+        signal: [V].
+    """
+    part, rates = dict(zip(FIELDS, numbers, strict=False)), []
+    wanted = clipped((signal - part["neutral"]) * part["per_signal"], -1.0, 1.0)
+    if valve.hysteresis > 0:
+        behind = own[f"play_{valve.joint}"]
+        gap, half = wanted - behind, 0.5 * part["hysteresis"]
+        rates.append(_PLAY * (gap - clipped(gap, -1.0 * half, half)))
+        wanted = behind
+    if not valve.bandwidth > 0:
+        return wanted, rates
+    spool, speed = own[f"spool_{valve.joint}"], own[f"spool_rate_{valve.joint}"]
+    w, moved = part["bandwidth"], speed
+    if valve.rate > 0:
+        moved = clipped(speed, -1.0 * part["rate"], part["rate"])
+    pull = w * (w * (wanted - spool) - 2.0 * part["spool_damping"] * speed)
+    return spool, [*rates, moved, pull]
 
 
 def row_of(cylinder: Cylinder, valve: Valve, stroke: float) -> list[float]:
@@ -189,6 +298,13 @@ def row_of(cylinder: Cylinder, valve: Valve, stroke: float) -> list[float]:
         "bandwidth": valve.bandwidth,
         "spool_damping": valve.damping,
         "rate": valve.rate,
+        "centre": valve.centre,
+        "regeneration": valve.regeneration,
+        "float_from": valve.float_from,
+        "per_float": 1.0 / (1.0 - valve.float_from),
+        "float_coefficient": valve.float_coefficient,
+        "demand": valve.demand,
+        "hysteresis": valve.hysteresis,
     }  # fmt: skip
     holding = [_holding(cylinder.counterbalance_a), _holding(cylinder.counterbalance_b)]
     return [*(float(values[name]) for name in FIELDS), *holding[0], *holding[1]]

@@ -1,8 +1,31 @@
 """Flow through orifices, from floats or traced numbers."""
 
+from typing import NamedTuple
+
 from crane.codegen.scalar import Number, apply, maximum, minimum, where_positive, with_sign_of
 
 LAMINAR = 1.0e4  # pressure drop below which an orifice's flow is smooth [Pa]
+
+
+class Flow(NamedTuple):
+    """What flows from one node to another.
+
+    Attributes:
+        source: Where it comes from.
+        target: Where it goes.
+        rate: [m3/s].
+        through: What it flows through: "inlet", "outlet", "leak", "relief", "refill", "bypass",
+            "regeneration", "float", "piston", "cross" (relief), "pump", "slip", or an element's
+            name.
+        drop: Of pressure at the edge that meters it, the rest is its compensator's [Pa]; None
+            where there is none.
+    """
+
+    source: str
+    target: str
+    rate: Number
+    through: str
+    drop: Number | None = None
 
 
 def root(drop: Number) -> Number:

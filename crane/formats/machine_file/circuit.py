@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import string
 import warnings
 from collections.abc import Callable
 from dataclasses import MISSING, fields
@@ -10,6 +11,7 @@ from typing import Any, TypeVar
 from crane.common.errors import CraneWarning, InputError, known
 from crane.common.magnitudes import doubt
 from crane.description.findings import FollowUpError, flag, recoverable
+from crane.formats.machine_file.curves import read_curve
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.hydraulics.components import (
@@ -18,22 +20,30 @@ from crane.hydraulics.components import (
     Cylinder,
     Hydraulics,
     Oil,
-    PartError,
     PDGains,
-    Supply,
     Valve,
     check_relief,
     check_tank,
-    number_names,
 )
+from crane.hydraulics.elements import Accumulator, Element, Line
+from crane.hydraulics.numbers import PartError, number_names
+from crane.hydraulics.sources import Engine, Supply
 
 Made = TypeVar("Made")
-Part = TypeVar("Part", Oil, Supply, Counterbalance, Cylinder, Valve, PDGains)
+Part = TypeVar("Part")
 
 _TOGETHER = ("tank", "relief")  # looked at with other parts
-_KINDS = ("orifice", "compensated")
+_NAME = set(string.ascii_letters + string.digits + "_")
+_KINDS = ("orifice", "compensated", "sharing")
 _COMPENSATED = ("flow", "margin", "meter_out")  # what only these have
 _EDGES = ("c1", "c2", "c3", "c4")
+_CURVED = (*_EDGES, "centre")
+_REGULATED = ("control", "summed")
+MOTOR = {  # keys, and what they are of `Cylinder`
+    "displacement": None, "gear": None, "volume": None,
+    **{name: name for name in ("leakage", "leakage_a", "leakage_b", "relief", "relief_gain",
+                               "cross_relief", "refill", "gas_a", "gas_b")},
+}  # fmt: skip
 
 
 def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) -> Hydraulics | None:
@@ -45,24 +55,27 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
     section = top.section("hydraulics", "'hydraulics'")
     if section is None:
         return None
-    section.only("supply", "oil", "cylinders", "valves", "control")
+    section.only(
+        "supply", "supplies", "engine", "oil", "lines", "accumulators", "elements", "cylinders",
+        "motors", "valves", "control",
+    )  # fmt: skip
     supply = None
     with recoverable():
         supply_section = section.section("supply", "'supply'")
         if supply_section is None:
             raise section.fail(None, "'hydraulics' has no 'supply', give its pressure")
-        supply_section.only(*number_names(Supply))
-        supply = _part(supply_section, Supply)
+        supply_section.only(*number_names(Supply), *_REGULATED)
+        supply = _supply(supply_section)
     oil = Oil()
     with recoverable():
         oil_section = section.section("oil", "'oil'")
         if oil_section is not None:
             oil_section.only(*number_names(Oil))
-            oil = _part(oil_section, Oil)
+            oil = part_of(oil_section, Oil)
     if supply is not None and supply_section is not None:
         with recoverable():
-            _checked(supply_section, check_tank, supply, oil)
-            _warn_of_unit(supply_section, "tank", supply.tank)
+            checked(supply_section, check_tank, supply, oil)
+            warn_of_unit(supply_section, "tank", supply.tank)
     named: dict[str, list[str]] = {"cylinder": [], "valve": [], "control": []}
     cylinders: dict[str, Cylinder] = {}
     keys = (*number_names(Cylinder), *HOLDING)
@@ -72,8 +85,17 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
             check_active(joint, item, active)
             cylinders[joint] = _cylinder(joint, item, tree)
             _check_relief(item, supply, cylinders[joint])
+    keys = tuple(MOTOR)
+    for joint, item in section.mappings("motors", "motor of", *keys):
+        named["cylinder"].append(joint)
+        with recoverable():
+            check_active(joint, item, active)
+            if joint in cylinders:
+                raise item.fail(None, f"'{joint}' has a cylinder and a motor, keep one of them")
+            cylinders[joint] = _motor(joint, item)
+            _check_relief(item, supply, cylinders[joint])
     valves: dict[str, Valve] = {}
-    given = (*number_names(Valve), "type", "flow", "meter_out")
+    given = (*number_names(Valve), "type", "flow", "meter_out", "supply", "return_a", "return_b")
     for joint, item in section.mappings("valves", "valve of", *given):
         named["valve"].append(joint)
         with recoverable():
@@ -88,21 +110,25 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
         named["control"].append(joint)
         with recoverable():
             check_active(joint, item, active)
-            control[joint] = _part(item, PDGains)
+            control[joint] = part_of(item, PDGains)
     if named["control"] and set(named["control"]) != set(named["cylinder"]):
         listed = ", ".join(named["cylinder"])
         flag(section.fail("control", f"give gains of all of {listed}, or none"))
     if not named["cylinder"]:
         flag(section.fail(None, "'hydraulics' drives nothing, give cylinders and valves"))
+    others = read_network(section)
     if supply is None or not cylinders.keys() == valves.keys() <= set(active):
         raise FollowUpError("the circuit is not complete")
     order = [joint for joint in active if joint in cylinders]
-    return Hydraulics(
+    return checked(
+        section,
+        Hydraulics,
         supply,
         oil,
         {joint: cylinders[joint] for joint in order},
         {joint: valves[joint] for joint in order},
         {joint: control[joint] for joint in order if control},
+        **others,
     )
 
 
@@ -120,23 +146,24 @@ def _turns(tree: TreeBuilder, joint: str) -> bool:
     return joint in tree.joints and tree.joints[joint].kind == "revolute"
 
 
-def _part(section: Section, kind: type[Part], turning: bool = False, **given: Any) -> Part:
+def part_of(section: Section, kind: type[Part], turning: bool = False, **given: Any) -> Part:
     """A part whose remaining numbers stand in a section."""
-    own = [x for x in fields(kind) if x.name in number_names(kind) and x.name not in given]
+    numbers: Any = fields(kind)  # type: ignore[arg-type]
+    own = [x for x in numbers if x.name in number_names(kind) and x.name not in given]
     for entry in own:
         least = -math.inf if entry.metadata.get("signed") else 0.0
         if entry.default is MISSING:
             given[entry.name] = section.number(entry.name, minimum=least)
         else:
             given[entry.name] = section.number(entry.name, float(entry.default), minimum=least)
-    part = _checked(section, kind, **given)
+    part = checked(section, kind, **given)
     for entry in own:
         if entry.name in section and entry.name not in _TOGETHER:
-            _warn_of_unit(section, entry.name, given[entry.name], turning)
+            warn_of_unit(section, entry.name, given[entry.name], turning)
     return part
 
 
-def _checked(section: Section, make: Callable[..., Made], *items: object, **given: Any) -> Made:
+def checked(section: Section, make: Callable[..., Made], *items: object, **given: Any) -> Made:
     """What is made of a section's numbers, or its error with file and line."""
     try:
         return make(*items, **given)
@@ -146,7 +173,7 @@ def _checked(section: Section, make: Callable[..., Made], *items: object, **give
         raise section.fail(None, str(error)) from None
 
 
-def _warn_of_unit(section: Section, key: str, value: float, turning: bool = False) -> None:
+def warn_of_unit(section: Section, key: str, value: float, turning: bool = False) -> None:
     """Warn of a number that can be, and hardly is in its SI unit."""
     if text := doubt(key, value, turning):
         what = f"{section.where(key)}: '{key}' of {section.title} {text}"
@@ -157,8 +184,8 @@ def _check_relief(section: Section, supply: Supply | None, cylinder: Cylinder) -
     """A cylinder's relief beside the supply, which may have been refused."""
     if supply is None:
         return
-    _checked(section, check_relief, supply, cylinder)
-    _warn_of_unit(section, "relief", cylinder.relief)
+    checked(section, check_relief, supply, cylinder)
+    warn_of_unit(section, "relief", cylinder.relief)
     if 0 < cylinder.relief <= supply.pressure and not doubt("relief", cylinder.relief):
         what = (
             f"{section.where('relief')}: 'relief' of {section.title} is {cylinder.relief:g} Pa, "
@@ -173,7 +200,7 @@ def _cylinder(joint: str, item: Section, tree: TreeBuilder) -> Cylinder:
         problem = f"joint '{joint}' {lack}, a cylinder needs the limits of its stroke"
         flag(item.fail(None, problem))
     turning = _turns(tree, joint)
-    return _part(item, Cylinder, turning, joint=joint, **_holding(item))
+    return part_of(item, Cylinder, turning, joint=joint, **_holding(item))
 
 
 def _holding(item: Section) -> dict[str, Counterbalance]:
@@ -182,8 +209,67 @@ def _holding(item: Section) -> dict[str, Counterbalance]:
         section = item.section(name, f"'{name}'")
         if section is not None:
             section.only(*number_names(Counterbalance))
-            found[name] = _part(section, Counterbalance)
+            found[name] = part_of(section, Counterbalance)
     return found
+
+
+def _supply(section: Section) -> Supply:
+    given: dict[str, Any] = {"control": section.text("control", "pressure")}
+    if "summed" in section:
+        given["summed"] = section.names("summed")
+    return part_of(section, Supply, **given)
+
+
+def _motor(joint: str, item: Section) -> Cylinder:
+    """A motor by its displacement per turn of its own shaft, whose joint the gear turns slower."""
+    displacement = item.number("displacement", minimum=0.0)
+    gear = item.number("gear", 1.0, minimum=0.0)
+    volume = item.number("volume", minimum=0.0)
+    for key, value in (("displacement", displacement), ("gear", gear), ("volume", volume)):
+        if value == 0:
+            raise item.fail(key, f"'{key}' of {item.title} is 0, give it")
+        warn_of_unit(item, key, value)
+    given: dict[str, Any] = dict.fromkeys(("area_a", "area_b"), displacement * gear)
+    given |= dict.fromkeys(("hose_a", "hose_b"), volume)
+    return part_of(item, Cylinder, joint=joint, motor=True, **given)
+
+
+def read_network(section: Section) -> dict[str, Any]:
+    """What a circuit has beside first pump, cylinders and valves, by fields of `Hydraulics`."""
+    found: dict[str, Any] = {}
+    for key, title, kind in (
+        ("supplies", "supply", Supply), ("lines", "line", Line),
+        ("accumulators", "accumulator", Accumulator), ("elements", "element", Element),
+    ):  # fmt: skip
+        parts: dict[str, Any] = {}
+        more = {Supply: _REGULATED, Element: ("type", "from", "to", "joints", "side")}
+        keys = [name for name in number_names(kind) if (kind, name) != (Supply, "tank")]
+        for name, item in section.mappings(key, title, *keys, *more.get(kind, ())):
+            with recoverable():
+                if not name or not set(name) <= _NAME:
+                    raise item.fail(None, f"a {title} is called '{name}', use letters, digits, _")
+                parts[name] = (
+                    _element(item)
+                    if kind is Element
+                    else (_supply(item) if kind is Supply else part_of(item, kind))
+                )
+        found[key] = parts
+    engine = section.section("engine", "'engine'")
+    if engine is not None:
+        with recoverable():
+            engine.only(*number_names(Engine))
+            found["engine"] = part_of(engine, Engine)
+    return found
+
+
+def _element(item: Section) -> Element:
+    given: dict[str, Any] = {
+        "kind": item.text("type"), "source": item.text("from"), "target": item.text("to"),
+        "side": item.text("side", "both"),
+    }  # fmt: skip
+    if "joints" in item:
+        given["joints"] = item.names("joints")
+    return part_of(item, Element, **given)
 
 
 def _valve(item: Section, joint: str) -> Valve:
@@ -191,10 +277,18 @@ def _valve(item: Section, joint: str) -> Valve:
     if kind not in _KINDS:
         raise item.fail("type", f"valve type '{kind}' is unknown, {known(_KINDS, kind)}")
     for name in _COMPENSATED:
-        if kind == "orifice" and name in item:
+        if kind != "compensated" and name in item:
             raise item.fail(name, f"'{name}' is for valves of type 'compensated', remove it")
-    if kind == "orifice":
-        return _part(item, Valve, joint=joint)
+    given: dict[str, Any] = {
+        key: item.text(key) for key in ("supply", "return_a", "return_b") if key in item
+    }
+    curves = {}
+    for name in _CURVED:
+        if name in item and (found := read_curve(item, name)) is not None:
+            given[name], curves[name] = found
+    given["curves"] = curves
+    if kind != "compensated":
+        return part_of(item, Valve, joint=joint, sharing=kind == "sharing", **given)
     margin = item.number("margin", minimum=0.0)
     if margin == 0:
         raise item.fail("margin", "'margin' is 0, give the pressure drop that is kept")
@@ -203,13 +297,14 @@ def _valve(item: Section, joint: str) -> Valve:
         for name in ("flow", "meter_out"):
             if name in item:
                 raise item.fail(name, f"'{name}' stands beside '{edges[0]}', keep one of them")
-        return _part(item, Valve, joint=joint)
+        return part_of(item, Valve, joint=joint, **given)
     flow = item.number("flow", minimum=0.0)
     if flow == 0:
         raise item.fail("flow", "'flow' is 0, give the flow at full stroke")
     inlet = flow / math.sqrt(margin)
     outlet = item.number("meter_out", inlet, minimum=0.0)
-    _warn_of_unit(item, "flow", flow)
+    warn_of_unit(item, "flow", flow)
     if "meter_out" in item:
-        _warn_of_unit(item, "meter_out", outlet)
-    return _part(item, Valve, joint=joint, c1=inlet, c2=outlet, c3=outlet, c4=inlet)
+        warn_of_unit(item, "meter_out", outlet)
+    given |= {"c1": inlet, "c2": outlet, "c3": outlet, "c4": inlet}
+    return part_of(item, Valve, joint=joint, **given)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from crane.description.changes import circuit_parts, elements, number_at, tree_numbers
+from crane.description.changes import CIRCUIT, circuit_parts, elements, number_at, tree_numbers
 from crane.description.sensors import SENSOR
 from crane.description.tree import Link
 from crane.formats.machine_file.text import Way
@@ -73,8 +73,7 @@ def places(machine: Machine) -> dict[str, InURDF | InFile]:
         parts[head] = (field, i if field in _LISTS else item.joint), item
     for head, part in circuit_parts(machine.hydraulics).items() if machine.hydraulics else ():
         kind, _, joint = head.partition(".")
-        section = {"cylinder": "cylinders", "valve": "valves", "valve_control": "control"}
-        own = (section[kind], joint) if joint else (kind,)
+        own = (CIRCUIT[f"{kind}."], joint) if joint else (kind,)
         parts[head] = ("hydraulics", *own), part
     for quantity, sensor in machine.sensors.items():
         parts[f"{SENSOR}{quantity}"] = ("sensors", quantity), sensor

@@ -13,6 +13,8 @@ from crane.common.errors import CraneError, CraneWarning, InputError, OutputErro
 from crane.common.output import file_name, staging
 from crane.description.sensors import unit_of
 from crane.description.spec import Task, Via
+from crane.formats.machine_file.circuit import MOTOR
+from crane.formats.machine_file.curves import curve_data
 from crane.formats.machine_file.estimation import estimation_data
 from crane.formats.machine_file.outside import load_data, outside_data
 from crane.formats.machine_file.places import InFile, InURDF, places
@@ -28,8 +30,9 @@ from crane.formats.parts import (
     rotors_of,
     with_whole_flyers,
 )
-from crane.hydraulics import Cylinder, Hydraulics, Valve
-from crane.hydraulics.components import HOLDING, number_names
+from crane.hydraulics import Cylinder, Element, Hydraulics, Supply, Valve
+from crane.hydraulics.components import HOLDING
+from crane.hydraulics.numbers import number_names
 from crane.machine import Machine
 
 
@@ -297,10 +300,25 @@ def _via(via: Via) -> dict[str, Any]:
 
 def _hydraulics(circuit: Hydraulics) -> dict[str, Any]:
     data = {
-        "supply": _all_numbers(circuit.supply),
+        "supply": _supply(circuit.supply) | {"tank": circuit.supply.tank},
         "oil": _all_numbers(circuit.oil),
         "cylinders": {joint: _cylinder(item) for joint, item in circuit.cylinders.items()},
         "valves": {joint: _valve(valve) for joint, valve in circuit.valves.items()},
+    }
+    motors = {joint for joint, item in circuit.cylinders.items() if item.motor}
+    if motors:
+        data["motors"] = {joint: _motor(data["cylinders"].pop(joint)) for joint in motors}
+    if circuit.engine is not None:
+        data["engine"] = _all_numbers(circuit.engine)
+    data |= {
+        key: found
+        for key, found in {
+            "supplies": {x: _supply(part) for x, part in circuit.supplies.items()},
+            "lines": {x: _all_numbers(part) for x, part in circuit.lines.items()},
+            "accumulators": {x: _all_numbers(part) for x, part in circuit.accumulators.items()},
+            "elements": {x: _element(part) for x, part in circuit.elements.items()},
+        }.items()
+        if found
     }
     if circuit.control:
         data["control"] = {joint: _all_numbers(gains) for joint, gains in circuit.control.items()}
@@ -309,6 +327,26 @@ def _hydraulics(circuit: Hydraulics) -> dict[str, Any]:
 
 def _all_numbers(part: Any) -> dict[str, Any]:
     return {name: getattr(part, name) for name in number_names(type(part))}
+
+
+def _supply(supply: Supply) -> dict[str, Any]:
+    data = _all_numbers(supply)
+    del data["tank"]
+    if supply.control != "pressure":
+        data["control"] = supply.control
+    return data | ({"summed": list(supply.summed)} if supply.summed else {})
+
+
+def _element(element: Element) -> dict[str, Any]:
+    data: dict[str, Any] = {"type": element.kind, "from": element.source, "to": element.target}
+    data |= _all_numbers(element)
+    return data | ({"joints": [*element.joints], "side": element.side} if element.joints else {})
+
+
+def _motor(cylinder: dict[str, Any]) -> dict[str, Any]:
+    """A motor from what it is as a cylinder."""
+    own = {"displacement": cylinder["area_a"], "volume": cylinder["hose_a"]}
+    return own | {key: cylinder[name] for key, name in MOTOR.items() if name is not None}
 
 
 def _cylinder(cylinder: Cylinder) -> dict[str, Any]:
@@ -323,9 +361,17 @@ def _valve(valve: Valve, by_flow: bool = True) -> dict[str, Any]:
         for name in number_names(Valve)
         if name not in (*edges, "margin")
     }
-    every = {name: getattr(valve, name) for name in edges}
+    every: dict[str, Any] = {name: getattr(valve, name) for name in edges}
+    usual = Valve(valve.joint, 1.0, 1.0, 1.0, 1.0)
+    for name in ("supply", "return_a", "return_b"):
+        if getattr(valve, name) != getattr(usual, name):
+            rest[name] = getattr(valve, name)
+    for name, curve in valve.curves.items():
+        of = rest if name == "centre" else every
+        of[name] = curve_data(getattr(valve, name), curve)
     if not valve.margin:
-        return {"type": "orifice", **every, **rest}
+        return {"type": "sharing" if valve.sharing else "orifice", **every, **rest}
+    by_flow = by_flow and not valve.curves.keys() & {*edges}
     flow = _flow(valve) if by_flow else None
     given = every if flow is None else {"flow": flow, "meter_out": valve.c2}
     return {"type": "compensated", "margin": valve.margin, **given, **rest}

@@ -8,7 +8,8 @@ from crane.codegen import Number
 from crane.common.samples import Array
 from crane.control.base import At
 from crane.control.valves import Command, circuit_of
-from crane.hydraulics.components import Cylinder, Supply, Valve
+from crane.hydraulics.components import Cylinder, Valve
+from crane.hydraulics.sources import Supply
 from crane.machine import Machine
 
 

@@ -1,0 +1,101 @@
+"""Nodes beside chambers, and elements between nodes, as formulas."""
+
+from collections.abc import Mapping, Sequence
+
+from crane.codegen import Expression, Number, maximum
+from crane.codegen.scalar import apply, where_positive
+from crane.hydraulics.elements import Element
+from crane.hydraulics.flow import Flow, clipped, root
+
+GAS_PRESSURE = 1.0e5  # at which volumes of entrapped gas are given [Pa]
+_FULL = 0.02  # of an accumulator's gas, the least that is left
+
+
+def softness_of(
+    common: Mapping[str, Number], volume: Number, hose: Number, gas: Number, p: Number
+) -> Number:
+    """Volume per pressure, V / K = V / B_oil + (V - V_h) / B_steel + V_h / B_hose + gas's.
+
+    The gas is what is entrapped, and the oil's free air.
+    """
+    soft = volume * common["oil"] + hose * common["hose"]
+    if _is(common["steel"]):
+        soft = soft + common["steel"] * maximum(volume - hose, 0.0)
+    if _is(common["air"]):
+        gas = gas + common["air"] * volume
+    if _is(gas):
+        # V = gas (p0 / p)^(1/n), -dV/dp = gas / (n p0) (p0 / p)^(1 + 1/n)
+        power = common["gas_power"]
+        thin = apply("log", maximum(p, 1.0) * (1.0 / GAS_PRESSURE))
+        soft = soft + gas * (power - 1.0) * (1.0 / GAS_PRESSURE) * apply("exp", -power * thin)
+    return soft
+
+
+def _is(number: Number) -> bool:
+    """Whether it is there."""
+    return isinstance(number, Expression) or number != 0.0
+
+
+def gas_of(
+    gas: Mapping[str, Number], p: Number, inflow: Number, oil: Number | None
+) -> tuple[list[Number], Number]:
+    """Rates of an accumulator's states, and the heat that leaves its gas [W].
+
+    See `Accumulator`. Below the precharge the gas keeps its volume, and the port's oil alone gives
+    way.
+
+    Args:
+        gas: Its numbers.
+        p: Its pressure [Pa].
+        inflow: [m3/s].
+        oil: In it, a state where heat leaves the gas [m3].
+    """
+    line, volume, precharge, n = (gas[x] for x in ("line", "volume", "precharge", "exponent"))
+    if oil is None:
+        # V_g = volume (p0 / p)^(1/n), -dV/dp = V_g / (n p)
+        above = maximum(p, precharge)
+        thin = apply("log", precharge / above)
+        soft = volume * apply("exp", thin / n) / (n * above)
+        return [inflow / (line + where_positive(p - precharge, soft, 0.0))], 0.0
+    left = clipped(volume - oil, _FULL * volume, volume)
+    isothermal = precharge * volume / left
+    cooling = (p - isothermal) * gas["per_time"]
+    slope = (n * p * inflow / left - cooling) / (1.0 + line * n * p / left)
+    holds = maximum(oil, p - precharge)  # the gas, rather than the diaphragm its port
+    slope = where_positive(holds, slope, inflow / line)
+    into = where_positive(holds, inflow - line * slope, 0.0)
+    heat = where_positive(holds, left * cooling / (n - 1.0), 0.0)
+    return [slope, into], heat
+
+
+def flow_of(
+    name: str,
+    element: Element,
+    numbers: Mapping[str, Number],
+    pressures: Mapping[str, Number],
+    opened: Mapping[str, Sequence[Number]],
+) -> Flow:
+    """What flows through an element, see `Element`.
+
+    Args:
+        name: Its name.
+        element: What it is.
+        numbers: Its numbers.
+        pressures: Of all nodes [Pa].
+        opened: Openings y of valves on both sides, by joint.
+    """
+    drop = pressures[element.source] - pressures[element.target]
+    if element.kind in ("check", "relief"):
+        drop = maximum(drop - numbers["pressure"], 0.0)
+    if element.kind in ("orifice", "check"):
+        rate = numbers["coefficient"] * root(drop)
+    else:
+        rate = numbers["gain"] * drop
+    if element.joints:
+        sides = {"both": (0, 1), "out": (0,), "back": (1,)}[element.side]
+        openings = [opened[joint][side] for joint in element.joints for side in sides]
+        most = openings[0]
+        for opening in openings[1:]:
+            most = maximum(most, opening)
+        rate = most * rate
+    return Flow(element.source, element.target, rate, name)

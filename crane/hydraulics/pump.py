@@ -1,0 +1,111 @@
+"""A pump with its regulator as formulas."""
+
+from collections.abc import Mapping, Sequence
+
+from crane.codegen import Number, maximum
+from crane.codegen.scalar import apply, minimum
+from crane.hydraulics.driven_cylinder import DrivenCylinder
+from crane.hydraulics.flow import Flow, clipped, root
+from crane.hydraulics.sources import TANK, Supply
+
+_SLIGHT = 1.0e4  # [Pa], below which power limits nothing
+_CLOSED = 1.0e-30  # square of a coefficient that lets nothing pass
+
+
+class Pump:
+    """A pump at an instant, see `Supply`.
+
+    Args:
+        name: Of its node.
+        supply: What it is.
+        numbers: Its numbers.
+        pressures: Of all nodes [Pa].
+        load: Highest of its valves [Pa].
+        fed: What it feeds.
+        speed: Of the engine over its set speed.
+        share: Of its displacement, where that takes time.
+
+    Attributes:
+        flows: Into its line, and out of it past the pump, the relief valve and open centres.
+        asked: Share of the displacement that the regulator asks for.
+        share: Share that it has.
+        share_rate: Its rate, where it takes time.
+        shaft: Power that turns the pump [W].
+        torque: The same over the speed's share [W].
+        heat: What is lost in it beside its slip [W].
+    """
+
+    def __init__(
+        self,
+        name: str,
+        supply: Supply,
+        numbers: Mapping[str, Number],
+        pressures: Mapping[str, Number],
+        load: Number,
+        fed: Sequence[DrivenCylinder],
+        speed: Number,
+        share: Number | None,
+    ):
+        self._name, self._supply, self._numbers, self._fed = name, supply, numbers, fed
+        self._p, self._tank = pressures[name], pressures[TANK]
+        self.flows: list[Flow] = []
+        before = self._bypass()
+        self.asked = self._regulated(pressures, load, before)
+        self.share = self.asked if share is None else share
+        self.share_rate: list[Number] = []
+        if share is not None:
+            self.share_rate = [(self.asked - share) * numbers["per_response"]]
+        above = self._p - self._tank
+        delivered = self.share * numbers["flow"] * speed
+        self.flows.append(Flow(TANK, name, delivered, "pump"))
+        if supply.slip > 0:
+            self.flows.append(Flow(name, TANK, numbers["slip"] * above, "slip"))
+        if supply.relief > 0:
+            over = maximum(self._p - numbers["relief"], 0.0)
+            self.flows.append(Flow(name, TANK, numbers["relief_gain"] * over, "relief"))
+        useful = delivered * above
+        self.heat = numbers["friction"] * useful + numbers["drag"] * speed * speed
+        self.shaft = useful + self.heat
+        turned = self.share * numbers["flow"] * above * (1.0 + numbers["friction"])
+        self.torque = turned + numbers["drag"] * speed
+
+    def _bypass(self) -> Number:
+        """Pressure over the tank's before the throttle behind its open centres [Pa].
+
+        Throttles in series: 1 / c^2 = sum of 1 / c_i^2, and each has its share of the drop.
+        """
+        centres = [one.centre() for one in self._fed if one.valve.centre > 0]
+        if not centres:
+            return 0.0
+        total: Number = 0.0
+        for c in centres:
+            total = total + 1.0 / (c * c + _CLOSED)
+        last: Number = 0.0
+        if self._supply.throttle > 0:
+            last = 1.0 / (self._numbers["throttle"] * self._numbers["throttle"])
+        total = total + last
+        drop = self._p - self._tank
+        rate = root(drop) / apply("sqrt", total)
+        self.flows.append(Flow(self._name, TANK, rate, "bypass"))
+        return drop * last / total
+
+    def _regulated(self, pressures: Mapping[str, Number], load: Number, before: Number) -> Number:
+        """The share that the regulator asks for."""
+        numbers, control, p = self._numbers, self._supply.control, self._p
+        if control == "fixed":
+            return 1.0
+        cut_off = (numbers["pressure"] - p) * numbers["per_droop"]
+        asked: Number = cut_off
+        if control == "load-sensing":
+            wanted = maximum(load + numbers["margin"], numbers["standby"])
+            asked = (minimum(wanted, numbers["pressure"]) - p) * numbers["per_droop"]
+        elif control == "negative":
+            asked = minimum(1.0 - before / numbers["signal"], cut_off)
+        elif control == "positive":
+            asked = minimum(sum((one.demand for one in self._fed), 0.0), cut_off)
+        if self._supply.power > 0:
+            names = self._supply.summed or (self._name,)
+            mean = sum((pressures[name] for name in names), 0.0) * (1.0 / len(names))
+            most = numbers["flow"] * maximum(mean - self._tank, _SLIGHT)
+            asked = minimum(asked, numbers["power"] / most)
+        return clipped(asked, numbers["least"], 1.0)

@@ -1,0 +1,160 @@
+"""What a circuit is fed by: pumps with their regulators, and the engine that turns them."""
+
+from dataclasses import dataclass
+
+from crane.common.errors import InputError
+from crane.common.magnitudes import meant
+from crane.hydraulics.numbers import PartError, above, check_numbers, positive
+
+CONTROLS = ("pressure", "load-sensing", "negative", "positive", "fixed")
+MAIN = "supply"  # name of the first pump's node
+TANK = "tank"
+
+
+@dataclass(frozen=True)
+class Supply:
+    """A pump, its regulator and the line behind it; of the first one the tank, too.
+
+    The regulator asks for the share e of the pump's flow, 0 to 1,
+
+        pressure:      (pressure - p) / droop,
+        load-sensing:  (min(max(p_LS + margin, standby), pressure) - p) / droop,
+        negative:      (signal - (p_N - p_tank)) / signal,
+        positive:      sum of |y| over its valves, times their `demand`,
+        fixed:         1,
+
+    with p_LS the highest load of its open valves and p_N the pressure before the throttle that
+    ends its open centre. It is at least `least`, and at most (pressure - p) / droop (cut-off; not
+    of a fixed pump) and power / (flow (p - p_tank)), a hyperbola with its corner at power / flow;
+    where `summed` names pumps, of the mean of their p. The share follows within `response`, and
+    the line gets e flow n - slip (p - p_tank), n the engine's speed over its set speed.
+
+    Attributes:
+        pressure: That the pump keeps, or its cut-off [Pa].
+        tank: Pressure of the return line [Pa].
+        flow: The most that the pump delivers [m3/s]; 0 for as much as is asked for.
+        droop: By how much the pressure falls from no flow to all of it [Pa].
+        volume: Of the line between pump and valves [m3].
+        margin: Above the highest load [Pa], of load sensing.
+        standby: Least pressure that load sensing sets [Pa].
+        signal: Pressure before the throttle at which a negative control gives nothing [Pa].
+        throttle: Coefficient of the throttle behind the open centre [m3/(s Pa^0.5)]; 0 for none.
+        least: Share of its flow that it always gives.
+        response: Time constant of the displacement [s]; 0 for none.
+        power: The most that it takes up at the set speed [W]; 0 for no limit.
+        relief: Pressure above the vacuum at which the line is relieved to the tank [Pa]; 0 for no
+            relief valve.
+        relief_gain: Its flow per pressure above it [m3/(s Pa)].
+        slip: Leakage of the pump [m3/(s Pa)].
+        friction: Share of its torque that is lost besides.
+        drag: Power that turns it without load, at the set speed [W].
+        control: One of `CONTROLS`.
+        summed: Names of the pumps whose mean pressure limits its power; its own if empty.
+    """
+
+    pressure: float
+    tank: float = 1.0e5
+    flow: float = 0.0
+    droop: float = above(2.0e5)
+    volume: float = above(2.0e-3)
+    margin: float = 0.0
+    standby: float = 0.0
+    signal: float = 0.0
+    throttle: float = 0.0
+    least: float = 0.0
+    response: float = 0.0
+    power: float = 0.0
+    relief: float = 0.0
+    relief_gain: float = above(1.0e-8)
+    slip: float = 0.0
+    friction: float = 0.0
+    drag: float = 0.0
+    control: str = "pressure"
+    summed: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "the supply")
+        if self.pressure <= self.tank:
+            raise PartError(
+                "pressure",
+                f"pressure of the supply is {self.pressure:g} Pa, not above the tank's "
+                f"{self.tank:g} Pa, so that nothing would flow"
+                + (
+                    meant("pressure", self.pressure)
+                    or ", give a little more for a pump that rests"
+                ),
+            )
+        if self.control not in CONTROLS:
+            raise PartError(
+                "control", f"control '{self.control}' is none of {', '.join(CONTROLS)}"
+            )
+        if not self.flow and (self.control != "pressure" or self.power or self.response):
+            raise PartError(
+                "flow", "a regulated pump has no 'flow', give the most that it delivers"
+            )
+        for key, control in (("margin", "load-sensing"), ("signal", "negative")):
+            if self.control == control and not getattr(self, key):
+                raise PartError(key, f"a {control} pump has no '{key}', give it [Pa]")
+        if self.control == "negative" and not self.throttle:
+            raise PartError("throttle", "a pump with negative control has no 'throttle', give it")
+        if self.control in ("fixed", "negative", "positive") and not self.relief:
+            raise PartError(
+                "relief", f"a pump of {self.control} flow has no 'relief', give it [Pa]"
+            )
+        for key in ("least", "friction"):
+            if getattr(self, key) >= 1:
+                raise PartError(
+                    key, f"{key} of the supply is {getattr(self, key):g}, give below 1"
+                )
+        if 0 < self.relief <= self.tank:
+            raise PartError("relief", f"relief of the supply is {self.relief:g} Pa, not above the "
+                            f"tank's {self.tank:g} Pa, so that it would never close")  # fmt: skip
+
+    @property
+    def rest(self) -> float:
+        """Pressure of its line while nothing moves [Pa]."""
+        if self.control == "load-sensing":
+            return min(max(self.tank + self.margin, self.standby), self.pressure)
+        return self.pressure if self.control == "pressure" else self.tank
+
+
+@dataclass(frozen=True)
+class Engine:
+    """What turns the pumps: J w' = T - sum of their torques.
+
+    The governor gives T = torque (speed + droop - w) / droop, held within 0 and `torque`. Pumps
+    deliver `flow` at `speed`, where it gives full torque; unloaded it turns at speed + droop.
+
+    Attributes:
+        speed: Set speed [rad/s].
+        torque: The most that it gives [N m].
+        inertia: Of engine and pumps [kg m2].
+        droop: Of the governor [rad/s].
+        fuel: Consumption [kg/J]; 0 if it is not known.
+        idle: Consumption without load [kg/s].
+    """
+
+    speed: float = positive()
+    torque: float = positive()
+    inertia: float = positive()
+    droop: float = above(10.0)
+    fuel: float = 0.0
+    idle: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "the engine")
+
+
+def check_summed(supplies: dict[str, Supply]) -> None:
+    """Raise where a pump's power is limited by the pressure of one that is not there.
+
+    Raises:
+        InputError: With both names.
+    """
+    for name, supply in supplies.items():
+        for other in supply.summed:
+            if other not in supplies or not supplies[other].flow:
+                known = ", ".join(x for x, y in supplies.items() if y.flow)
+                raise InputError(
+                    f"'summed' of '{name}' names '{other}', give pumps with a flow: {known}"
+                )
