@@ -87,7 +87,7 @@ if TYPE_CHECKING:
     from crane.simulation.symbolic import casadi_function
     from crane.studies import Study, SwayStudy, study, sway_study
     from crane.view.page import report
-    from crane.view.sketch import sketch
+    from crane.view.sketch import sketch, sketch_circuit
 
 __version__ = "0.1.0"
 LOADED = time.time()  # before any other file of the package was read
@@ -128,7 +128,7 @@ _HOMES = {
     "crane.simulation.symbolic": "casadi_function",
     "crane.studies": "Study SwayStudy study sway_study",
     "crane.view.page": "report",
-    "crane.view.sketch": "sketch",
+    "crane.view.sketch": "sketch sketch_circuit",
 }
 
 __all__ = [
@@ -144,9 +144,9 @@ __all__ = [
     "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
     "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
     "read_measured", "read_path", "replay", "report", "retimed", "sensitivities", "simulate",
-    "simulate_batch", "sketch", "study", "sway_study", "task_trajectory", "tip_trajectory",
-    "via_attitudes", "via_points", "without_sway", "workspace", "write_machine", "write_mjcf",
-    "write_urdf_plus",
+    "simulate_batch", "sketch", "sketch_circuit", "study", "sway_study", "task_trajectory",
+    "tip_trajectory", "via_attitudes", "via_points", "without_sway", "workspace", "write_machine",
+    "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 

@@ -42,6 +42,9 @@ def sketch(
         typer.Option(help="xy, xz or yz of the world; the machine's own plane if not given."),
     ] = None,
     com: Annotated[bool, typer.Option("--com", help="Mark centres of mass.")] = False,
+    circuit: Annotated[
+        bool, typer.Option("--circuit", help="Draw the hydraulic circuit instead.")
+    ] = False,
     out: OutFile = None,
     change: Change = None,
     lock: Lock = None,
@@ -52,15 +55,24 @@ def sketch(
     argument: Argument = None,
     force: Force = False,
 ) -> None:
-    """Draw the mechanism of a machine (png, svg or pdf)."""
+    """Draw the mechanism of a machine, or its hydraulic circuit (png, svg or pdf)."""
     from crane.cli.runs import check_free
     from crane.common.output import file_name
     from crane.formats.ambiguity import near_assemblies
+    from crane.view.sketch.circuit import sketch_circuit
     from crane.view.sketch.draw import sketch as draw
 
+    if circuit:
+        for option, given in (("--at", at), ("--plane", plane), ("--com", com)):
+            if given:
+                raise InputError(f"{option} is for the mechanism, leave it out with --circuit")
     loaded = load(machine, lock, change, active, free, floating, packages, argument)
-    figure = out or Path(file_name(loaded.name) + "_sketch.png")
+    figure = out or Path(file_name(loaded.name) + ("_circuit.png" if circuit else "_sketch.png"))
     check_free(figure, force)
+    if circuit:
+        sketch_circuit(loaded, figure)
+        print(f"written to {figure}")
+        return
     others = [] if at else near_assemblies(loaded)
     draw(loaded, figure, posture(loaded, at), plane, com, others)
     if others:
