@@ -48,7 +48,9 @@ def expected(hydraulics):
     """Names of the symbols that a circuit must have."""
     names = ["tank", *(["engine"] if hydraulics.engine else [])]
     names += [f"pump {name}" for name in hydraulics.sources]
-    names += [f"regulator {name}" for name, x in hydraulics.sources.items() if x.control != "fixed"]
+    names += [
+        f"regulator {name}" for name, x in hydraulics.sources.items() if x.control != "fixed"
+    ]
     names += [f"relief {name}" for name, x in hydraulics.sources.items() if x.relief]
     names += [f"accumulator {name}" for name in hydraulics.accumulators]
     names += [f"element {name}" for name in hydraulics.elements]
@@ -208,7 +210,9 @@ def test_wires_end_at_ports(drawings):
         for wire in ink.wires:
             for at in (wire.start, wire.end):
                 on = any(w is not wire and w.net == wire.net and w.holds(at) for w in ink.wires)
-                left = at[1] == wire.start[1] == wire.end[1] and at[0] < 160  # begins with its name
+                left = (
+                    at[1] == wire.start[1] == wire.end[1] and at[0] < 160
+                )  # begins with its name
                 assert on or (wire.net, at) in ports or left, (name, wire)
 
 

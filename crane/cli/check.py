@@ -46,6 +46,8 @@ def check(
         print(line)
     if report.summary is not None:
         print(report.summary)
+    for note in report.notes:
+        print(note)
     if report.findings:
         print(report.counts)
     for line in report.proposed:

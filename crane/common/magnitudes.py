@@ -83,12 +83,12 @@ USUAL = {
     "signal": Magnitude("Pa", 1e4, 1e7, 2e6, _PRESSURE),
     "precharge": Magnitude("Pa", 1e5, 5e7, 1e7, _PRESSURE),
     "cross_relief": _PORT,
-    "power": Magnitude("W", 1.0, 2e6, 8e4, ((("kW", 1e3), ("hp", 745.7)),)),
-    "drag": Magnitude("W", 0.1, 1e5, 2e3, ((("kW", 1e3),),)),
+    "power": Magnitude("W", 1e3, 2e6, 8e4, ((("kW", 1e3), ("hp", 745.7)),)),
+    "drag": Magnitude("W", 20.0, 1e5, 2e3, ((("kW", 1e3),),)),
     "response": Magnitude("s", 1e-3, 5.0, 0.1, ((("ms", 1e-3),),)),
     "slip": _LEAK,
     "air": Magnitude("", 0.0, 0.2, 0.01, ((("percent", 0.01),),)),
-    "speed": Magnitude("rad/s", 5.0, 2e3, 190.0, ((("rpm", math.pi / 30),),)),
+    "speed": Magnitude("rad/s", 5.0, 420.0, 190.0, ((("rpm", math.pi / 30),),)),
     "torque": Magnitude("N m", 0.1, 5e4, 500.0, ((("kN m", 1e3),),)),
     "inertia": Magnitude("kg m2", 1e-5, 1e3, 2.0),
     "fuel": Magnitude("kg/J", 3e-8, 2e-7, 6e-8, ((("g/kWh", 1e-3 / 3.6e6),),)),
@@ -117,6 +117,13 @@ USUAL = {
         _COEFFICIENT,
     ),
 }
+_SHARE = (("percent", 0.01),)
+USUAL |= {
+    "friction": Magnitude("", 0.0, 0.5, 0.05, (_SHARE,)),
+    "least": Magnitude("", 0.0, 0.9, 0.05, (_SHARE,)),
+    "demand": Magnitude("", 0.01, 2.0, 1.0, (_SHARE,)),
+    "gear": Magnitude("", 0.02, 1e4, 20.0),
+}
 _TURN = Magnitude("m3/rad", 1e-9, 0.1, 1e-3, ((("cm3/rad", 1e-6), ("l/rad", 1e-3)),))
 TURNING = {  # what differs where the joint turns
     "area_a": _TURN,
@@ -124,18 +131,35 @@ TURNING = {  # what differs where the joint turns
     "cushion": Magnitude("rad", 0.0, 3.2, 0.2, ((("degrees", math.pi / 180),),)),
     "stiffness": Magnitude("N m/rad", 1e0, 1e12, 1e7),
 }
+_VESSEL = Magnitude("m3", 1e-8, 0.3, 2e-3, _VOLUME)  # half a litre is a usual one, half a m3 not
+OWN = {  # what differs for a kind of part
+    ("engine", "droop"): Magnitude("rad/s", 0.1, 60.0, 10.0, ((("rpm", math.pi / 30),),)),
+    ("element", "gain"): Magnitude("m3/(s Pa)", 0.0, 1e-6, 2e-9, _LEAKAGE),
+    ("element", "pressure"): Magnitude("Pa", 1e3, 7e7, 1e6, _PRESSURE),
+    ("accumulator", "line"): _HOSE,
+    ("accumulator", "volume"): _VESSEL,
+    ("line", "volume"): _VESSEL,
+    ("motor", "volume"): _HOSE,
+}
 _BOTH = 20.0  # how much farther from the typical value a second unit may bring it to be named
 
 
-def doubt(name: str, value: float, turning: bool = False) -> str:
+def usual_of(name: str, turning: bool = False, kind: str = "") -> Magnitude | None:
+    """What is usual of a number, None of one that may be anything; see `doubt`."""
+    own = OWN.get((kind, name)) or (TURNING.get(name) if turning else None)
+    return own or USUAL.get(name)
+
+
+def doubt(name: str, value: float, turning: bool = False, kind: str = "") -> str:
     """What to say of a number that hardly is in its SI unit, else nothing.
 
     Args:
         name: Of the number in a machine file.
         value: The number, which may be; zero is never doubted.
         turning: Whether it belongs to a joint that turns.
+        kind: Of the part that has it: "engine", "element", "accumulator" ...
     """
-    usual = (TURNING if turning else {}).get(name) or USUAL.get(name)
+    usual = usual_of(name, turning, kind)
     if usual is None or value == 0 or usual.least <= value <= usual.most:
         return ""
     unit = f" {usual.unit}" if usual.unit else ""

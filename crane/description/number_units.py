@@ -1,6 +1,6 @@
 """SI units of a machine's numbers, by their names."""
 
-from crane.common.magnitudes import TURNING, USUAL
+from crane.common.magnitudes import usual_of
 from crane.description.sensors import FORCE_UNITS, SENSOR, VELOCITY_UNITS, parsed, unit_of
 from crane.description.tree import Tree
 
@@ -66,15 +66,11 @@ def _of_element(head: str, word: str, length: str) -> str:
     return units.get(head, {}).get(word, "")
 
 
-_OTHERWISE = {("engine", "droop"): "rad/s", ("element", "gain"): "m3/(s Pa)",
-              ("accumulator", "line"): "m3"}  # fmt: skip
 _CIRCUIT = ("cylinder", "valve", "supply", "oil", "engine", "line", "accumulator", "element")
 
 
 def _of_circuit(head: str, word: str, turns: bool) -> str:
-    if (head, word) in _OTHERWISE:
-        return _OTHERWISE[head, word]
     if head not in _CIRCUIT:
         return ""
-    usual = (TURNING if turns else {}).get(word) or USUAL.get(word)
+    usual = usual_of(word, turns, head)
     return usual.unit if usual is not None else ""

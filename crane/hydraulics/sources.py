@@ -107,8 +107,12 @@ class Supply:
                     key, f"{key} of the supply is {getattr(self, key):g}, give below 1"
                 )
         if 0 < self.relief <= self.tank:
-            raise PartError("relief", f"relief of the supply is {self.relief:g} Pa, not above the "
-                            f"tank's {self.tank:g} Pa, so that it would never close")  # fmt: skip
+            hint = meant("relief", self.relief) or ", give a higher one"
+            raise PartError(
+                "relief",
+                f"relief of the supply is {self.relief:g} Pa, not above the tank's "
+                f"{self.tank:g} Pa, so that it would never close{hint}",
+            )
 
     @property
     def rest(self) -> float:

@@ -17,6 +17,7 @@ from crane.description.findings import Findings, collecting, recoverable
 from crane.description.floating import floated
 from crane.description.sources import find
 from crane.formats.adding.open_loops import Proposal, proposals
+from crane.formats.check.circuit import shortage, warn_of_circuit
 from crane.formats.check.mechanism import check_mechanism
 from crane.formats.check.plausible import implausible
 from crane.formats.machine_file.read import read
@@ -65,6 +66,7 @@ class Report:
         full: Whether there was more than is listed.
         next: The command to type next.
         proposals: Loops that the description seems to leave open.
+        notes: What is worth knowing, and neither wrong nor unusual.
     """
 
     findings: tuple[Finding, ...]
@@ -72,6 +74,7 @@ class Report:
     full: bool
     next: str
     proposals: tuple[Proposal, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def proposed(self) -> list[str]:
@@ -167,6 +170,8 @@ def _check(
         if spec is not None:
             closure = _closed(spec, found)
         implausible(found.files, spec)
+        if spec is not None:
+            warn_of_circuit(spec)
     findings = [_finding(str(error), True, path.name) for error in found.errors]
     findings += [
         _finding(str(one.message), False, path.name)
@@ -181,8 +186,9 @@ def _check(
     open_loops: tuple[Proposal, ...] = ()
     if spec is not None and closure is not None:
         open_loops = proposals(spec, closure.model, closure.home)
+    notes = tuple(shortage(spec)) if spec is not None and summary is not None else ()
     what_next = _next(name, spec, closure, summary, bool(open_loops))
-    return Report(tuple(ordered[:_MOST]), summary, full, what_next, open_loops)
+    return Report(tuple(ordered[:_MOST]), summary, full, what_next, open_loops, notes)
 
 
 def _together(alike: list[Finding]) -> str:

@@ -25,9 +25,10 @@ from crane.hydraulics.components import (
     check_relief,
     check_tank,
 )
+from crane.hydraulics.connections import drained, joined
 from crane.hydraulics.elements import Accumulator, Element, Line
 from crane.hydraulics.numbers import PartError, number_names
-from crane.hydraulics.sources import Engine, Supply
+from crane.hydraulics.sources import MAIN, Engine, Supply
 
 Made = TypeVar("Made")
 Part = TypeVar("Part")
@@ -36,6 +37,7 @@ _TOGETHER = ("tank", "relief")  # looked at with other parts
 _NAME = set(string.ascii_letters + string.digits + "_")
 _KINDS = ("orifice", "compensated", "sharing")
 _COMPENSATED = ("flow", "margin", "meter_out")  # what only these have
+_NODES = {"supplies": "supply", "lines": "line", "accumulators": "accumulator"}
 _EDGES = ("c1", "c2", "c3", "c4")
 _CURVED = (*_EDGES, "centre")
 _REGULATED = ("control", "summed")
@@ -120,7 +122,7 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
     if supply is None or not cylinders.keys() == valves.keys() <= set(active):
         raise FollowUpError("the circuit is not complete")
     order = [joint for joint in active if joint in cylinders]
-    return checked(
+    made = checked(
         section,
         Hydraulics,
         supply,
@@ -130,6 +132,44 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
         {joint: control[joint] for joint in order if control},
         **others,
     )
+    _check_connections(section, made)
+    return made
+
+
+def circuit_places(top: Section) -> dict[str, str]:
+    """File and line of each pump, line and accumulator, as "supply NAME" and so on."""
+    section = top.section("hydraulics", "'hydraulics'")
+    if section is None:
+        return {}
+    found = {f"supply {MAIN}": section.where("supply")}
+    for key, kind in _NODES.items():
+        outer = section.section(key, f"'{key}'")
+        if outer is not None:
+            found |= {f"{kind} {name}": outer.where(name) for name in outer}
+    return found
+
+
+def _check_connections(section: Section, hydraulics: Hydraulics) -> None:
+    """Note nodes that hang on nothing, and returns from which no oil gets to the tank."""
+    together, emptied = joined(hydraulics), drained(hydraulics)
+    for key, kind in _NODES.items():
+        outer = section.section(key, f"'{key}'")
+        for name in outer or ():
+            assert outer is not None
+            if name in together:
+                continue
+            how = "'supply' of a valve or 'from'" if key == "supplies" else "'from' or 'to'"
+            problem = f"nothing is joined to the {kind} '{name}', name it as {how} of an element"
+            flag(outer.fail(name, f"{problem}, or remove it"), harmless=True)
+    outer = section.section("lines", "'lines'")
+    for name in outer or ():
+        assert outer is not None
+        given = [joint for joint, valve in hydraulics.valves.items()
+                 if name in (valve.return_a, valve.return_b)]  # fmt: skip
+        if given and name not in emptied:
+            problem = f"what {' and '.join(given)} give into the line '{name}' never gets to the "
+            problem += f"tank, add an element from '{name}' to 'tank'"
+            flag(outer.fail(name, problem), harmless=True)
 
 
 def check_active(joint: str, item: Section, active: tuple[str, ...]) -> None:
@@ -146,7 +186,7 @@ def _turns(tree: TreeBuilder, joint: str) -> bool:
     return joint in tree.joints and tree.joints[joint].kind == "revolute"
 
 
-def part_of(section: Section, kind: type[Part], turning: bool = False, **given: Any) -> Part:
+def part_of(section: Section, kind: type[Part], turning: bool = False, /, **given: Any) -> Part:
     """A part whose remaining numbers stand in a section."""
     numbers: Any = fields(kind)  # type: ignore[arg-type]
     own = [x for x in numbers if x.name in number_names(kind) and x.name not in given]
@@ -159,7 +199,7 @@ def part_of(section: Section, kind: type[Part], turning: bool = False, **given: 
     part = checked(section, kind, **given)
     for entry in own:
         if entry.name in section and entry.name not in _TOGETHER:
-            warn_of_unit(section, entry.name, given[entry.name], turning)
+            warn_of_unit(section, entry.name, given[entry.name], turning, kind.__name__.lower())
     return part
 
 
@@ -173,9 +213,11 @@ def checked(section: Section, make: Callable[..., Made], *items: object, **given
         raise section.fail(None, str(error)) from None
 
 
-def warn_of_unit(section: Section, key: str, value: float, turning: bool = False) -> None:
+def warn_of_unit(
+    section: Section, key: str, value: float, turning: bool = False, kind: str = ""
+) -> None:
     """Warn of a number that can be, and hardly is in its SI unit."""
-    if text := doubt(key, value, turning):
+    if text := doubt(key, value, turning, kind):
         what = f"{section.where(key)}: '{key}' of {section.title} {text}"
         warnings.warn(what, CraneWarning, stacklevel=2)
 
@@ -217,7 +259,10 @@ def _supply(section: Section) -> Supply:
     given: dict[str, Any] = {"control": section.text("control", "pressure")}
     if "summed" in section:
         given["summed"] = section.names("summed")
-    return part_of(section, Supply, **given)
+    supply = part_of(section, Supply, **given)
+    if "relief" in section:
+        warn_of_unit(section, "relief", supply.relief)
+    return supply
 
 
 def _motor(joint: str, item: Section) -> Cylinder:
@@ -228,7 +273,7 @@ def _motor(joint: str, item: Section) -> Cylinder:
     for key, value in (("displacement", displacement), ("gear", gear), ("volume", volume)):
         if value == 0:
             raise item.fail(key, f"'{key}' of {item.title} is 0, give it")
-        warn_of_unit(item, key, value)
+        warn_of_unit(item, key, value, kind="motor")
     given: dict[str, Any] = dict.fromkeys(("area_a", "area_b"), displacement * gear)
     given |= dict.fromkeys(("hose_a", "hose_b"), volume)
     return part_of(item, Cylinder, joint=joint, motor=True, **given)

@@ -28,7 +28,7 @@ from crane.description.spec import (
     unit_vector,
 )
 from crane.description.tree import with_rotors
-from crane.formats.machine_file.circuit import check_active, read_hydraulics
+from crane.formats.machine_file.circuit import check_active, circuit_places, read_hydraulics
 from crane.formats.machine_file.estimation import read_estimation
 from crane.formats.machine_file.forces import (
     read_end_stops,
@@ -154,6 +154,8 @@ def _read_machine(path: Path) -> MachineSpec:
     if active:
         valves: tuple[str, ...] = Anything() if "hydraulics" in top else ()
         hydraulics = _part(read_hydraulics, None, top, tree, active)
+        if hydraulics is not None:
+            where |= circuit_places(top)
         if hydraulics is not None and not isinstance(active, Anything):
             valves = hydraulics.joints
         tasks = _part(read_tasks, tasks, top, tree, active, tip, valves)
