@@ -29,9 +29,9 @@ def valve(joint, **more):
     return Valve(joint, **(dict.fromkeys(("c1", "c2", "c3", "c4"), 5e-7) | more))
 
 
-def circuit(folder, supply, cylinders, valves, **others):
+def circuit(folder, supply, cylinders, valves, name="X{}", **others):
     """A machine with a circuit; cylinders and valves as keywords of each, in order."""
-    joints = [f"X{i}" for i in range(1, len(cylinders) + 1)]
+    joints = [name.format(i) for i in range(1, len(cylinders) + 1)]
     machine = rig(folder, joints=joints)
     parts = {j: cylinder(j, **more) for j, more in zip(joints, cylinders, strict=True)}
     spools = {j: valve(j, **more) for j, more in zip(joints, valves, strict=True)}
@@ -88,3 +88,28 @@ def network(folder):
         engine=ENGINE, lines={"back": Line(2e-3)}, elements=elements,
         accumulators={"store": Accumulator(2.5e-3, 8e6)},
     )  # fmt: skip
+
+
+def long_names(folder):
+    """Names of users: long, and with letters that mean something elsewhere."""
+    first = "boom_swing_cylinder_of_the_$left$_side_1"
+    last = "accumulator_of_the_boom_suspension"
+    return circuit(
+        folder, SENSING, [EVERYTHING] * 2, [{"sharing": True}, {"supply": "C"}],
+        name="boom_swing_cylinder_of_the_$left$_side_{}",
+        supplies={"C": POSITIVE, "pump_of_the_slewing_gear_motor": FIXED},
+        accumulators={last: Accumulator(1e-3, 8e6)},
+        elements={
+            "ride_control_of_the_boom_on_roads": Element(
+                "orifice", f"{first}.a", last, coefficient=1e-7, joints=(first,)
+            ),
+            "to": Element("check", "pump_of_the_slewing_gear_motor", "supply", coefficient=1e-6),
+        },
+    )  # fmt: skip
+
+
+def everything_tapped(folder):
+    """Whatever stands beside a chamber's line that leads down, with unequal flows."""
+    valves = [{"sharing": True, "regeneration": 1e-6, "c1": 8.1e-6, "c4": 4.56e-6}]
+    between = Element("orifice", "X1.a", "X1.b", coefficient=1e-7)
+    return circuit(folder, SENSING, [EVERYTHING], valves, elements={"between": between})

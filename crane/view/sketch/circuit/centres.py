@@ -8,7 +8,7 @@ from crane.view.sketch.circuit import symbols
 from crane.view.sketch.circuit.ink import Ink, Point, Pose
 from crane.view.sketch.circuit.section import Function
 
-_FEED, _RETURN, _SIGNAL = 40.0, 59.0, 2.5  # lanes from a section's middle
+_FEED, _RETURN, _SIGNAL = 40.0, 59.0, 6.0  # lanes from a section's middle
 _STEP = 3.0  # between the lines of two pumps
 
 Ends = Mapping[str, tuple[float, Point, Point]]

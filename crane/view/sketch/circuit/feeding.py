@@ -53,11 +53,13 @@ def items_of(hydraulics: Hydraulics, functions: Sequence[Function]) -> list[Item
     return items
 
 
-def _below(ink: Ink, x: float, y: float, part: str, name: str, words: Sequence[str]) -> None:
+def _below(
+    ink: Ink, x: float, y: float, room: float, part: str, name: str, words: Sequence[str]
+) -> None:
     """Name and words below each other, the first line at y."""
-    ink.words(x, y, name, f"name {part}", size=NAME, weight="bold")
+    ink.words(x, y, name, f"name {part}", size=NAME, weight="bold", room=room - 6)
     for k, text in enumerate(words):
-        ink.words(x, y - 9 - _LINE * k, text, f"label {part}")
+        ink.words(x, y - 9 - _LINE * k, text, f"label {part}", room=room - 6)
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class _Tank(Item):
         at = x + 20
         ink.wire(TANK, (at, rails[TANK]), (at, y - 14))
         symbols.tank(ink, (at, y - 14), "tank", TANK, 11.0)
-        _below(ink, at, y - 26, "tank", "tank", self.words)
+        _below(ink, at, y - 26, self.width, "tank", "tank", self.words)
 
 
 def _tank(hydraulics: Hydraulics) -> _Tank:
@@ -84,7 +86,7 @@ class _Engine(Item):
         # the shaft goes on into the first pump
         machines.shaft(ink, (at, y - _SHAFT), (x + self.width, y - _SHAFT))
         machines.engine(ink, (at, y - _SHAFT), "engine")
-        _below(ink, at, y - _SHAFT - 20, "engine", "engine", self.words)
+        _below(ink, at, y - _SHAFT - 20, self.width, "engine", "engine", self.words)
 
 
 def _engine(engine: Engine) -> _Engine:
@@ -110,7 +112,7 @@ class _Pump(Item):
         foot = middle - machines.PUMP
         ink.wire("suction " + part, (at, foot), (at, foot - 5))
         symbols.tank(ink, (at, foot - 5), f"tank {part}", "suction " + part)
-        _below(ink, at, foot - 16, part, plain(name), self.words)
+        _below(ink, at, foot - 16, 2 * self.width - 104, part, plain(name), self.words)
         if supply.control in NAMES:
             box, control = (x + 20, y - 30), f"regulator {name}"
             machines.regulator(ink, box, NAMES[supply.control], control, supply.power > 0)
@@ -167,7 +169,7 @@ class _Accumulator(Item):
         ink.wire(self.name, (x + 14, rails[self.name]), (x + 14, middle - 22),
                  (at, middle - 22), (at, middle - 17))  # fmt: skip
         machines.accumulator(ink, (at, middle), part, self.name)
-        _below(ink, at, middle - 32, part, plain(self.name), self.words)
+        _below(ink, at, middle - 32, self.width, part, plain(self.name), self.words)
 
 
 def _accumulator(name: str, gas: Accumulator) -> _Accumulator:
@@ -200,7 +202,7 @@ class _Element(Item):
                          (lane, rails[net]))  # fmt: skip
             pose = Pose(at, middle, 3, flip=True)
         self._symbol(ink, pose, part)
-        _below(ink, x + 34, y - 52, part, plain(self.name), self.words)
+        _below(ink, x + 34, y - 52, 68.0, part, plain(self.name), self.words)
 
     @property
     def _reach(self) -> float:

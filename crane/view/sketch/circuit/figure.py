@@ -24,6 +24,7 @@ _ACROSS = 4  # functions beside each other
 _GAP, _FIRST = 9.0, 12.0  # between rails; from the lowest to what hangs on it
 _SIDE, _HEAD = 10.0, 26.0  # around all of it
 _NEAR = 3.0  # least distance of wires
+_LONG = 24  # letters of a rail's name
 
 
 def sketch_circuit(machine: Machine, path: str | Path) -> None:
@@ -254,9 +255,10 @@ def _told(hydraulics: Hydraulics, net: str) -> str:
     """What a rail is called."""
     kind, _, name = net.partition(" ")
     alone = len(hydraulics.sources) == 1
-    if kind == "C":
-        return f"{name.split()[0]} centre"
-    if kind in ("LS", "N") and name:
+    shown = net
+    if kind == "C" and name:
+        shown = f"{name.split()[0]} centre"
+    elif kind in ("LS", "N") and name:
         sign = {"LS": "LS", "N": "pN"}[kind]
-        return sign if alone else f"{sign} {plain(name)}"
-    return plain(net)
+        shown = sign if alone else f"{sign} {name}"
+    return plain(shown if len(shown) <= _LONG else f"{shown[: _LONG - 1]}…")

@@ -1,13 +1,16 @@
 """What a circuit is drawn with: wires that belong to nets, ports, lines, words, in points."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import withStroke
+from matplotlib.textpath import TextPath
 
 from crane.common.samples import Array
 from crane.view.plots.recording import INK
@@ -15,7 +18,24 @@ from crane.view.plots.recording import INK
 Point = tuple[float, float]
 _SAME = 1e-6  # [points]
 _SIGNAL = (0, (3, 2))
-SMALL, NAME = 6.3, 8.0  # sizes of words [points]
+SMALL, NAME, LEAST = 6.3, 8.0, 5.2  # sizes of words [points]
+
+
+def _fitting(text: str, size: float, room: float, weight: str) -> tuple[str, float]:
+    """A text and its size, so that it is no wider than its room."""
+    font = FontProperties(family="DejaVu Sans", weight=weight)
+
+    def width(text: str) -> float:
+        return float(TextPath((0, 0), text, size=size, prop=font).get_extents().width)
+
+    wide, least = width(text), min(LEAST / size, 1.0)
+    if wide * least > room and not text.startswith("$"):
+        end = len(text)
+        while width(text[:end].rstrip("\\") + "…") * least > room and end > 1:
+            end -= 1
+        text = text[:end].rstrip("\\") + "…"
+        wide = width(text)
+    return text, size * min(room / wide, 1.0)
 
 
 @dataclass(frozen=True)
@@ -161,9 +181,12 @@ class Ink:
         self.line([(float(x), float(y)) for x, y in points], linewidth=0.7)
 
     def words(
-        self, x: float, y: float, text: str, gid: str, size: float = SMALL, **options: Any
-    ) -> None:
-        """A line of words, its middle at y."""
+        self, x: float, y: float, text: str, gid: str, size: float = SMALL,
+        room: float = math.inf, **options: Any,
+    ) -> None:  # fmt: skip
+        """A line of words, its middle at y; smaller and cut where it would not fit its room."""
+        if len(text) * size > room:  # no letter is wider than its height
+            text, size = _fitting(text, size, room, options.get("weight", "normal"))
         look: dict[str, Any] = {"ha": "center", "va": "center", "zorder": 9} | options
         halo = [withStroke(linewidth=1.6, foreground="white")]
         self.axes.text(x, y, text, fontsize=size, gid=gid, path_effects=halo, **look)

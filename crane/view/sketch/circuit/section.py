@@ -14,7 +14,7 @@ from crane.view.sketch.sheet import symbol
 
 WIDTH = 122.0
 LANE = 14.0  # of chambers, from the section's middle
-_TAP = 56.0  # of chambers that something else is joined to, from the middle
+_TAP = 55.0  # of chambers that something else is joined to, from the middle
 _LINE = 7.6  # height of a line of words
 _LANES = {"Ta": -26.0, "LS": -20.0, "P": 0.0, "T": 12.0}
 _BENDS = {"Ta": 3.0, "LS": 5.0, "P": 7.0, "T": 4.0}  # below the valve
@@ -87,7 +87,7 @@ class Function:
         words = [f"{one} l/min"] if one == other else [f"{one} | {other}", "l/min"]
         if valve.margin > 0:
             return [*words, f"Δp {bar(valve.margin)}"]
-        return [*words, "flow sharing"] if margin else [*words, f"at {bar(_ORIFICE_DROP)}"]
+        return [*words, "sharing"] if margin else [*words, f"at {bar(_ORIFICE_DROP)}"]
 
 
 def lane_of(function: Function, port: str) -> float:
@@ -349,7 +349,8 @@ class Section:
                 turned if function.turns else f"stroke {figure(1e3 * function.stroke)} mm"
             )
         y = at[1] + TOP - NAME / 2
-        ink.words(at[0], y, symbol(function.joint), f"name {part}", size=NAME, weight="bold")
+        ink.words(at[0], y, symbol(function.joint), f"name {part}", size=NAME, weight="bold",
+                  room=WIDTH - 8)  # fmt: skip
         for k, text in enumerate(words):
             ink.words(at[0], y - 9 - _LINE * k, plain(text), f"label {part}")
 
