@@ -97,8 +97,11 @@ CALLS = {
         "rig.yaml valves.csv --joint x --model friction",
     ],
     "live": ["slider.yaml", "motion.csv"],
-    "sketch": ["slider.yaml --out {out}.png", "rig.yaml --out {out}.svg",
-               "rig.yaml --circuit --out {out}.svg"],
+    "sketch": [
+        "slider.yaml --out {out}.png",
+        "rig.yaml --out {out}.svg",
+        "rig.yaml --circuit --out {out}.svg",
+    ],
     "modes": ["slider.yaml --out {out}", "rig.yaml --vary x=0.1:0.3:2 --out {out}"],
     "simulate": [
         "slider.yaml --task swing --out {out}",
