@@ -96,6 +96,7 @@ CALLS = {
         "rig.yaml valves.csv --joint x --model valve",
         "rig.yaml valves.csv --joint x --model friction",
     ],
+    "power": ["rig.yaml valves.csv --out {out}", "rig.yaml valves.csv --until 0.3 --out {out}"],
     "live": ["slider.yaml", "motion.csv"],
     "sketch": ["slider.yaml --out {out}.png", "rig.yaml --out {out}.svg"],
     "modes": ["slider.yaml --out {out}", "rig.yaml --vary x=0.1:0.3:2 --out {out}"],
