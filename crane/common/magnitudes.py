@@ -89,6 +89,7 @@ USUAL = {
     "slip": _LEAK,
     "air": Magnitude("", 0.0, 0.2, 0.01, ((("percent", 0.01),),)),
     "speed": Magnitude("rad/s", 5.0, 2e3, 190.0, ((("rpm", math.pi / 30),),)),
+    "speed_droop": Magnitude("rad/s", 0.01, 200.0, 8.0, ((("rpm", math.pi / 30),),)),
     "torque": Magnitude("N m", 0.1, 5e4, 500.0, ((("kN m", 1e3),),)),
     "inertia": Magnitude("kg m2", 1e-5, 1e3, 2.0),
     "fuel": Magnitude("kg/J", 3e-8, 2e-7, 6e-8, ((("g/kWh", 1e-3 / 3.6e6),),)),

@@ -66,7 +66,7 @@ def _of_element(head: str, word: str, length: str) -> str:
     return units.get(head, {}).get(word, "")
 
 
-_OTHERWISE = {("engine", "droop"): "rad/s", ("element", "gain"): "m3/(s Pa)",
+_OTHERWISE = {("element", "gain"): "m3/(s Pa)",
               ("accumulator", "line"): "m3"}  # fmt: skip
 _CIRCUIT = ("cylinder", "valve", "supply", "oil", "engine", "line", "accumulator", "element")
 

@@ -7,11 +7,10 @@ from crane.codegen import Number, maximum
 from crane.codegen.scalar import minimum, where_positive
 from crane.hydraulics.components import Counterbalance, Cylinder, Valve
 from crane.hydraulics.flow import Flow, clipped, in_series, root, through
-from crane.hydraulics.nodes import softness_of
+from crane.hydraulics.nodes import PER_SENSED, softness_of
 from crane.hydraulics.sources import TANK
 
 INSIDE = ("piston", "cross")  # flows that pass no hose
-_PER_SENSED = 100.0  # one over the opening at which a valve reports all of its load
 _PLAY = 500.0  # [1/s], at which a signal takes its play along
 _SLIGHT = 0.1  # of the hose's volume, the least that a chamber holds
 FIELDS = (
@@ -127,7 +126,7 @@ class DrivenCylinder:
 
     def sensed(self, tank: Number) -> Number:
         """Pressure that its valve reports as its load, the tank's while it is closed [Pa]."""
-        shares = [clipped(y * _PER_SENSED, 0.0, 1.0) for y in self.opened]
+        shares = [clipped(y * PER_SENSED, 0.0, 1.0) for y in self.opened]
         loads = [share * (p - tank) for share, p in zip(shares, self.pressures, strict=True)]
         return tank + maximum(*loads)
 
