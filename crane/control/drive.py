@@ -91,6 +91,13 @@ class ValveDrive(Law):
         instant, _ = self._at(at)
         return self._forces(instant), instant.rates
 
+    def grip(self, at: At) -> list[Number]:
+        """Coulomb friction that is added to that of the joints `Hydraulics.gripped` [N], [N m]."""
+        instant, _ = self._at(at)
+        gripped = self.circuit.hydraulics.gripped
+        found = zip(self.circuit.joints, instant.grips, strict=True)
+        return [grip for joint, grip in found if joint in gripped]
+
     def look(self, at: At) -> list[Number]:
         """What is recorded in `channels`."""
         instant, signals = self._at(at)

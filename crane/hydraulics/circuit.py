@@ -31,6 +31,7 @@ class Instant:
 
     Attributes:
         forces: (m,) of the cylinders, F = area_a p_A - area_b p_B, equation (20) [N], [N m].
+        grips: (m,) Coulomb friction that they add to that of their joints [N], [N m].
         rates: (k,) of the states.
         spools: (m,) positions u.
         chambers: (m,) pairs A, B.
@@ -39,6 +40,7 @@ class Instant:
     """
 
     forces: list[Number]
+    grips: list[Number]
     rates: list[Number]
     spools: list[Number]
     chambers: list[tuple[Chamber, Chamber]]
@@ -197,6 +199,7 @@ class Circuit:
         elif self._limited:
             supply = common["vapour"] + maximum(state[self.stiff - 1], 0.0)
         forces: list[Number] = []
+        grips: list[Number] = []
         rates: list[Number] = []
         spools: list[Number] = []
         chambers: list[tuple[Chamber, Chamber]] = []
@@ -216,6 +219,7 @@ class Circuit:
             )
             spools.append(spool)
             forces.append(function.force)
+            grips.append(function.grip)
             chambers.append(function.chambers)
             rates += [*(side.slope for side in function.chambers), *function.spring_rate]
             rates += spool_rates
@@ -234,7 +238,7 @@ class Circuit:
             stored, kept = stored + net, kept + supply * net
         work = supply * pumped - tank * returned
         rates += [pumped, returned, stored, work, lost, kept]
-        return Instant(forces, rates, spools, chambers, supply, tank)
+        return Instant(forces, grips, rates, spools, chambers, supply, tank)
 
     def _spool(
         self, i: int, part: dict[str, Number], own: Sequence[Number], signal: Number

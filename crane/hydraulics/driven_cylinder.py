@@ -14,7 +14,7 @@ FIELDS = (
     "area_a", "area_b", "hose_a", "hose_b", "gas_a", "gas_b", "leakage", "leakage_a", "leakage_b",
     "relief", "relief_gain", "refill", "cushion", "cushion_resistance", "stiffness", "damping",
     "stroke", "c1", "c2", "c3", "c4", "margin", "neutral", "per_signal", "dead_band", "per_stroke",
-    "bandwidth", "spool_damping", "rate",
+    "bandwidth", "spool_damping", "rate", "seal_friction", "brake", "per_release",
 )  # fmt: skip
 _HOLDING = ("pressure", "pilot_ratio", "per_range", "coefficient")
 WIDTH = len(FIELDS) + 2 * len(_HOLDING)
@@ -57,6 +57,7 @@ class DrivenCylinder:
 
     Attributes:
         force: Of the cylinder, equation (20) [N], [N m].
+        grip: Coulomb friction that seals and brake add to the joint's [N], [N m]; see `_grip`.
         chambers: A and B.
         drawn: Flow from the supply [m3/s].
         returned: Flow to the tank [m3/s].
@@ -89,6 +90,7 @@ class DrivenCylinder:
         pressures = [vapour + maximum(own[side], 0.0) for side in range(2)]
         areas = [part["area_a"], part["area_b"]]
         self.force = areas[0] * pressures[0] - areas[1] * pressures[1]
+        self.grip = self._grip(pressures, tank, spool)
         self.spring_rate: list[Number] = []
         self.spring_power: Number = 0.0
         self.spring_flow: Number = 0.0
@@ -134,6 +136,21 @@ class DrivenCylinder:
             slope = net / where_positive(own[side], softness, middle)
             sides.append(Chamber(p, volume, area, fed - drained, net, slope))
         self.chambers = (sides[0], sides[1])
+
+    def _grip(self, pressures: Sequence[Number], tank: Number, spool: Number) -> Number:
+        """F_K = mu (max(p_A - p_R, 0) + max(p_B - p_R, 0)) + B (1 - (|u| - d) / e) [N], [N m].
+
+        With mu and B of the seals and the brake, its last factor within 0 and 1, d the dead band
+        and e the travel that releases it.
+        """
+        part, grip = self._part, 0.0 * tank
+        if part["seal_friction"] != 0.0:
+            above = [maximum(p - tank, 0.0) for p in pressures]
+            grip = grip + part["seal_friction"] * (above[0] + above[1])
+        if part["brake"] != 0.0:
+            travel = (apply("abs", spool) - part["dead_band"]) * part["per_release"]
+            grip = grip + part["brake"] * (1.0 - clipped(travel, 0.0, 1.0))
+        return grip
 
     def _inflow(
         self, drop: Number, inlet: Number, side: int, p: Number, other: Number, left: Number
@@ -189,6 +206,7 @@ def row_of(cylinder: Cylinder, valve: Valve, stroke: float) -> list[float]:
         "bandwidth": valve.bandwidth,
         "spool_damping": valve.damping,
         "rate": valve.rate,
+        "per_release": 1.0 / cylinder.brake_release,
     }  # fmt: skip
     holding = [_holding(cylinder.counterbalance_a), _holding(cylinder.counterbalance_b)]
     return [*(float(values[name]) for name in FIELDS), *holding[0], *holding[1]]
