@@ -93,8 +93,10 @@ class ValveDrive(Law):
 
     def grip(self, at: At) -> list[Number]:
         """Coulomb friction that is added to that of the joints `Hydraulics.gripped` [N], [N m]."""
-        instant, _ = self._at(at)
         gripped = self.circuit.hydraulics.gripped
+        if not gripped:
+            return []
+        instant, _ = self._at(at)
         found = zip(self.circuit.joints, instant.grips, strict=True)
         return [grip for joint, grip in found if joint in gripped]
 

@@ -143,7 +143,8 @@ class DrivenCylinder:
         With mu and B of the seals and the brake, its last factor within 0 and 1, d the dead band
         and e the travel that releases it.
         """
-        part, grip = self._part, 0.0 * tank
+        part = self._part
+        grip: Number = 0.0
         if part["seal_friction"] != 0.0:
             above = [maximum(p - tank, 0.0) for p in pressures]
             grip = grip + part["seal_friction"] * (above[0] + above[1])

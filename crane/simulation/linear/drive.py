@@ -146,8 +146,9 @@ class Drive:
         at = At(q_a, v_a, [*own, *integrals], settings, u, _no_inverse)
         tau, rates = control.trace(at)
         seen = [*control.look(at), *(tau[i] for i in self._forces)]
-        net = subtract(tau, self._gripped(machine, control.grip(at), v_a))
-        values = [*net, *rates[:k], *seen]
+        if grip := control.grip(at):
+            tau = subtract(tau, self._gripped(machine, grip, v_a))
+        values = [*tau, *rates[:k], *seen]
         by = [x for x in (*q_a, *v_a, *own, *u) if isinstance(x, Expression)]
         slopes = [entry for row in derivatives(values, by) for entry in row]
         words = [x.index if isinstance(x, Expression) else float(x) for x in (*values, *slopes)]
