@@ -415,6 +415,13 @@ class Problem:
                 if last:
                     raise
                 continue
+            if any(np.shape(one) != np.shape(two) for one, two in zip(found, base, strict=True)):
+                unknown = self.unknowns[i]
+                raise InputError(
+                    f"'{unknown.name}' cannot be varied about "
+                    f"{unknown.start + unknown.scale * z[i]:g}, where the machine has other "
+                    "equations: begin it elsewhere"
+                )
             return found.difference(base, side * _NUDGE)
         raise AssertionError
 
