@@ -357,6 +357,25 @@ def test_joints_that_hold_share_the_limits_of_the_moment():
     assert seals > 0.2 * limit
 
 
+@pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
+def test_measured_pressures_of_the_tank_count(tmp_path, backend):
+    """A replay of a recording whose tank is not the machine's: that of the recording counts."""
+    law = {"coulomb": 100.0, "viscous": 900.0}
+    machine = rig(tmp_path, axis="1 0 0", mass=300.0, cylinder={"seal_friction": SEAL},
+                  friction=law)  # fmt: skip
+    times = [0.0, 0.1, 0.2, 1.0]
+    tank = np.array([8e5, 8e5, 8e5, 4e5])
+    signals = crane.Signals(machine, times, {"x": [0.0, 0.0, 0.3, 0.3]}, [8e6] * 4, tank)
+    found = run(machine, signals, [0.1], 0.8, 1e-2, backend=backend)
+    late = found.time > 0.3
+    p = [found.channels[f"pressure_x_{side}"] for side in "ab"]
+    measured = found.channels["pressure_tank"]
+    assert np.ptp(measured[late]) > 1e5
+    seals = SEAL * sum(np.maximum(x - measured, 0.0) for x in p)
+    formula = 100.0 + seals + 900.0 * found.v[:, 0]
+    assert found.channels["friction_x"][late] == pytest.approx(formula[late], rel=1e-9)
+
+
 def test_what_holds_nothing_beside_what_holds_much(tmp_path):
     """A brake that is released has a limit of next to nothing; that tells nothing of others."""
     slight = dict.fromkeys(("c1", "c2", "c3", "c4"), 1e-12)
@@ -477,6 +496,11 @@ def test_sensitivities_know_seals_and_brake(tmp_path):
         assert (sizes > 0).all()
         off = np.abs(found.slopes[-100:, :, k] - true[-100:]) / sizes
         assert off.max() < 2e-3, name
+    weights = np.random.default_rng(1).normal(size=found.slopes.shape[:2]) * [1.0, 1.0, 1e-7]
+    back = crane.gradient(machine, signals(machine), [0.2], 0.6, 1e-3, of=weights, by=by,
+                          outputs=outputs, tolerance=1e-9)  # fmt: skip
+    ahead = np.einsum("ik,ikp->p", weights, found.slopes)
+    assert back.slopes == pytest.approx(ahead, rel=1e-4)
     bare = rig(tmp_path, ORIFICE, friction=law)
     with pytest.raises(CraneError, match="'cylinder.x.brake' cannot be varied about 0"):
         crane.sensitivities(bare, signals(bare), [0.2], 0.1, by=["cylinder.x.brake"])
