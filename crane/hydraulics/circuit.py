@@ -48,6 +48,7 @@ class Instant:
 
     Attributes:
         forces: (m,) of the cylinders, F = area_a p_A - area_b p_B, equation (20) [N], [N m].
+        grips: (m,) Coulomb friction that they add to that of their joints [N], [N m].
         rates: (k,) of the states.
         spools: (m,) positions u.
         chambers: (m,) pairs A, B.
@@ -63,6 +64,7 @@ class Instant:
     """
 
     forces: list[Number]
+    grips: list[Number]
     rates: list[Number]
     spools: list[Number]
     chambers: list[tuple[Chamber, Chamber]]
@@ -383,7 +385,8 @@ class Circuit:
         work = books.work - tank * books.returned
         rates += [books.pumped, books.returned, oil, work, books.lost + heat, kept]
         return Instant(
-            [one.force for one in functions], rates, spools, chambers, pressures[MAIN], tank,
+            [one.force for one in functions], [one.grip(tank) for one in functions], rates,
+            spools, chambers, pressures[MAIN], tank,
             pressures, books.flows, pumps, speed, stored,
             {one.joint: one.damped for one in functions if one.spring_rate},
         )  # fmt: skip

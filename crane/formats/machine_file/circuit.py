@@ -42,7 +42,8 @@ _REGULATED = ("control", "summed")
 MOTOR = {  # keys, and what they are of `Cylinder`
     "displacement": None, "gear": None, "volume": None,
     **{name: name for name in ("leakage", "leakage_a", "leakage_b", "relief", "relief_gain",
-                               "cross_relief", "refill", "gas_a", "gas_b")},
+                               "cross_relief", "refill", "gas_a", "gas_b", "seal_friction",
+                               "brake", "brake_release")},
 }  # fmt: skip
 
 
