@@ -94,6 +94,15 @@ class ValveDrive(Law):
         instant, _ = self._at(at)
         return self._forces(instant), instant.rates
 
+    def grip(self, at: At) -> list[Number]:
+        """Coulomb friction that is added to that of the joints `Hydraulics.gripped` [N], [N m]."""
+        gripped = self.circuit.hydraulics.gripped
+        if not gripped:
+            return []
+        instant, _ = self._at(at)
+        found = zip(self.circuit.joints, instant.grips, strict=True)
+        return [grip for joint, grip in found if joint in gripped]
+
     def look(self, at: At) -> list[Number]:
         """What is recorded in `channels`."""
         instant, signals = self._at(at)

@@ -42,7 +42,8 @@ _REGULATED = ("control", "summed")
 MOTOR = {  # keys, and what they are of `Cylinder`
     "displacement": None, "gear": None, "volume": None,
     **{name: name for name in ("leakage", "leakage_a", "leakage_b", "relief", "relief_gain",
-                               "cross_relief", "refill", "gas_a", "gas_b")},
+                               "cross_relief", "refill", "gas_a", "gas_b", "seal_friction",
+                               "brake", "brake_release")},
 }  # fmt: skip
 
 
@@ -146,7 +147,7 @@ def _turns(tree: TreeBuilder, joint: str) -> bool:
     return joint in tree.joints and tree.joints[joint].kind == "revolute"
 
 
-def part_of(section: Section, kind: type[Part], turning: bool = False, **given: Any) -> Part:
+def part_of(section: Section, kind: type[Part], turning: bool = False, /, **given: Any) -> Part:
     """A part whose remaining numbers stand in a section."""
     numbers: Any = fields(kind)  # type: ignore[arg-type]
     own = [x for x in numbers if x.name in number_names(kind) and x.name not in given]
