@@ -10,6 +10,7 @@ from crane.codegen import Program, Tape
 from crane.common.errors import RecordingError, known
 from crane.common.samples import Array, Brief
 from crane.control import Signals, ValveDrive
+from crane.description import Friction
 from crane.description.sensors import VELOCITY
 from crane.dynamics import Dynamics
 from crane.hydraulics import Circuit, Engine
@@ -22,7 +23,7 @@ from crane.recordings.summary import subject
 from crane.recordings.timeseries import TIME, check_unit, write_columns
 
 DIESEL = 840.0  # [kg/m3]
-LOAD, JOINT_FRICTION = "load", "friction"
+LOAD, JOINT_FRICTION, _GRIP = "load", "friction", "grip"
 # What an owner's power goes into, in the order in which it is told.
 PARTS = (
     SHAFT, "friction", "slip", "relief", "bypass", "element", "inlet", "compensator", "outlet",
@@ -223,7 +224,8 @@ def power_account(machine: Machine, recording: Recording) -> PowerAccount:
     rows = np.column_stack([x, v, *state, *columns.signals(), *around])
     names, values = _evaluated(circuit, rows)
     powers = dict(zip(names, values.T, strict=True))
-    friction = _friction(machine, recording)
+    grips = {joint: powers.pop(f"{joint}.{_GRIP}") for joint in circuit.joints}
+    friction = _friction(machine, recording, grips)
     for i, joint in enumerate(circuit.joints):
         rod = powers.pop(f"{joint}.{ROD}")
         lost = friction[joint] * v[:, i]
@@ -247,7 +249,7 @@ def power_account(machine: Machine, recording: Recording) -> PowerAccount:
 
 def _engine(engine: Engine, speed: Array) -> Array:
     """(N,) power of its governor at speeds (N,) [rad/s]."""
-    share = np.clip((engine.speed + engine.droop - speed) / engine.droop, 0.0, 1.0)
+    share = np.clip((engine.speed + engine.speed_droop - speed) / engine.speed_droop, 0.0, 1.0)
     return np.asarray(engine.torque * share * speed)
 
 
@@ -262,14 +264,22 @@ def _check_joints(machine: Machine, recording: Recording) -> None:
         check_unit(joint, recording.units[joint], [machine.unit(joint)])
 
 
-def _friction(machine: Machine, recording: Recording) -> dict[str, Array]:
-    """(N,) of the active joints [N], [N m]."""
+def _friction(
+    machine: Machine, recording: Recording, grips: Mapping[str, Array]
+) -> dict[str, Array]:
+    """(N,) of the active joints [N], [N m]; `grips` are of seals and brakes."""
     names = {joint: f"friction_{joint}" for joint in machine.active}
     if all(name in recording.channels for name in names.values()):
         return {joint: recording.channels[name] for joint, name in names.items()}
     order = [recording.joints.index(joint) for joint in machine.active]
-    found = Dynamics(machine).friction(recording.q[:, order], recording.v[:, order])
-    return dict(zip(machine.active, found.T, strict=True))
+    v = recording.v[:, order]
+    own = Dynamics(machine).friction(recording.q[:, order], v)
+    found = dict(zip(machine.active, own.T, strict=True))
+    for joint, grip in grips.items():
+        law, rate = machine.friction.get(joint, Friction()), v[:, machine.active.index(joint)]
+        sign = np.tanh(rate / law.smoothing) if law.smoothing else np.sign(rate)
+        found[joint] = found[joint] + grip * sign
+    return found
 
 
 class _Columns:
@@ -347,7 +357,10 @@ class _Columns:
 
 
 def _evaluated(circuit: Circuit, rows: Array) -> tuple[list[str], Array]:
-    """Names (k,) and values (N, k) of all powers at rows of x, v, states, signals, pressures."""
+    """Names (k,) and values (N, k) of powers and grips at rows (N, .).
+
+    A row has x, v, states, signals and given pressures.
+    """
 
     def build(program: Program) -> None:
         tape, m, taken = Tape(), len(circuit.joints), 0
@@ -357,6 +370,8 @@ def _evaluated(circuit: Circuit, rows: Array) -> tuple[list[str], Array]:
             taken += count
         now = circuit.at(circuit.numbers.tolist(), *given)
         powers = powers_of(circuit, now, given[1])
+        for joint, grip in zip(circuit.joints, now.grips, strict=True):
+            powers[f"{joint}.{_GRIP}"] = grip
         program.add("powers", 1, {name: [power] for name, power in powers.items()})
         size = program.outputs("powers").size
         with program.routine("along", counts=("count",), arrays=("rows", "out")) as r:

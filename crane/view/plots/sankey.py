@@ -103,10 +103,10 @@ class _Sankey:
         self._given = {x: energies[f"{x}.{SHAFT}"] for x in account.pumps
                        if energies.get(f"{x}.{SHAFT}", 0.0) > 0}  # fmt: skip
         self._all = sum(self._given.values())
-        pumps = {x for x in account.powers if owner_of(x) in account.pumps
-                 and what_of(x) in ("friction", "slip")}  # fmt: skip
+        pumps = [x for x in account.powers if owner_of(x) in account.pumps
+                 and what_of(x) in ("friction", "slip")]  # fmt: skip
         names = [x for x in account.powers if what_of(x) != SHAFT and x not in pumps]
-        self._pumps = self._group("pumps", sorted(pumps))
+        self._pumps = self._group("pumps", pumps)
         self._losses = {
             pump: sum(energies[x] for x in pumps if owner_of(x) == pump) for pump in self._given
         }
@@ -123,7 +123,7 @@ class _Sankey:
                 if group.back > _LEAST * self._all:
                     self._sources[f"{plain(group.words)}\ngives back"] = group.back
                 group.back = 0.0
-        self._groups = [group for group in groups if group.items]
+        self._groups = [group for group in groups if group.spent > _LEAST * self._all]
         self.figure = self._drawn()
 
     def _group(self, owner: str, names: list[str]) -> _Group:
@@ -137,7 +137,8 @@ class _Sankey:
                 taken = -energy
             energy, back = energy + taken, back + taken
             whose = owner_of(name)
-            words = what if owner in (whose, "pumps") else whose if what == "element" else ""
+            alone = owner == whose or len(self._given) == 1
+            words = whose if what == "element" else what if alone and what != "stored" else ""
             if energy < _LEAST * self._all:
                 small += energy
             elif energy > 0:
@@ -159,7 +160,7 @@ class _Sankey:
         self._axes, self._scale = axes, scale
         words = title(self._account.machine, f"{self._account.task} energy".strip())
         axes.text(0.1, -0.1, plain(words), fontsize=11, fontweight="bold", va="top")
-        if not self._all > 0:
+        if not self._all > 0 or not self._groups:
             axes.text(0.1, -0.6, "the shafts give nothing", va="top")
             return figure
         self._sided(self._fed(groups))
@@ -254,11 +255,11 @@ class _Sankey:
         halo = [withStroke(linewidth=2.0, foreground="white", alpha=0.8)]
         self._axes.text(
             x, y, words, ha=ha, va=va, fontsize=8, fontweight=weight, path_effects=halo,
-            rotation=90 if turned else 0,
+            rotation=90 if turned else 0, zorder=3,
         )  # fmt: skip
 
     def _bar(self, x: float, top: float, size: float, color: str) -> None:
-        box = Rectangle((x, top - size), _BAR, size, facecolor=color, linewidth=0)
+        box = Rectangle((x, top - size), _BAR, size, facecolor=color, linewidth=0, zorder=2)
         self._axes.add_patch(box)
 
     def _ribbon(
