@@ -342,6 +342,18 @@ def test_the_command_refuses_in_one_line(patu, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_one_sample_and_a_machine_at_rest_have_tables_and_pictures(patu, tmp_path):
+    """Nothing is divided by a duration or an energy of zero."""
+    machine, recording = patu
+    account = crane.power_account(machine, recording.between(0.0, 0.0))
+    assert account.mean(account.shaft) == account.shaft[0]
+    assert set(account.totals.values()) == {0.0}
+    for shown in (account, crane.power_account(machine, recording.between(0.0, 0.5))):
+        assert "nan" not in shown.to_markdown()
+        sankey_figure(shown)
+        power_figure(shown)
+
+
 @pytest.mark.parametrize("which", ["mixed", "digging"])
 def test_pictures_have_words_that_do_not_overlap(request, which):
     from matplotlib.backends.backend_agg import FigureCanvasAgg

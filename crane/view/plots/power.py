@@ -108,6 +108,13 @@ def _stack(
     axes.plot(time, shaft, color=INK, linewidth=1.1, label="shafts")
     axes.axhline(0.0, color=INK, linewidth=0.6)
     axes.margins(x=0.0)
+    axes.set_ylim(-_reach(-below, -shaft), _reach(above, shaft))
+
+
+def _reach(edge: Array, shaft: Array) -> float:
+    """How far an axis goes: a line that fills or empties within a sample may leave it."""
+    long = min(float(edge.max()), 1.5 * float(np.quantile(edge, 0.998)))
+    return 1.06 * max(long, float(shaft.max()), 0.02 * float(np.abs(shaft).max()), 1e-3)
 
 
 def _blocks(values: Array) -> Array:

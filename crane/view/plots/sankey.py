@@ -22,7 +22,7 @@ from crane.view.plots.text import plain
 _TALL = 4.2  # of all that is given [inch]
 _LINE, _GAP, _APART = 0.19, 0.05, 0.42  # of a label, between labels, between groups [inch]
 _COLUMNS = (1.35, 3.1, 5.5, 8.1)  # where bars stand [inch]
-_WIDE, _BAR, _TOP, _BOTTOM, _STUB = 10.2, 0.14, 0.3, 0.3, 0.45  # [inch]
+_WIDE, _BAR, _TOP, _BOTTOM, _STUB = 10.2, 0.14, 0.3, 0.3, 0.32  # [inch]
 _LEAST, _NOTHING = 4e-3, 1e-3  # shares of all that have a ribbon of their own, and one at all
 _NEUTRAL = "#8c9aa8"
 
@@ -161,7 +161,7 @@ class _Sankey:
         words = title(self._account.machine, f"{self._account.task} energy".strip())
         axes.text(0.1, -0.1, plain(words), fontsize=11, fontweight="bold", va="top")
         if not self._all > 0 or not self._groups:
-            axes.text(0.1, -0.6, "the shafts give nothing", va="top")
+            axes.text(0.1, -0.6, "nothing is driven", va="top")
             return figure
         self._sided(self._fed(groups))
         for group in groups:
@@ -229,8 +229,9 @@ class _Sankey:
             low = group.y - tall
             left, nose = x - _STUB, x - 0.5 * _STUB
             corners = [(left, low), (nose, low), (x, low), (x, low + back), (left, low + back)]
-            corners.append((left + 0.12, low + 0.5 * back))
-            self._axes.add_patch(Polygon(corners, facecolor=COLORS[LOAD], alpha=0.5, linewidth=0))
+            corners.append((left + 0.1, low + 0.5 * back))
+            color = COLORS[LOAD if group.words in self._account.joints else "stored"]
+            self._axes.add_patch(Polygon(corners, facecolor=color, alpha=0.5, linewidth=0))
             words = f"gives back {self._kilo(group.back)}"
             self._text(left - 0.05, low + 0.5 * back, words, ha="right", va="center")
         at = group.y
