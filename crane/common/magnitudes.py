@@ -82,6 +82,8 @@ USUAL = {
     "pilot_ratio": Magnitude("", 0.1, 100.0, 4.0),
     "bandwidth": Magnitude("rad/s", 0.5, 1e4, 50.0),
     "rate": Magnitude("1/s", 0.05, 1e3, 10.0),
+    "bore": Magnitude("m", 2e-3, 0.6, 0.1, ((("mm", 1e-3), ("cm", 1e-2)),)),
+    "rod": Magnitude("m", 1e-3, 0.5, 0.06, ((("mm", 1e-3), ("cm", 1e-2)),)),
     "standby": Magnitude("Pa", 1e5, 2e7, 2e6, _PRESSURE),
     "signal": Magnitude("Pa", 1e4, 1e7, 2e6, _PRESSURE),
     "precharge": Magnitude("Pa", 1e5, 5e7, 1e7, _PRESSURE),
