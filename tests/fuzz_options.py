@@ -96,6 +96,7 @@ CALLS = {
         "rig.yaml valves.csv --joint x --model valve",
         "rig.yaml valves.csv --joint x --model friction",
     ],
+    "power": ["rig.yaml valves.csv --out {out}", "rig.yaml valves.csv --until 0.3 --out {out}"],
     "live": ["slider.yaml", "motion.csv"],
     "sketch": [
         "slider.yaml --out {out}.png",

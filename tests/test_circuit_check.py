@@ -144,7 +144,7 @@ def test_what_is_odd_is_a_warning(base, circuit, where, line):
                                 "coefficient": 1e-5}}},
         {"supply": {"control": "negative", "flow": 3e-3, "pressure": 2.8e7, "signal": 3e6,
                     "throttle": 1e-6, "relief": 3.2e7}, **valve(centre=2e-6)},
-        {"engine": {"speed": 188.0, "torque": 600.0, "inertia": 2.0, "droop": 10.0}},
+        {"engine": {"speed": 188.0, "torque": 600.0, "inertia": 2.0, "speed_droop": 10.0}},
         {"elements": {"pre": {"type": "check", "from": "x.a", "to": "x.b", "coefficient": 1e-6,
                               "pressure": 3.5e4}}},
     ],
@@ -199,9 +199,10 @@ def test_valves_that_take_more_than_the_pump_gives_are_a_note(base):
 
 
 KINDS = (Supply, Engine, Line, Accumulator, Element, Cylinder, Valve, Counterbalance, Oil)
-# signals in volts, ratios, and damping, of which anything is usual
+# signals in volts, ratios, damping and brakes, of which anything is usual
 UNJUDGED = {("valve", "neutral"), ("valve", "full"), ("valve", "damping"),
-            ("cylinder", "damping"), ("accumulator", "exponent")}  # fmt: skip
+            ("cylinder", "damping"), ("accumulator", "exponent"),
+            ("cylinder", "brake"), ("motor", "brake")}  # fmt: skip
 # refused beyond a limit with a message of their own
 SHARES = {("valve", "dead_band"), ("valve", "hysteresis"), ("valve", "float_from")}
 
@@ -250,8 +251,8 @@ UNITS = [
     ("engine", {"speed": 1800, "torque": 600, "inertia": 2}, "'speed' of 'engine' is 1800 rad/s",
      "rpm, write 188.5"),
     ("engine", {"speed": 188, "torque": 0.06, "inertia": 2}, "'torque' of 'engine'", "kN m"),
-    ("engine", {"speed": 188, "torque": 600, "inertia": 2, "droop": 100},
-     "'droop' of 'engine' is 100 rad/s", "rpm, write 10.47"),
+    ("engine", {"speed": 188, "torque": 600, "inertia": 2, "speed_droop": 100},
+     "'speed_droop' of 'engine' is 100 rad/s", "rpm, write 10.47"),
     ("engine", {"speed": 188, "torque": 600, "inertia": 2, "fuel": 210}, "'fuel' of 'engine'",
      "g/kWh, write 5.833e-08"),
     ("engine", {"speed": 188, "torque": 600, "inertia": 2, "idle": 2}, "'idle' of 'engine'",
@@ -308,8 +309,14 @@ def test_units_that_people_write_are_told(base, key, numbers, what, unit):
     assert unit in told
 
 
-def test_the_bundled_circuits_are_not_told_of():
-    assert check("excavator").findings == ()
+@pytest.mark.parametrize(
+    "name", ["excavator", "excavator_ls", "excavator_two_pumps", "patu655_ls"]
+)
+def test_the_bundled_circuits_are_not_told_of(name):
+    assert check(name).findings == ()
+
+
+def test_the_note_on_a_bundled_circuit():
     assert check("patu655").notes == (
         "hydraulics: the valves of 'supply' take 160 l/min together, it gives 100 l/min",
     )
@@ -317,4 +324,4 @@ def test_the_bundled_circuits_are_not_told_of():
 
 def test_the_table_has_no_unknown_names():
     names = {name for kind in KINDS for name in number_names(kind)} | set(MOTOR)
-    assert set(USUAL) - names <= {"meter_out"}
+    assert set(USUAL) - names <= {"meter_out", "bore", "rod"}

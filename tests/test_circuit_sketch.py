@@ -22,12 +22,13 @@ def counted(folder, kind, count):
     return getattr(circuits, kind)(folder, count)
 
 
+BUNDLED = ("patu655", "excavator", "excavator_two_pumps")
 CASES = {
     "network": circuits.network,
     "long names": circuits.long_names,
     "tapped": circuits.everything_tapped,
     **{f"{kind} {n}": lambda folder, kind=kind, n=n: counted(folder, kind, n)
-       for kind in ("sensing", "sharing", "two_pumps") for n in (1, 3, 5, 8)},
+       for kind in ("sensing", "sharing", "two_pumps") for n in (1, 4, 5, 8)},
 }  # fmt: skip
 
 
@@ -35,7 +36,7 @@ CASES = {
 def drawings(tmp_path_factory):
     """By name machine, figure and ink."""
     machines = {name: make(tmp_path_factory.mktemp("rig")) for name, make in CASES.items()}
-    machines |= {name: crane.load(name) for name in ("patu655", "excavator")}
+    machines |= {name: crane.load(name) for name in BUNDLED}
     return {name: (machine, *circuit_figure(machine)) for name, machine in machines.items()}
 
 

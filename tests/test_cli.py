@@ -246,8 +246,8 @@ def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
         (["fly"], "No such command 'fly'"),
         (
             ["info", "zzzzzz"],
-            "known: excavator, kr300, mini_forwarder, patu655, patu655_grapple, tx40; crane list "
-            "shows all names",
+            "known: excavator, excavator_ls, excavator_two_pumps, kr300, mini_forwarder, patu655, "
+            "patu655_grapple, patu655_ls, tx40; crane list shows all names",
         ),
         (["demo", "--out", ""], "the name after --out is empty"),
         (["demo", "--out", "/dev/null"], "/dev/null: is a file"),

@@ -22,6 +22,7 @@ from crane.cli import (  # noqa: F401  register their commands
     live,
     modes,
     pictures,
+    power,
     sensitivities,
     simulate,
     stability,

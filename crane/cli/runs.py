@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from crane.motion.workspaces import Workspace
     from crane.simulation.linear import LinearModel
     from crane.simulation.sensitivity import Sensitivities
+    from crane.studies.power import PowerAccount
 
 RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
 COMPARISON = "comparison.md"
@@ -184,6 +185,28 @@ def write_sensitivities(folder: Path, found: "Sensitivities") -> None:
         (part / "sensitivities.md").write_text(found.to_text() + "\n", encoding="utf-8")
         found.to_csv(part / "sensitivities.csv")
         plot_sensitivities(found, part / "sensitivities.png")
+
+
+def write_power(folder: Path, account: "PowerAccount") -> str:
+    """Write table, powers over time and pictures into a folder, created where there is none.
+
+    Returns:
+        The table, Markdown.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.plots.power import plot_power
+    from crane.view.plots.sankey import plot_sankey
+
+    heading = title(account.machine, f"{account.task} power".strip())
+    text = f"# {heading}\n\n{account.to_markdown()}"
+    with staging(folder) as part:
+        (part / "power.md").write_text(text, encoding="utf-8")
+        account.to_csv(part / "power.csv")
+        plot_power(account, part / "power.png")
+        plot_sankey(account, part / "sankey.png")
+    return text
 
 
 def write_modes(

@@ -43,6 +43,7 @@ _ORIFICE: tuple[Units, ...] = (
     (("l/min per root of bar", _LITRE_PER_MINUTE / math.sqrt(1e5)),),
     (("l/min per root of MPa", 1e-3 * _LITRE_PER_MINUTE), ("m3/s per root of bar", 10**-2.5)),
 )
+_PRESSING: tuple[Units, ...] = ((("N per bar", 1e-5), ("N per MPa", 1e-6)),)
 
 _PORT = Magnitude("Pa", 1e5, 7e7, 2e7, _PRESSURE)
 _AREA = Magnitude("m2", 1e-6, 0.2, 3e-3, ((("cm2", 1e-4), ("mm2", 1e-6)),))
@@ -76,9 +77,13 @@ USUAL = {
     "relief_gain": Magnitude("m3/(s Pa)", 1e-13, 1e-6, 2e-9, _LEAKAGE),
     "cushion": Magnitude("m", 0.0, 1.0, 0.03, ((("mm", 1e-3),),)),
     "stiffness": Magnitude("N/m", 1e2, 1e12, 1e8, ((("N/mm", 1e3), ("kN/mm", 1e6)),)),
+    "seal_friction": Magnitude("N/Pa", 1e-8, 5e-3, 2e-4, _PRESSING),
+    "brake_release": Magnitude("", 1e-3, 1.0, 0.05, ((("percent", 1e-2),),)),
     "pilot_ratio": Magnitude("", 0.1, 100.0, 4.0),
     "bandwidth": Magnitude("rad/s", 0.5, 1e4, 50.0),
     "rate": Magnitude("1/s", 0.05, 1e3, 10.0),
+    "bore": Magnitude("m", 2e-3, 0.6, 0.1, ((("mm", 1e-3), ("cm", 1e-2)),)),
+    "rod": Magnitude("m", 1e-3, 0.5, 0.06, ((("mm", 1e-3), ("cm", 1e-2)),)),
     "standby": Magnitude("Pa", 1e5, 2e7, 2e6, _PRESSURE),
     "signal": Magnitude("Pa", 1e4, 1e7, 2e6, _PRESSURE),
     "precharge": Magnitude("Pa", 1e5, 5e7, 1e7, _PRESSURE),
@@ -89,6 +94,7 @@ USUAL = {
     "slip": _LEAK,
     "air": Magnitude("", 0.0, 0.2, 0.01, ((("percent", 0.01),),)),
     "speed": Magnitude("rad/s", 5.0, 420.0, 190.0, ((("rpm", math.pi / 30),),)),
+    "speed_droop": Magnitude("rad/s", 0.01, 60.0, 8.0, ((("rpm", math.pi / 30),),)),
     "torque": Magnitude("N m", 0.1, 5e4, 500.0, ((("kN m", 1e3),),)),
     "inertia": Magnitude("kg m2", 1e-5, 1e3, 2.0),
     "fuel": Magnitude("kg/J", 3e-8, 2e-7, 6e-8, ((("g/kWh", 1e-3 / 3.6e6),),)),
@@ -130,10 +136,12 @@ TURNING = {  # what differs where the joint turns
     "area_b": _TURN,
     "cushion": Magnitude("rad", 0.0, 3.2, 0.2, ((("degrees", math.pi / 180),),)),
     "stiffness": Magnitude("N m/rad", 1e0, 1e12, 1e7),
+    "seal_friction": Magnitude(
+        "N m/Pa", 1e-9, 1e-2, 5e-5, ((("N m per bar", 1e-5), ("N m per MPa", 1e-6)),)
+    ),
 }
 _VESSEL = Magnitude("m3", 1e-8, 0.3, 2e-3, _VOLUME)  # half a litre is a usual one, half a m3 not
 OWN = {  # what differs for a kind of part
-    ("engine", "droop"): Magnitude("rad/s", 0.1, 60.0, 10.0, ((("rpm", math.pi / 30),),)),
     ("element", "gain"): Magnitude("m3/(s Pa)", 0.0, 1e-6, 2e-9, _LEAKAGE),
     ("element", "pressure"): Magnitude("Pa", 1e3, 7e7, 1e6, _PRESSURE),
     ("accumulator", "line"): _HOSE,

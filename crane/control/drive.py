@@ -13,6 +13,8 @@ from crane.hydraulics import Circuit
 from crane.hydraulics.circuit import Instant
 from crane.machine import Machine
 
+_OWN = ("spring_", "oil_")  # states of the circuit that are recorded: compressions, oil under gas
+
 
 class ValveDrive(Law):
     """The circuit between the valves' signals and the active forces.
@@ -92,6 +94,15 @@ class ValveDrive(Law):
         instant, _ = self._at(at)
         return self._forces(instant), instant.rates
 
+    def grip(self, at: At) -> list[Number]:
+        """Coulomb friction that is added to that of the joints `Hydraulics.gripped` [N], [N m]."""
+        gripped = self.circuit.hydraulics.gripped
+        if not gripped:
+            return []
+        instant, _ = self._at(at)
+        found = zip(self.circuit.joints, instant.grips, strict=True)
+        return [grip for joint, grip in found if joint in gripped]
+
     def look(self, at: At) -> list[Number]:
         """What is recorded in `channels`."""
         instant, signals = self._at(at)
@@ -101,7 +112,7 @@ class ValveDrive(Law):
             out += [side.valve for side in sides]
         out += [instant.supply, instant.tank]
         own = dict(zip(self.circuit.states, at.state, strict=False))
-        out += [own[name] for name in own if name.startswith("spring_")]
+        out += [own[name] for name in own if name.startswith(_OWN)]
         out += [instant.pressures[name] for name in self._others]
         for pump in instant.pumps.values():
             out += [pump.share, pump.shaft]
@@ -137,7 +148,8 @@ class ValveDrive(Law):
             found += [(f"pressure_{joint}_{side}", "Pa") for side in "ab"]
             found += [(f"flow_{joint}_{side}", "m3/s") for side in "ab"]
         found += [("pressure_supply", "Pa"), ("pressure_tank", "Pa")]
-        found += [(name, "m") for name in self.circuit.states if name.startswith("spring_")]
+        units = self.circuit.states
+        found += [(name, units[name]) for name in units if name.startswith(_OWN)]
         found += [(f"pressure_{name}", "Pa") for name in self._others]
         for name in self.circuit.pumps:
             found += [(f"share_{name}", ""), (f"shaft_{name}", "W")]

@@ -59,7 +59,7 @@ def _of_element(head: str, word: str, length: str) -> str:
                        "volume": "m3", "rest": length},
         "rope": {"length": "m", "stiffness": "N/m", "damping": "s/m"},
         "end_stop": {"stiffness": stiff, "damping": f"s/{length}"},
-        "cylinder": {"damping": viscous},
+        "cylinder": {"damping": viscous, "brake": force},
         "valve_control": {"kp": f"1/{length}", "kd": f"s/{length}"},
         "valve": dict.fromkeys(("neutral", "full"), "V"),
     }  # fmt: skip

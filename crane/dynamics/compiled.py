@@ -26,7 +26,7 @@ def _observed(sweep: Sweep, moved: Moved) -> list[Number]:
 
 
 FRICTION = " with friction"
-MOVES = ("rates", "observation", "resting")  # what depends on `JointForces.set_modes`
+MOVES = ("rates", "observation", "resting")  # what depends on `set_modes`, `set_grip`
 # What can be asked of a sweep, given a second argument x (n,): a_A for inverse and regressor,
 # tau_A for the others.
 QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
@@ -170,6 +170,8 @@ def _build(
         outputs = [entry for matrix in matrices for row in matrix for entry in row]
     else:
         sweep = Sweep(posture, loops, constants, q, v_a, form, modes)
+        if modes:
+            sweep = sweep.gripped(sweep.told)
         outputs = QUANTITIES[of](sweep, x)
         if of != quantity:
             outputs = _slopes(sweep, outputs, x)

@@ -88,6 +88,8 @@ class Dynamics:
         self.pattern = self.numbers.copy()
         self._modes = modes_at(machine, self.forces) if self.backend == "compiled" else []
         self.pattern[self._modes] = np.nan
+        self._grips = slice(len(self.numbers) - len(self.forces.gripped), len(self.numbers))
+        self.pattern[self._grips] = np.nan
 
     def __repr__(self) -> str:
         """Of what, and how it is computed."""
@@ -526,6 +528,15 @@ class Dynamics:
         self.forces.set_modes(slip, held, pace, moving)
         if self._modes:
             self.numbers[self._modes] = [*np.column_stack([slip, held, pace]).ravel(), moving]
+
+    def set_grip(self, grip: Array) -> None:
+        """Say what a circuit adds to Coulomb friction; see `JointForces.set_grip`.
+
+        It counts where `set_modes` does.
+        """
+        self.forces.set_grip(grip)
+        if self.backend == "compiled":
+            self.numbers[self._grips] = grip
 
     @property
     def _n(self) -> int:

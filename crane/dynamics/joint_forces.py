@@ -20,6 +20,7 @@ _MODES = slice(_LAW.index("slip"), _LAW.index("pace") + 1)
 _SPRING = slice(_LAW.index("stiffness"), _LAW.index("slack") + 1)
 _STOP = slice(_LAW.index("stop"), _LAW.index("upper") + 1)
 _GAS = slice(_LAW.index("gas"), len(_LAW))
+TRACE = 1e-6  # of a joint that sticks by what a circuit adds alone, for it never to be none
 AT_REST = 5e-10  # velocity of a machine that is none
 STILL = 1e-9  # acceleration of a joint that is none [rad/s^2], [m/s^2]
 _JUMP = 1e300  # sharpness of a sign that is not smoothed
@@ -41,6 +42,8 @@ class JointForces:
     Attributes:
         lengths: The distances that something acts along; m of them.
         sticking: Columns of the joints whose friction sticks.
+        gripped: Columns of the joints whose Coulomb friction a circuit adds to.
+        grip: (nv,) how much that is at present [N], [N m]; see `set_grip`.
         moving: 0 where friction holds the whole machine at rest, else 1; see `set_modes`.
         table: (nv + m, 22) per joint, then per distance: Coulomb friction, its offset, viscous
             friction, its offset, one over the smoothing velocity, stiction, one over its velocity,
@@ -56,10 +59,13 @@ class JointForces:
         self._joints, self.lengths = machine.model.nv, Lengths(machine, pairs)
         table = self.table = np.zeros((self._joints + len(pairs), len(_LAW)))
         self.sticking, self.moving = sticking(machine), 1.0
+        self.gripped, self.grip = gripped(machine), np.zeros(self._joints)
         every = dict.fromkeys(machine.joints, Friction()) | dict(machine.friction)
         for joint, friction in every.items():
-            table[machine.column(joint), :7] = (
-                friction.coulomb,
+            column = machine.column(joint)
+            alone = column in self.sticking and not friction.sticks
+            table[column, :7] = (
+                TRACE if alone else friction.coulomb,
                 friction.coulomb_offset,
                 friction.viscous,
                 friction.viscous_offset,
@@ -100,6 +106,11 @@ class JointForces:
     @property
     def breakaway(self) -> Array:
         """(k,) how much friction of the joints that stick can differ from its offset at rest."""
+        return self._own_breakaway + self.grip[list(self.sticking)]
+
+    @property
+    def _own_breakaway(self) -> Array:
+        """The same without what a circuit adds."""
         law = self.table[list(self.sticking)]
         limits: Array = law[:, _LAW.index("coulomb")] + law[:, _LAW.index("stiction")]
         return limits
@@ -127,6 +138,10 @@ class JointForces:
         self.moving = float(moving)
         self.table[list(self.sticking), _MODES] = np.column_stack([slip, held, pace])
 
+    def set_grip(self, grip: Array) -> None:
+        """Say what a circuit adds to the Coulomb friction of the joints `gripped` (g,)."""
+        self.grip[list(self.gripped)] = grip
+
     def friction(self, v: Array, modes: bool = False) -> Array:
         """Drive force that friction consumes at every joint.
 
@@ -136,7 +151,8 @@ class JointForces:
 
         Args:
             v: (nv,) [m/s], [rad/s].
-            modes: Whether s of the joints whose friction sticks is what `set_modes` says.
+            modes: Whether s of the joints whose friction sticks is what `set_modes` says, and F_C
+                has what a circuit adds.
 
         Returns:
             (nv,) [N], [N m].
@@ -147,6 +163,7 @@ class JointForces:
         if modes:
             here = list(self.sticking)
             sign[here] = self.table[here, _LAW.index("slip")]
+            coulomb = coulomb + self.grip
         sticking = stiction * np.exp(-((v * stribeck) ** 2))
         return (coulomb + sticking) * sign + coulomb_offset + (viscous + viscous_offset * sign) * v
 
@@ -163,7 +180,7 @@ class JointForces:
         here = list(self.sticking)
         out = np.zeros_like(v)
         starts = (v[here] == 0) & (np.abs(a[here]) > STILL)
-        out[here] = np.where(starts, np.sign(a[here]) * self.breakaway, 0.0)
+        out[here] = np.where(starts, np.sign(a[here]) * self._own_breakaway, 0.0)
         return out
 
     def passive(self, q: Array, v: Array) -> Array:
@@ -239,9 +256,20 @@ class JointForces:
 
 
 def sticking(machine: Machine) -> tuple[int, ...]:
-    """Columns of the joints whose friction sticks, in order."""
+    """Columns of the joints whose friction sticks, in order.
+
+    By their own law, or by what a circuit adds to it where that is not smoothed.
+    """
     laws = machine.friction.items()
-    return tuple(sorted(machine.column(joint) for joint, law in laws if law.sticks))
+    found = {machine.column(joint) for joint, law in laws if law.sticks}
+    smooth = {machine.column(joint) for joint, law in laws if law.smoothing}
+    return tuple(sorted(found | set(gripped(machine)) - smooth))
+
+
+def gripped(machine: Machine) -> tuple[int, ...]:
+    """Columns of the joints `Hydraulics.gripped`, in their order."""
+    joints = machine.hydraulics.gripped if machine.hydraulics is not None else ()
+    return tuple(machine.column(joint) for joint in joints)
 
 
 def _rows(machine: Machine) -> tuple[list[int], list[Pair]]:

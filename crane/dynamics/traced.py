@@ -1,6 +1,7 @@
 """One forward sweep (Kane's form) and the forces along joints and distances, as formulas."""
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -46,7 +47,8 @@ def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Arr
     Per body mass, COM (3), inertia about it (xx, xy, xz, yy, yz, zz) in the body's directions of
     the geometry; per joint the 22 numbers of `JointForces.table`; gravity (3); per joint its rotor
     inertia; per distance its 22 numbers, and where its two ends are on their bodies, likewise;
-    whether anything moves.
+    whether anything moves; what a circuit adds to the Coulomb friction of joints
+    (`JointForces.gripped`).
     """
     bodies = []
     for i, joint in enumerate(machine.coordinates.joints, start=1):
@@ -64,7 +66,7 @@ def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Arr
         turns = (geometry.turns[machine.coordinates.bodies[joint]] for joint, _ in ends)
         places = (turn.T @ place for turn, (_, place) in zip(turns, ends, strict=True))
         numbers += [law, *places]
-    return np.concatenate([*numbers, [forces.moving]])
+    return np.concatenate([*numbers, [forces.moving], forces.grip[list(forces.gripped)]])
 
 
 def modes_at(machine: Machine, forces: JointForces) -> list[int]:
@@ -85,12 +87,14 @@ class Form:
             `crane.dynamics.recursion`.
         spans: By distance of `JointForces.lengths` the bodies that its ends are on.
         sticking: Columns of the joints whose friction sticks.
+        gripped: Columns of the joints whose Coulomb friction a circuit adds to.
     """
 
     carriers: tuple[int, ...]
     plan: Plan
     spans: Spans
     sticking: tuple[int, ...]
+    gripped: tuple[int, ...]
 
     @classmethod
     def of(cls, machine: Machine, formulation: str, forces: JointForces) -> "Form":
@@ -102,7 +106,8 @@ class Form:
         bodies = machine.coordinates.bodies
         spans = ((bodies[one], bodies[two]) for (one, _), (two, _) in forces.lengths.ends)
         plan = planned(machine) if formulation == "exact" else ()
-        return cls(carriers(machine, formulation), plan, tuple(spans), forces.sticking)
+        kinds = forces.sticking, forces.gripped
+        return cls(carriers(machine, formulation), plan, tuple(spans), *kinds)
 
 
 @dataclass(frozen=True)
@@ -146,6 +151,7 @@ class Sweep:
         gamma: Rows of gamma by joint.
         rates: (nb + 1,) joint velocities, 0 for the world.
         drift: (nb + 1,) accelerations of the joints at a_A = 0.
+        told: (g,) what the constants say that a circuit adds to Coulomb friction.
     """
 
     def __init__(
@@ -176,7 +182,9 @@ class Sweep:
             constants.vector(after + (NUMBERS + 6) * k, NUMBERS + 6)
             for k in range(len(form.spans))
         ]
-        self._moving = constants[after + (NUMBERS + 6) * len(form.spans)]
+        last = after + (NUMBERS + 6) * len(form.spans)
+        self._moving = constants[last]
+        self.told = constants.vector(last + 1, len(form.gripped))
         self.gamma = loops.gamma
         self.rates: Vector = [0.0, *(dot(self.gamma[i], v_a) for i in range(1, self._size))]
         # the loops' drift is that of the whole machine whatever carries a body
@@ -186,6 +194,18 @@ class Sweep:
         )
         self.drift = whole.drift if drift is None else drift
         self._whole, self._motion = whole, alone
+
+    def gripped(self, grip: Sequence[Number]) -> "Sweep":
+        """The same with what a circuit adds to the Coulomb friction of `Form.gripped` (g,)."""
+        if not self.form.gripped:
+            return self
+        out = copy(self)
+        for name in ("_at_joints", "_passive"):  # what is known already of their friction
+            out.__dict__.pop(name, None)
+        out._laws = list(self._laws)
+        for i, more in zip(self.form.gripped, grip, strict=True):
+            out._laws[i] = [self._laws[i][0] + more, *self._laws[i][1:]]
+        return out
 
     @cached_property
     def _columns(self) -> list[list[tuple[Vector, Vector]]]:

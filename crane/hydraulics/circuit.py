@@ -20,7 +20,7 @@ from crane.hydraulics.driven_cylinder import (
 )
 from crane.hydraulics.elements import Accumulator
 from crane.hydraulics.flow import Flow, clipped
-from crane.hydraulics.nodes import flow_of, gas_of, softness_of
+from crane.hydraulics.nodes import flow_of, gas_of, highest, joined, softness_of
 from crane.hydraulics.pump import Pump
 from crane.hydraulics.sources import MAIN, TANK, Engine, Supply
 
@@ -48,6 +48,7 @@ class Instant:
 
     Attributes:
         forces: (m,) of the cylinders, F = area_a p_A - area_b p_B, equation (20) [N], [N m].
+        grips: (m,) Coulomb friction that they add to that of their joints [N], [N m].
         rates: (k,) of the states.
         spools: (m,) positions u.
         chambers: (m,) pairs A, B.
@@ -63,6 +64,7 @@ class Instant:
     """
 
     forces: list[Number]
+    grips: list[Number]
     rates: list[Number]
     spools: list[Number]
     chambers: list[tuple[Chamber, Chamber]]
@@ -196,7 +198,7 @@ class Circuit:
         ]  # fmt: skip
 
     def _engine_row(self, engine: Engine) -> list[float]:
-        over = engine.droop / engine.speed
+        over = engine.speed_droop / engine.speed
         return [
             engine.speed, engine.torque, 1.0 / over, over, 1.0 / (engine.inertia * engine.speed),
         ]  # fmt: skip
@@ -256,7 +258,7 @@ class Circuit:
                 oil = item.volume * (1.0 - item.precharge / max(p, item.precharge))
                 state[self._place[f"oil_{name}"]] = oil
         if self._engine is not None:
-            state[self._place["engine"]] = 1.0 + self._engine.droop / self._engine.speed
+            state[self._place["engine"]] = 1.0 + self._engine.speed_droop / self._engine.speed
         return state
 
     def at(
@@ -312,11 +314,12 @@ class Circuit:
             pressures |= functions[i].nodes
         fed = {name: [one for one in functions if one.valve.supply == name] for name in pressures}
         loads = {
-            name: _highest(functions, tank)
+            name: highest([one.sensed(tank) for one in functions])
             for name, functions in fed.items()
             if functions and self._senses(name, functions)
         }
         opened = {one.joint: one.opened for one in functions}
+        loads = joined(self.hydraulics.elements.values(), loads, tank, opened)
         books = Books(pressures)
         for name, element in self.hydraulics.elements.items():
             books.enter([flow_of(name, element, others[name], pressures, opened)])
@@ -382,7 +385,8 @@ class Circuit:
         work = books.work - tank * books.returned
         rates += [books.pumped, books.returned, oil, work, books.lost + heat, kept]
         return Instant(
-            [one.force for one in functions], rates, spools, chambers, pressures[MAIN], tank,
+            [one.force for one in functions], [one.grip(tank) for one in functions], rates,
+            spools, chambers, pressures[MAIN], tank,
             pressures, books.flows, pumps, speed, stored,
             {one.joint: one.damped for one in functions if one.spring_rate},
         )  # fmt: skip
@@ -393,11 +397,3 @@ class Circuit:
         return any(one.valve.sharing for one in functions) or (
             pump is not None and pump.control == "load-sensing"
         )
-
-
-def _highest(functions: Sequence[DrivenCylinder], tank: Number) -> Number:
-    loads = [one.sensed(tank) for one in functions]
-    out = loads[0]
-    for load in loads[1:]:
-        out = maximum(out, load)
-    return out

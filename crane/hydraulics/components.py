@@ -89,6 +89,11 @@ class Cylinder:
         stiffness: Of a spring in series with the cylinder, for boom and mountings [N/m] or
             [N m/rad]; 0 for none.
         damping: Of a damper beside that spring [N s/m] or [N m s/rad].
+        seal_friction: By how much the pressures of both chambers raise the joint's Coulomb
+            friction [N/Pa] or [N m/Pa], see `DrivenCylinder.grip`.
+        brake: What a spring-applied brake holds while the spool is within its dead band [N] or
+            [N m]; 0 for none.
+        brake_release: Spool travel beyond the dead band over which it lets go.
         counterbalance_a: Load-holding valve at chamber A.
         counterbalance_b: At chamber B.
         cross_relief: Pressure of one chamber over the other at which the one is relieved into it
@@ -116,6 +121,9 @@ class Cylinder:
     cushion_coefficient: float = above(1.0e-7)
     stiffness: float = 0.0
     damping: float = above(1.0e5)
+    seal_friction: float = 0.0
+    brake: float = 0.0
+    brake_release: float = above(0.05)
     counterbalance_a: Counterbalance | None = None
     counterbalance_b: Counterbalance | None = None
     cross_relief: float = 0.0
@@ -125,6 +133,11 @@ class Cylinder:
 
     def __post_init__(self) -> None:
         check_numbers(self, f"the cylinder of '{self.joint}'")
+
+    @property
+    def grips(self) -> bool:
+        """Whether it adds to the joint's Coulomb friction."""
+        return self.seal_friction > 0 or self.brake > 0
 
 
 @dataclass(frozen=True)
@@ -317,6 +330,11 @@ class Hydraulics:
     def joints(self) -> tuple[str, ...]:
         """The joints that it drives."""
         return tuple(self.cylinders)
+
+    @property
+    def gripped(self) -> tuple[str, ...]:
+        """The joints whose Coulomb friction it adds to."""
+        return tuple(joint for joint, cylinder in self.cylinders.items() if cylinder.grips)
 
     def only(self, joints: Iterable[str]) -> "Hydraulics | None":
         """The circuit of some joints, in their order; None if it drives none of them."""

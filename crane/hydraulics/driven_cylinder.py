@@ -4,14 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from crane.codegen import Number, maximum
-from crane.codegen.scalar import minimum, where_positive
+from crane.codegen.scalar import apply, minimum, where_positive
 from crane.hydraulics.components import Counterbalance, Cylinder, Valve
 from crane.hydraulics.flow import Flow, clipped, in_series, root, through
-from crane.hydraulics.nodes import softness_of
+from crane.hydraulics.nodes import PER_SENSED, softness_of
 from crane.hydraulics.sources import TANK
 
 INSIDE = ("piston", "cross")  # flows that pass no hose
-_PER_SENSED = 100.0  # one over the opening at which a valve reports all of its load
 _PLAY = 500.0  # [1/s], at which a signal takes its play along
 _SLIGHT = 0.1  # of the hose's volume, the least that a chamber holds
 FIELDS = (
@@ -20,6 +19,7 @@ FIELDS = (
     "stroke", "c1", "c2", "c3", "c4", "margin", "neutral", "per_signal", "dead_band", "per_stroke",
     "bandwidth", "spool_damping", "rate", "cross_relief", "rupture_a", "rupture_b", "centre",
     "regeneration", "float_from", "per_float", "float_coefficient", "demand", "hysteresis",
+    "seal_friction", "brake", "per_release",
 )  # fmt: skip
 _HOLDING = ("pressure", "pilot_ratio", "per_range", "coefficient")
 WIDTH = len(FIELDS) + 2 * len(_HOLDING)
@@ -127,7 +127,7 @@ class DrivenCylinder:
 
     def sensed(self, tank: Number) -> Number:
         """Pressure that its valve reports as its load, the tank's while it is closed [Pa]."""
-        shares = [clipped(y * _PER_SENSED, 0.0, 1.0) for y in self.opened]
+        shares = [clipped(y * PER_SENSED, 0.0, 1.0) for y in self.opened]
         loads = [share * (p - tank) for share, p in zip(shares, self.pressures, strict=True)]
         return tank + maximum(*loads)
 
@@ -222,6 +222,26 @@ class DrivenCylinder:
             return self._part[name] * where_positive(stroke, curve.at(stroke), 0.0)
         return self._part[name] * self.opened[side]
 
+    def grip(self, tank: Number) -> Number:
+        """Coulomb friction that seals and brake add to the joint's [N], [N m].
+
+        F_K = mu (max(p_A - p_R, 0) + max(p_B - p_R, 0)) + B (1 - (|u| - d) / e), with mu and B of
+        the seals and the brake, its last factor within 0 and 1, d the dead band and e the travel
+        that releases it.
+
+        Args:
+            tank: p_R [Pa].
+        """
+        part = self._part
+        grip: Number = 0.0
+        if self._cylinder.seal_friction > 0:
+            above = [maximum(p - tank, 0.0) for p in self.pressures]
+            grip = grip + part["seal_friction"] * (above[0] + above[1])
+        if self._cylinder.brake > 0:
+            travel = (apply("abs", self._spool) - part["dead_band"]) * part["per_release"]
+            grip = grip + part["brake"] * (1.0 - clipped(travel, 0.0, 1.0))
+        return grip
+
     def _inflow(
         self, supply: Number, inlet: Number, side: int, load: Number
     ) -> tuple[Number, Number | None]:
@@ -305,6 +325,7 @@ def row_of(cylinder: Cylinder, valve: Valve, stroke: float) -> list[float]:
         "float_coefficient": valve.float_coefficient,
         "demand": valve.demand,
         "hysteresis": valve.hysteresis,
+        "per_release": 1.0 / cylinder.brake_release,
     }  # fmt: skip
     holding = [_holding(cylinder.counterbalance_a), _holding(cylinder.counterbalance_b)]
     return [*(float(values[name]) for name in FIELDS), *holding[0], *holding[1]]

@@ -71,7 +71,8 @@ class Element:
         leak:    gain w (p_1 - p_2)              either way
 
     w is 1, or the largest opening of the valves of `joints`, on both sides or when they move their
-    joint `out` or `back`.
+    joint `out` or `back`. An orifice that joins two pumps so joins what they know of loads, too,
+    as a merge and divide valve does.
 
     Attributes:
         kind: One of `KINDS`.

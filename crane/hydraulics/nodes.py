@@ -1,6 +1,6 @@
 """Nodes beside chambers, and elements between nodes, as formulas."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from crane.codegen import Expression, Number, maximum
 from crane.codegen.scalar import apply, where_positive
@@ -8,6 +8,7 @@ from crane.hydraulics.elements import Element
 from crane.hydraulics.flow import Flow, clipped, root
 
 GAS_PRESSURE = 1.0e5  # at which volumes of entrapped gas are given [Pa]
+PER_SENSED = 100.0  # one over the opening at which all of a load is reported
 _FULL = 0.02  # of an accumulator's gas, the least that is left
 
 
@@ -91,11 +92,45 @@ def flow_of(
         rate = numbers["coefficient"] * root(drop)
     else:
         rate = numbers["gain"] * drop
-    if element.joints:
-        sides = {"both": (0, 1), "out": (0,), "back": (1,)}[element.side]
-        openings = [opened[joint][side] for joint in element.joints for side in sides]
-        most = openings[0]
-        for opening in openings[1:]:
-            most = maximum(most, opening)
-        rate = most * rate
+    rate = opening_of(element, opened) * rate
     return Flow(element.source, element.target, rate, name)
+
+
+def opening_of(element: Element, opened: Mapping[str, Sequence[Number]]) -> Number:
+    """How far valves open an element, 0 to 1; see `flow_of`."""
+    if not element.joints:
+        return 1.0
+    sides = {"both": (0, 1), "out": (0,), "back": (1,)}[element.side]
+    return highest([opened[joint][side] for joint in element.joints for side in sides])
+
+
+def highest(values: Sequence[Number]) -> Number:
+    """The largest of some."""
+    out = values[0]
+    for value in values[1:]:
+        out = maximum(out, value)
+    return out
+
+
+def joined(
+    elements: Iterable[Element],
+    loads: Mapping[str, Number],
+    tank: Number,
+    opened: Mapping[str, Sequence[Number]],
+) -> dict[str, Number]:
+    """Highest loads by pump, where orifices between pumps join what they know of them [Pa].
+
+    Args:
+        elements: All of the circuit.
+        loads: Of each pump's own valves.
+        tank: Pressure [Pa].
+        opened: See `flow_of`.
+    """
+    out = dict(loads)
+    for element in elements:
+        pair = element.source, element.target
+        if element.kind == "orifice" and {*pair} <= loads.keys():
+            share = clipped(opening_of(element, opened) * PER_SENSED, 0.0, 1.0)
+            for one, other in (pair, pair[::-1]):
+                out[one] = maximum(out[one], tank + share * (loads[other] - tank))
+    return out

@@ -126,14 +126,15 @@ class Supply:
 class Engine:
     """What turns the pumps: J w' = T - sum of their torques.
 
-    The governor gives T = torque (speed + droop - w) / droop, held within 0 and `torque`. Pumps
-    deliver `flow` at `speed`, where it gives full torque; unloaded it turns at speed + droop.
+    The governor gives T = torque (speed + speed_droop - w) / speed_droop, held within 0 and
+    `torque`. Pumps deliver `flow` at `speed`, where it gives full torque; unloaded it turns at
+    speed + speed_droop.
 
     Attributes:
         speed: Set speed [rad/s].
         torque: The most that it gives [N m].
         inertia: Of engine and pumps [kg m2].
-        droop: Of the governor [rad/s].
+        speed_droop: Of the governor, from no to full torque [rad/s].
         fuel: Consumption [kg/J]; 0 if it is not known.
         idle: Consumption without load [kg/s].
     """
@@ -141,7 +142,7 @@ class Engine:
     speed: float = positive()
     torque: float = positive()
     inertia: float = positive()
-    droop: float = above(10.0)
+    speed_droop: float = above(10.0)
     fuel: float = 0.0
     idle: float = 0.0
 

@@ -17,6 +17,7 @@ from crane.simulation.judgement import said
 from crane.simulation.run import (
     Progress,
     as_controller,
+    as_driven,
     count_steps,
     fixed,
     integrate,
@@ -103,6 +104,7 @@ def simulate_batch(
     def run(i: int) -> _Result:
         machine = machines[i]
         control = as_controller(None if controller is None else controller(machine), machine)
+        machine = as_driven(machine, control)
         steps = count_steps(control, duration, step)
         if text := reference_beyond(machine, control, steps * step):
             beyond[i] = text

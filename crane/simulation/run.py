@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -144,6 +145,7 @@ def simulate(
         machine = load(machine)
     machine = machine.under(*loads)
     control = as_controller(controller, machine)
+    machine = as_driven(machine, control)
     steps = count_steps(control, duration, step)
     if text := reference_beyond(machine, control, steps * step):
         warnings.warn(text, CraneWarning, stacklevel=2)
@@ -332,6 +334,18 @@ def as_controller(controller: Controller | Command | Force | None, machine: Mach
             "tau_a or a controller object"
         )
     return Feedback(controller, machine)
+
+
+def as_driven(machine: Machine, control: Controller) -> Machine:
+    """The machine without seals and brakes where no circuit says what presses them."""
+    hydraulics = machine.hydraulics
+    if hydraulics is None or not hydraulics.gripped or isinstance(control, ValveDrive):
+        return machine
+    free = {
+        joint: replace(cylinder, seal_friction=0.0, brake=0.0)
+        for joint, cylinder in hydraulics.cylinders.items()
+    }
+    return machine.replace(hydraulics=replace(hydraulics, cylinders=free))
 
 
 def count_steps(control: Controller, duration: float | None, step: float) -> int:

@@ -13,6 +13,7 @@ from crane.control import Signals, ValveDrive
 from crane.dynamics import Dynamics
 from crane.dynamics.compiled import FRICTION, QUANTITIES
 from crane.dynamics.dynamics import ARGUMENTS
+from crane.dynamics.joint_forces import sticking
 from crane.dynamics.traced import Sweep
 from crane.formats import load
 from crane.hydraulics.circuit import BALANCES
@@ -146,12 +147,12 @@ def _posture(
 
 def _simulation(machine: Machine) -> tuple[dict[str, int], list[Any], Outputs]:
     """The same of what `crane.simulate` integrates."""
-    for joint, law in machine.friction.items():
-        if law.sticks:
-            raise InputError(
-                f"friction of '{joint}' sticks, so that accelerations jump: say over which "
-                f"velocity it turns, as friction.{joint}.smoothing=2e-3"
-            )
+    for column in sticking(machine):
+        joint = machine.joints[column]
+        raise InputError(
+            f"friction of '{joint}' sticks, so that accelerations jump: say over which "
+            f"velocity it turns, as friction.{joint}.smoothing=2e-3"
+        )
     # the signals are a command's references
     drive = ValveDrive(machine, Signals(machine, [0.0], {}))
     chart, layout = Chart.of(Dynamics(machine)), state_layout(machine, drive.circuit.size)
@@ -160,6 +161,7 @@ def _simulation(machine: Machine) -> tuple[dict[str, int], list[Any], Outputs]:
     # zeros among the settings are parts that the circuit has not
     at = traced.seen(settings_of(drive, tape, 2, True), tape.loads(3, 0, m))
     tau, rates = drive.trace(at)
+    traced = traced.gripped(drive, at)
     moved, stiff = traced.moved(tau, rest=False), drive.circuit.stiff
     numbers = machine.closure.fast.geometry.numbers, chart.dynamics.numbers, drive.settings
     sizes = {"q": machine.model.nv, "v_a": len(machine.active), "circuit": stiff, "signals": m}

@@ -1,7 +1,10 @@
-"""Model-based design studies: measures of a machine over its parameters."""
+"""Measures of a machine over its parameters, and of its runs."""
 
+from crane.studies.power import PowerAccount, power_account
 from crane.studies.run import study
 from crane.studies.sway import SwayRow, SwayStudy, sway_study
 from crane.studies.table import Study
 
-__all__ = ["Study", "SwayRow", "SwayStudy", "study", "sway_study"]
+__all__ = [
+    "PowerAccount", "Study", "SwayRow", "SwayStudy", "power_account", "study", "sway_study",
+]  # fmt: skip

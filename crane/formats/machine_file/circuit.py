@@ -40,11 +40,13 @@ _COMPENSATED = ("flow", "margin", "meter_out")  # what only these have
 _NODES = {"supplies": "supply", "lines": "line", "accumulators": "accumulator"}
 _EDGES = ("c1", "c2", "c3", "c4")
 _CURVED = (*_EDGES, "centre")
+_BORED = ("bore", "rod", "count")
 _REGULATED = ("control", "summed")
 MOTOR = {  # keys, and what they are of `Cylinder`
     "displacement": None, "gear": None, "volume": None,
     **{name: name for name in ("leakage", "leakage_a", "leakage_b", "relief", "relief_gain",
-                               "cross_relief", "refill", "gas_a", "gas_b")},
+                               "cross_relief", "refill", "gas_a", "gas_b", "seal_friction",
+                               "brake", "brake_release")},
 }  # fmt: skip
 
 
@@ -78,9 +80,13 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
         with recoverable():
             checked(supply_section, check_tank, supply, oil)
             warn_of_unit(supply_section, "tank", supply.tank)
+    for key in ("cylinders", "motors"):
+        section.spread(key, section.listed(key))
+    for key in ("valves", "control"):
+        section.spread(key, [*section.listed("cylinders"), *section.listed("motors")])
     named: dict[str, list[str]] = {"cylinder": [], "valve": [], "control": []}
     cylinders: dict[str, Cylinder] = {}
-    keys = (*number_names(Cylinder), *HOLDING)
+    keys: tuple[str, ...] = (*number_names(Cylinder), *HOLDING, *_BORED)
     for joint, item in section.mappings("cylinders", "cylinder of", *keys):
         named["cylinder"].append(joint)
         with recoverable():
@@ -242,7 +248,31 @@ def _cylinder(joint: str, item: Section, tree: TreeBuilder) -> Cylinder:
         problem = f"joint '{joint}' {lack}, a cylinder needs the limits of its stroke"
         flag(item.fail(None, problem))
     turning = _turns(tree, joint)
-    return part_of(item, Cylinder, turning, joint=joint, **_holding(item))
+    return part_of(item, Cylinder, turning, joint=joint, **_areas(item, turning), **_holding(item))
+
+
+def _areas(item: Section, turning: bool) -> dict[str, float]:
+    """Areas of a cylinder whose bore and rod are given, of so many side by side."""
+    count = item.number("count", 1.0)
+    if count != int(count) or count < 1:
+        raise item.fail("count", f"'count' of {item.title} is {count:g}, give a whole number")
+    if "bore" not in item:
+        for key in ("rod", "count"):
+            if key in item:
+                raise item.fail(key, f"'{key}' of {item.title} goes with 'bore', give it")
+        return {}
+    if turning:
+        raise item.fail("bore", f"{item.title} turns its joint, give area_a and area_b [m3/rad]")
+    bore, rod = item.number("bore"), item.number("rod", 0.0, minimum=0.0)
+    if not bore > rod:
+        raise item.fail("bore", f"'bore' of {item.title} is {bore:g} m, give more than the rod")
+    for key in ("area_a", "area_b"):
+        if key in item:
+            raise item.fail(key, f"'{key}' stands beside 'bore', keep one of them")
+    for key, value in (("bore", bore), ("rod", rod)):
+        warn_of_unit(item, key, value)
+    area = count * math.pi / 4.0
+    return {"area_a": area * bore**2, "area_b": area * (bore**2 - rod**2)}
 
 
 def _holding(item: Section) -> dict[str, Counterbalance]:

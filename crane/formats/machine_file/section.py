@@ -12,6 +12,7 @@ from crane.common.errors import DescriptionError, known
 from crane.description.findings import flag, recoverable
 from crane.description.sources import bundled
 
+ALL = "all"  # an item whose keys hold for all beside it
 EXTENDS = "extends"  # the key that names the file a machine file is a variant of
 
 
@@ -398,6 +399,28 @@ class Section:
             if inner is not None:
                 inner.only(*keys)
                 yield name, inner
+
+    def spread(self, key: str, names: Iterable[str]) -> None:
+        """Let what the item `all` of a mapping of mappings says hold for each of some names.
+
+        What an item says itself stands; one that is not there is made.
+        """
+        outer = self._data.get(key)
+        if not isinstance(outer, _Map) or not isinstance(outer.get(ALL), _Map):
+            return
+        common, place = outer.pop(ALL), outer.places.pop(ALL)
+        for name in names:
+            own = outer.get(name, _Map(*place))
+            if isinstance(own, _Map):
+                for word in common:
+                    if word not in own:
+                        own.put(common, word)
+                outer[name], outer.places[name] = own, outer.places.get(name, place)
+
+    def listed(self, key: str) -> list[str]:
+        """Names in a mapping, none where there is none."""
+        outer = self._data.get(key)
+        return [name for name in outer if name != ALL] if isinstance(outer, _Map) else []
 
     def _filled(self, key: str, title: str, keys: Iterable[str]) -> "Section":
         """A mapping that is not empty."""

@@ -10,8 +10,10 @@ from scipy.interpolate import CubicSpline
 
 from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
+from crane.description import Friction
 from crane.description.sensors import SENSOR, SIGNAL, Sensor, with_numbers
 from crane.dynamics import Dynamics
+from crane.dynamics.joint_forces import sticking
 from crane.formats.loading import Variants
 from crane.identification.calibration.unknowns import FITTED, Unknown
 from crane.machine import Machine
@@ -213,9 +215,9 @@ class Problem:
         if not smooth:
             return made
         friction = dict(made.friction)
-        for joint, law in friction.items():
-            if law.sticks:
-                friction[joint] = replace(law, smoothing=smooth * _SMOOTH[made.unit(joint)])
+        for joint in (made.joints[i] for i in sticking(made)):
+            law = friction.get(joint, Friction())
+            friction[joint] = replace(law, smoothing=smooth * _SMOOTH[made.unit(joint)])
         return made.replace(friction=friction)
 
     def simulated(self, case: Case, z: Array, fitted: bool) -> CubicSpline:
@@ -371,7 +373,7 @@ class Problem:
             out[:, k, moving] = sensor.scale * changes(late)[:, k]
         for i in slopes.keys() & set(numbers):
             out[:, :, i] += slopes[i]
-        if smooth > self.smooth and any(law.sticks for law in self.machine.friction.values()):
+        if smooth > self.smooth and sticking(self.machine):
             return self.residuals(case, z, fitted=True), out
         return here - case.measured, out
 
@@ -413,6 +415,13 @@ class Problem:
                 if last:
                     raise
                 continue
+            if any(np.shape(one) != np.shape(two) for one, two in zip(found, base, strict=True)):
+                unknown = self.unknowns[i]
+                raise InputError(
+                    f"'{unknown.name}' cannot be varied about "
+                    f"{unknown.start + unknown.scale * z[i]:g}, where the machine has other "
+                    "equations: begin it elsewhere"
+                )
             return found.difference(base, side * _NUDGE)
         raise AssertionError
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from crane.common.errors import CraneError
 from crane.common.samples import Array
+from crane.dynamics.joint_forces import sticking
 from crane.identification.calibration.lacking import Lacking, lacking
 from crane.identification.calibration.problem import ROUGH, Case, Problem, noise_of
 from crane.identification.calibration.unknowns import Unknown
@@ -49,7 +50,7 @@ class Search:
         self.jacobian = self.residual = self.blocks = np.zeros(0)
         self._done = done
         self._begins: Array | None = None
-        self._sticks = any(law.sticks for law in problem.machine.friction.values())
+        self._sticks = bool(sticking(problem.machine))
 
     def narrowed(self, problem: Problem, z: Array) -> "Search":
         """A search of fewer numbers that begins near where this one ended."""

@@ -10,6 +10,7 @@ from crane.common.errors import InputError, known
 from crane.common.samples import Array, as_number
 from crane.control.valves import circuit_of
 from crane.description.sensors import INCLINATION, SIGNAL, VELOCITY
+from crane.dynamics.joint_forces import sticking
 from crane.formats.loading import Variants
 from crane.identification.calibration.problem import Case, Problem, case_of
 from crane.identification.calibration.unknowns import unknowns_of
@@ -90,7 +91,7 @@ class Told:
         if any(variants.values[name] != value for name, value in begun.items()):
             self.machine = variants.machine(begun)
         # where and when something sticks depends on everything before
-        self._sticks = any(law.sticks for law in machine.friction.values())
+        self._sticks = bool(sticking(machine))
         self._problem = self._smoothed([])
 
     def variant(self, values: Mapping[str, float]) -> Machine:

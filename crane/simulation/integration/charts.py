@@ -11,7 +11,7 @@ postures (generalized coordinate partitioning, Wehage and Haug 1982).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -52,8 +52,8 @@ class Chart:
     @classmethod
     def of(cls, dynamics: Dynamics) -> "Chart":
         """The user's coordinates of a machine."""
-        machine, forces = dynamics.machine, dynamics.forces
-        sticking = Sticking(machine, forces.sticking, forces.breakaway)
+        machine = dynamics.machine
+        sticking = Sticking(machine, dynamics.forces.sticking)
         return cls(dynamics, machine.closure.active, sticking, machine.free)
 
     @property
@@ -184,5 +184,7 @@ class Chart:
             machine = self.machine.seen_from(q, names)
         except MechanismError:
             return None
+        # cylinders act, and grip, whatever the coordinates
+        machine = replace(machine, hydraulics=self.machine.hydraulics)
         dynamics = Dynamics(machine, self.dynamics.formulation, self.dynamics.backend)
         return Chart(dynamics, self.seen, self.sticking, self.free)

@@ -53,6 +53,7 @@ class PythonStepper:
             tau = np.zeros(0) if seen is None else seen[: len(chart.seen)]
             if seen is None:
                 tau, _ = self._asked(time, at, chart.velocities(at.q, at.v_a))
+            self._grip(time, at, chart.velocities(at.q, at.v_a))
             forces = chart.forces(at.q, tau)
             forces += chart.outside(time, at.q, at.v_a, at.shear).forces
             at.v_a[:] = chart.sticking.settle(self._dynamics, at.q, at.v_a, forces)
@@ -142,6 +143,7 @@ class PythonStepper:
         try:
             v_a = chart.velocities(at.q, at.v_a)
             tau, own_rate = self._asked(time, at, v_a)
+            self._grip(time, at, v_a)
             outside = chart.outside(time, at.q, at.v_a, at.shear)
             forces = chart.forces(at.q, tau) + outside.forces
             rates = self._dynamics.at("rates", at.q, at.v_a, forces)
@@ -150,6 +152,13 @@ class PythonStepper:
         self.margin = float(rates[-1])
         energies = [tau @ v_a, *outside.powers, rates[-2]]
         return np.concatenate([rates[:-2], outside.rates, own_rate, energies]), tau
+
+    def _grip(self, time: float, at: Parts, v_a: Array) -> None:
+        """Tell the dynamics what seals and brakes of a circuit add to friction."""
+        control = self._control
+        if self._dynamics.forces.gripped and isinstance(control, ValveDrive):
+            where = control.at(time, at.q[self._chart.seen], v_a, at.own)
+            self._dynamics.set_grip(np.array(control.grip(where), dtype=np.float64))
 
     def _asked(self, time: float, at: Parts, v_a: Array) -> tuple[Array, Array]:
         """What the controller answers, (n,) and (k,)."""

@@ -29,7 +29,7 @@ from crane.machine import Machine
 NEAR = 1e-10  # how far beyond a margin an event is that has been found; see `Moved.margin`
 _JERK = 1e-6  # of velocities, what no joint at rest changes when it is brought to it
 _FULL = 1.0 - 1e-12  # share of its limit from which a joint at rest gives way
-_INDEPENDENT = 1e-9  # of the largest, what rows that are independent have
+_INDEPENDENT = 1e-9  # of the largest, or of its own size, what rows that are independent have
 _SHOWN = 4  # joints that are named
 _HALVES = 200  # trials until an event is found
 
@@ -61,7 +61,6 @@ class Sticking:
     Args:
         machine: The machine, in any coordinates.
         columns: Of these joints.
-        limits: (k,) by how much their friction at rest can differ from its offset.
 
     Attributes:
         columns: The same.
@@ -74,8 +73,8 @@ class Sticking:
         switches: What has happened, the start first, of who asks for it by an empty list.
     """
 
-    def __init__(self, machine: Machine, columns: tuple[int, ...], limits: Array):
-        self.columns, self._limits = list(columns), limits
+    def __init__(self, machine: Machine, columns: tuple[int, ...]):
+        self.columns = list(columns)
         self._joints = [machine.joints[column] for column in columns]
         units = machine.closure.units[self.columns]
         self._pace = machine.closure.pace / units
@@ -113,7 +112,8 @@ class Sticking:
         """Find the modes at a closed posture.
 
         Args:
-            dynamics: Of the machine; it is told the modes.
+            dynamics: Of the machine; it is told the modes, and knows what a circuit adds to
+                friction.
             q: (nq,).
             v_a: (n,).
             tau: (n,) forces along the same coordinates.
@@ -138,7 +138,7 @@ class Sticking:
             return v_a
         parts = dynamics.at("resting", q, v_a, tau)
         drift, net = parts[n * (n + k) : -n], np.linalg.solve(half, parts[-n:])
-        limits = self._limits[rest]
+        limits = dynamics.forces.breakaway[rest]
         reach = np.linalg.solve(half, rows[rest].T) * limits
         bent = np.linalg.lstsq(reach.T, limits * drift[rest], rcond=None)[0]
         shares = _bounded(reach, net + bent)
@@ -189,14 +189,18 @@ def _bounded(reach: Array, net: Array) -> Array:
 
 
 def _independent(columns: Array) -> tuple[Indices, int]:
-    """Indices of columns that span them all, the largest first, and how many there are."""
+    """Indices of columns that span them all, the largest first, and how many there are.
+
+    Each is looked at in its own size: a limit may be next to nothing, of a brake that is released.
+    """
     from scipy.linalg import qr
 
     if not columns.size:
         return np.zeros(0, dtype=int), 0
     upper, order = qr(columns, mode="r", pivoting=True)
     sizes = np.abs(np.diag(upper))
-    rank = int((sizes > _INDEPENDENT * sizes[0]).sum())
+    own = np.linalg.norm(columns, axis=0)[order[: len(sizes)]]
+    rank = int((sizes > _INDEPENDENT * own).sum())
     return np.asarray(order[:rank], dtype=np.intp), rank
 
 

@@ -1,7 +1,7 @@
 """A machine and its controller as formulas of the state."""
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -66,6 +66,12 @@ class Traced:
         """What a controller sees."""
         inverse = self.sweep.inverse if self.chart.own else _undetermined
         return At(self.q_a, self.v_a, self.parts.own, settings, reference, inverse)
+
+    def gripped(self, control: TracedController, at: At) -> "Traced":
+        """The machine with the Coulomb friction that seals and brakes of a circuit add."""
+        if not self.sweep.form.gripped or not isinstance(control, ValveDrive):
+            return self
+        return replace(self, sweep=self.sweep.gripped(control.grip(at)))
 
     def moved(self, tau: Sequence[Number], rest: bool) -> Moved:
         """What it does under a controller's forces, with joints at rest or without."""
@@ -197,7 +203,8 @@ class Stepper:
         machine = machine_at(self._chart, tape, self._state, 4, references[own:])
         settings = settings_of(self._control, tape, 2, self._fold)
         at = machine.seen(settings, references[:own])
-        return machine, at, *self._control.trace(at)
+        tau, rates = self._control.trace(at)
+        return machine.gripped(self._control, at), at, tau, rates
 
     @property
     def width(self) -> int:
@@ -285,7 +292,9 @@ def form_of(
             f"give {n} and {states}: one per active joint, one per state"
         )
     chart.check_free(tau)
-    seen = control.look(at) if isinstance(control, ValveDrive) else []
+    seen: list[Number] = []
+    if isinstance(control, ValveDrive):
+        seen = [*control.look(at), *control.grip(at)]
     outputs = [
         [x.index if isinstance(x, Expression) else float(x) for x in part]
         for part in (tau, rates, seen, asked)

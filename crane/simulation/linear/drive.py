@@ -7,9 +7,11 @@ import numpy as np
 
 from crane.codegen import Expression, Number, Program, Tape
 from crane.codegen.derivative import derivatives
+from crane.codegen.scalar import subtract
 from crane.common.samples import Array
 from crane.control import At, Signals, ValveDrive
-from crane.dynamics import Dynamics
+from crane.dynamics import Dynamics, JointForces
+from crane.dynamics.law import sign_of
 from crane.hydraulics.circuit import BALANCES
 from crane.machine import Machine
 from crane.recordings.recording import FORCE_UNITS
@@ -144,6 +146,8 @@ class Drive:
         at = At(q_a, v_a, [*own, *integrals], settings, u, _no_inverse)
         tau, rates = control.trace(at)
         seen = [*control.look(at), *(tau[i] for i in self._forces)]
+        if grip := control.grip(at):
+            tau = subtract(tau, self._gripped(machine, grip, v_a))
         values = [*tau, *rates[:k], *seen]
         by = [x for x in (*q_a, *v_a, *own, *u) if isinstance(x, Expression)]
         slopes = [entry for row in derivatives(values, by) for entry in row]
@@ -156,6 +160,17 @@ class Drive:
         if key not in fast.programs:
             fast.programs[key] = fast.kept(key, build)
         return fast.programs[key]
+
+    @staticmethod
+    def _gripped(machine: Machine, grip: Sequence[Number], v_a: Sequence[Number]) -> list[Number]:
+        """Friction (n,) that seals and brakes add, F_K sign(v), that of joints at rest being 0."""
+        out: list[Number] = [0.0] * len(v_a)
+        forces = JointForces(machine)
+        for column, force in zip(forces.gripped, grip, strict=True):
+            i = machine.active.index(machine.joints[column])
+            sticks = column in forces.sticking
+            out[i] = force * sign_of(forces.table[column].tolist(), v_a[i], sticks, False)
+        return out
 
     def at(self, q_a: Array, v_a: Array, own: Array, u: Array) -> tuple[Array, Array]:
         """Forces (n,), rates (k,) and what is seen, and their derivatives by all arguments."""

@@ -150,6 +150,7 @@ class Rate:
         at = machine.seen(settings, references[: self._own])
         tau, own_rate = self._control.trace(at)
         look = self._control.look(at) if isinstance(self._control, ValveDrive) else []
+        machine = machine.gripped(self._control, at)
         found, sweep = machine.moved(tau, rest), machine.sweep
         active = self._chart.machine.closure.active
         rate = [*(sweep.slopes[i] for i in active), *found.a_a, *own_rate[: self._stiff]]

@@ -71,6 +71,8 @@ def setup_of(
         own = control.start_at(Dynamics(machine, backend="pinocchio"), q)
     if isinstance(control, ValveDrive):
         own = own[: control.circuit.stiff]
+    # of a variant that a circuit grips elsewhere there are more numbers
+    numbers[np.flatnonzero(np.isnan(dynamics.pattern))] = 0.0
     places = [np.zeros(0)]
     turns = geometry_of(machine.closure.equations).turns
     for link in frames:
@@ -79,7 +81,7 @@ def setup_of(
         places += [turn @ frame.placement.translation, turn @ frame.placement.rotation[:, 0]]
     return Setup(
         geometry,
-        np.where(np.isnan(dynamics.pattern), 0.0, numbers),
+        numbers,
         np.asarray(control.settings, dtype=np.float64),
         np.concatenate(places),
         references_of(machine, control, times),
