@@ -64,7 +64,7 @@ def throttle(
             arc = [(sign * 4.6, -4.0), (sign * 1.6, 0.0), (sign * 4.6, 4.0)]
         ink.line(pose(*arc))
     if adjusted:
-        ink.arrow(*pose((-6, -5), (6, 5)))
+        ink.arrow(*pose((-8, -3.5), (8, 3.5)))
 
 
 def rupture(ink: Ink, pose: Pose, part: str, nets: tuple[str, str]) -> None:
