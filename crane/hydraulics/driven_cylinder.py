@@ -157,27 +157,27 @@ class DrivenCylinder:
                 over = maximum(sign * across - part["cross_relief"], 0.0)
                 found.append(Flow(source, target, part["relief_gain"] * over, "cross"))
         if valve.regeneration > 0:
-            rate = part["regeneration"] * self.opened[0] * root(maximum(-across, 0.0))
+            orifice = in_series(part["regeneration"] * self.opened[0], *self._obstacles(1))
+            rate = self._held(orifice * root(maximum(-across, 0.0)), 1)
             found.append(Flow(node_b, node_a, rate, "regeneration"))
         floats: Number = 0.0
         if valve.float_from > 0:
             floats = clipped((-self._spool - part["float_from"]) * part["per_float"], 0.0, 1.0)
-        for side, name in enumerate("ab"):
+        for side in range(2):
             p, back, node = self.pressures[side], backs[side], nodes[side]
             to = valve.return_a if side == 0 else valve.return_b
             inlet = self._edge(*(("c1", 0) if side == 0 else ("c4", 1)))
-            if valve.float_from > 0 and side == 1:
-                inlet = inlet * (1.0 - floats)
             outlet = self._edge(*(("c3", 1) if side == 0 else ("c2", 0)))
+            if valve.float_from > 0:
+                outlet = outlet + part["float_coefficient"] * floats
+                if side == 1:
+                    inlet = inlet * (1.0 - floats)
             fed, drop = self._inflow(supply, inlet, side, load)
+            if drop is None:  # else nothing comes back
+                fed = -self._held(-fed, side) if self._ruptures(side) else fed
             found.append(Flow(valve.supply, node, fed, "inlet", drop))
             drained = -through(back - p, outlet, in_series(outlet, *self._obstacles(side)))
-            if (self._cylinder.rupture_a, self._cylinder.rupture_b)[side] > 0:
-                drained = minimum(drained, part[f"rupture_{name}"])
-            found.append(Flow(node, to, drained, "outlet"))
-            if valve.float_from > 0:
-                rate = part["float_coefficient"] * floats * root(p - back)
-                found.append(Flow(node, to, rate, "float"))
+            found.append(Flow(node, to, self._held(drained, side), "outlet"))
         return found
 
     def around(self, tank: Number) -> list[Flow]:
@@ -237,6 +237,16 @@ class DrivenCylinder:
             drop = clipped(supply - p, 0.0, margin)
             return inlet * root(drop), drop
         return through(supply - p, inlet, in_series(inlet, *self._obstacles(side))), None
+
+    def _ruptures(self, side: int) -> bool:
+        """Whether a chamber has a hose rupture valve."""
+        return (self._cylinder.rupture_a, self._cylinder.rupture_b)[side] > 0
+
+    def _held(self, rate: Number, side: int) -> Number:
+        """A flow out of a chamber, as far as its hose rupture valve lets it."""
+        if not self._ruptures(side):
+            return rate
+        return minimum(rate, self._part["rupture_a" if side == 0 else "rupture_b"])
 
     def _obstacles(self, side: int) -> tuple[Number | None, Number]:
         """In the way of the outflow: coefficient of the holding valve, 1 / c^2 of the cushion."""

@@ -23,12 +23,17 @@ def softness_of(
         soft = soft + common["steel"] * maximum(volume - hose, 0.0)
     if _is(common["air"]):
         gas = gas + common["air"] * volume
-    if _is(gas):
-        # V = gas (p0 / p)^(1/n), -dV/dp = gas / (n p0) (p0 / p)^(1 + 1/n)
-        power = common["gas_power"]
-        thin = apply("log", maximum(p, 1.0) * (1.0 / GAS_PRESSURE))
-        soft = soft + gas * (power - 1.0) * (1.0 / GAS_PRESSURE) * apply("exp", -power * thin)
-    return soft
+    return soft + bubbles(common, gas, p) if _is(gas) else soft
+
+
+def bubbles(common: Mapping[str, Number], gas: Number, p: Number) -> Number:
+    """Volume per pressure of gas in the oil.
+
+    V = gas (p0 / p)^(1/n), -dV/dp = gas / (n p0) (p0 / p)^(1 + 1/n).
+    """
+    power = common["gas_power"]
+    thin = apply("log", maximum(p, 1.0) * (1.0 / GAS_PRESSURE))
+    return gas * (power - 1.0) * (1.0 / GAS_PRESSURE) * apply("exp", -power * thin)
 
 
 def _is(number: Number) -> bool:

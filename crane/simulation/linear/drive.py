@@ -56,12 +56,12 @@ class Drive:
             self.states = dict(circuit.states)
             self._stiff, self.scales = circuit.stiff, circuit.scales[: circuit.stiff]
             self._vapour = circuit.hydraulics.oil.vapour_pressure
-            ends = [*circuit.starts, circuit.stiff]
             self._owner = {
                 name: joint
-                for joint, first, last in zip(circuit.joints, ends, ends[1:], strict=False)
+                for joint, first, last in zip(
+                    circuit.joints, circuit.starts, circuit.ends, strict=True
+                )
                 for name in list(self.states)[first:last]
-                if name != "pressure_supply"
             }
             self.inputs = {f"voltage_{joint}": "V" for joint in circuit.joints}
             self.seen = dict(control.channels) | {
@@ -73,14 +73,12 @@ class Drive:
             self._program = self._built(machine)
 
     def moving(self, v_a: Array) -> Array:
-        """(k + m,) which states and signals belong to joints that move, or to the supply."""
+        """(k + m,) which states and signals belong to joints that move, or to no joint."""
         assert self._control is not None
         joints = self._control.circuit.joints
         moving = {x for x, i in zip(joints, self._forces, strict=True) if v_a[i]}
-        own = [
-            self._owner.get(name) in moving or name == "pressure_supply" for name in self.states
-        ]
-        mask: Any = np.array([*own, *(joint in moving for joint in joints)]) & bool(moving)
+        own = [name not in self._owner or self._owner[name] in moving for name in self.states]
+        mask: Any = np.array([*own, *(joint in moving for joint in joints)])
         return mask
 
     def loaded(self, forces: Array) -> Any:
@@ -104,11 +102,29 @@ class Drive:
         z = np.concatenate([self.own, self.u])
         ways: list[Array] = []
         ends: list[tuple[float, float]] = []
-        if "pressure_supply" in names:
-            at = names.index("pressure_supply")
-            z[at] = supply.pressure - 0.5 * supply.droop - self._vapour
+
+        def free(name: str, value: float, least: float, most: float) -> None:
+            z[at := names.index(name)] = value
             ways.append(np.eye(len(z))[at])
-            ends.append((-0.5 * supply.droop, 0.5 * supply.droop))
+            ends.append((least - value, most - value))
+
+        for name, pump in self._control.circuit.pumps.items():
+            top = pump.pressure - self._vapour
+            if pump.control == "pressure":
+                free(f"pressure_{name}", top - 0.5 * pump.droop, top - pump.droop, top)
+            else:
+                free(f"pressure_{name}", 0.4 * top + pump.margin, 0.0, np.inf)
+            if f"share_{name}" in names:
+                free(f"share_{name}", 0.5, 0.0, 1.0)
+        for name in hydraulics.lines:
+            free(f"pressure_{name}", self.own[names.index(f"pressure_{name}")], 0.0, np.inf)
+        for name in hydraulics.accumulators:
+            free(f"pressure_{name}", self.own[names.index(f"pressure_{name}")], 0.0, np.inf)
+            if f"oil_{name}" in names:
+                at = names.index(f"oil_{name}")
+                free(f"oil_{name}", self.own[at], -np.inf, np.inf)
+        if "engine" in names:
+            free("engine", 1.0, 0.0, 2.0)
         for i, (joint, valve) in enumerate(hydraulics.valves.items()):
             if not (side := float(np.sign(v_a[self._forces[i]]))):
                 continue

@@ -14,7 +14,7 @@ from crane.simulation.linear.drive import Drive
 _STILL = 1e-9  # what is left of a trimmed machine, in its size per its pace squared
 _HANGS = 1e-6  # the same, of free joints that hang still
 _ROUNDS = 50  # of Newton's method
-_BAR, _MILLIMETRE, _SOON = 1e5, 1e-3, 0.1  # [Pa], [m], [s]
+_BAR, _MILLIMETRE, _THIMBLE, _SOON = 1e5, 1e-3, 1e-6, 0.1  # [Pa], [m], [m3], [s]
 
 
 def trimmed(dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array) -> tuple[Array, Array]:
@@ -75,7 +75,8 @@ class _Trim:
         n, k = len(q_a), len(drive.states)
         pressure = np.array([unit == "Pa" for unit in drive.states.values()])
         spring = np.array([name.startswith("spring_") for name in drive.states])
-        scales = np.where(pressure, _BAR, np.where(spring, _MILLIMETRE, 1.0))
+        volume = np.array([unit == "m3" for unit in drive.states.values()])
+        scales = np.select([pressure, spring, volume], [_BAR, _MILLIMETRE, _THIMBLE], 1.0)
         moving = drive.moving(v_a)
         loaded = drive.loaded(dynamics.inverse(q_a, v_a, np.zeros(n)))
         self._free = np.flatnonzero(np.concatenate([loaded | spring | moving[:k], moving[k:]]))
