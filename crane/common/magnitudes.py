@@ -94,6 +94,8 @@ USUAL = {
     "fuel": Magnitude("kg/J", 3e-8, 2e-7, 6e-8, ((("g/kWh", 1e-3 / 3.6e6),),)),
     "idle": Magnitude("kg/s", 1e-6, 1e-2, 3e-4, ((("kg/h", 1 / 3600), ("g/s", 1e-3)),)),
     "time_constant": Magnitude("s", 0.1, 1e4, 30.0),
+    "engine.droop": Magnitude("rad/s", 0.05, 300.0, 10.0, ((("rpm", math.pi / 30),),)),
+    "element.pressure": Magnitude("Pa", 1e3, 7e7, 1e7, _PRESSURE),
     "rupture_a": Magnitude("m3/s", 1e-8, 0.05, 1e-3, _FLOW),
     "rupture_b": Magnitude("m3/s", 1e-8, 0.05, 1e-3, _FLOW),
     "displacement": Magnitude(
@@ -131,11 +133,12 @@ def doubt(name: str, value: float, turning: bool = False) -> str:
     """What to say of a number that hardly is in its SI unit, else nothing.
 
     Args:
-        name: Of the number in a machine file.
+        name: Of the number in a machine file, perhaps behind that of its part: engine.droop.
         value: The number, which may be; zero is never doubted.
         turning: Whether it belongs to a joint that turns.
     """
-    usual = (TURNING if turning else {}).get(name) or USUAL.get(name)
+    word = name.rpartition(".")[2]
+    usual = (TURNING if turning else {}).get(word) or USUAL.get(name) or USUAL.get(word)
     if usual is None or value == 0 or usual.least <= value <= usual.most:
         return ""
     unit = f" {usual.unit}" if usual.unit else ""

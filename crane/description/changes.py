@@ -253,7 +253,7 @@ def _warn_of_units(spec: MachineSpec, part: str, values: Mapping[str, float]) ->
     joint = part.partition(".")[2]
     turning = joint in spec.tree.joints and spec.tree.joints[joint].kind != "prismatic"
     for name, value in values.items():
-        if text := doubt(name, value, turning):
+        if text := doubt(f"{part.partition('.')[0]}.{name}", value, turning):
             what = f"parameter '{part}.{name}' {text}"
             warnings.warn(what, CraneWarning, stacklevel=2)
 

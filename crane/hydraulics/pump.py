@@ -10,7 +10,7 @@ from crane.hydraulics.sources import TANK, Supply
 
 _SLIGHT = 1.0e4  # [Pa], below which power limits nothing
 _CENTRED = "fixed", "negative", "positive"  # whose flow goes on to the throttle without valves
-_CLOSED = 1.0e-30  # square of a coefficient that lets nothing pass
+_CLOSED = 1.0e-40  # square of a coefficient that lets nothing pass
 
 
 class Pump:

@@ -146,7 +146,9 @@ def _turns(tree: TreeBuilder, joint: str) -> bool:
     return joint in tree.joints and tree.joints[joint].kind == "revolute"
 
 
-def part_of(section: Section, kind: type[Part], turning: bool = False, **given: Any) -> Part:
+def part_of(
+    section: Section, kind: type[Part], turning: bool = False, /, **given: Any
+) -> Part:
     """A part whose remaining numbers stand in a section."""
     numbers: Any = fields(kind)  # type: ignore[arg-type]
     own = [x for x in numbers if x.name in number_names(kind) and x.name not in given]
@@ -159,7 +161,8 @@ def part_of(section: Section, kind: type[Part], turning: bool = False, **given: 
     part = checked(section, kind, **given)
     for entry in own:
         if entry.name in section and entry.name not in _TOGETHER:
-            warn_of_unit(section, entry.name, given[entry.name], turning)
+            of = kind.__name__.lower()
+            warn_of_unit(section, entry.name, given[entry.name], turning, of)
     return part
 
 
@@ -178,9 +181,11 @@ def checked(section: Section, make: Callable[..., Made], *items: object, **given
         raise section.fail(None, str(error)) from None
 
 
-def warn_of_unit(section: Section, key: str, value: float, turning: bool = False) -> None:
+def warn_of_unit(
+    section: Section, key: str, value: float, turning: bool = False, of: str = ""
+) -> None:
     """Warn of a number that can be, and hardly is in its SI unit."""
-    if text := doubt(key, value, turning):
+    if text := doubt(f"{of}.{key}" if of else key, value, turning):
         what = f"{section.where(key)}: '{key}' of {section.title} {text}"
         warnings.warn(what, CraneWarning, stacklevel=2)
 
