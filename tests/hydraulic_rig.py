@@ -49,9 +49,10 @@ def rig(
         more: Further sections: supplies, engine, lines, accumulators, elements.
     """
     motors = motors or {}
+    own = [x for x in joints if x not in motors or x in (cylinders or {})]
     links = ['<link name="base"/>']
     for joint in joints:
-        if joint in motors:
+        if joint not in own:
             links.append(
                 f'<link name="load_{joint}"><inertial><mass value="1"/>'
                 f'<inertia ixx="{inertia}" ixy="0" ixz="0" iyy="{inertia}" iyz="0" '
@@ -71,7 +72,7 @@ def rig(
     hydraulics = {
         "supply": {"pressure": 9.25e6} | (supply or {}),
         "oil": {"bulk_modulus": 1.2e9} | (oil or {}),
-        "cylinders": {x: parts | (cylinders or {}).get(x, {}) for x in joints if x not in motors},
+        "cylinders": {x: parts | (cylinders or {}).get(x, {}) for x in own},
         "valves": {x: _but(valve or ORIFICE, (valves or {}).get(x, {})) for x in joints},
     } | more
     if motors:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from circuit_state import flow, now
-from hydraulic_rig import AREA_A, AREA_B, COMPENSATED, HOSE, ORIFICE, STROKE, rig
+from hydraulic_rig import AREA_A, AREA_B, HOSE, ORIFICE, STROKE, rig
 from scipy.optimize import brentq
 
 import crane
@@ -23,7 +23,9 @@ ENGINE = {"speed": 190.0, "torque": 400.0, "inertia": 2.0, "droop": 10.0}
 def moved(machine, signals, duration, initial=None, **options):
     """A recording with valves opened after 0.1 s, within a tenth of a second."""
     n = len(machine.active)
-    initial = [0.05 if np.isfinite(x) else 0.0 for x in machine.upper] if initial is None else initial
+    initial = (
+        [0.05 if np.isfinite(x) else 0.0 for x in machine.upper] if initial is None else initial
+    )
     ramps = {joint: [0.0, 0.0, signal] for joint, signal in signals.items()}
     assert len(initial) == n
     return crane.simulate(
@@ -347,9 +349,7 @@ def test_hysteresis_is_as_wide_as_it_says(tmp_path):
     machine = rig(tmp_path, {**SIMPLE, "hysteresis": 0.06}, axis="1 0 0", supply={"pressure": 2e5})
     times = np.array([0.0, 10.0, 30.0, 50.0])
     wanted = np.array([0.0, 0.8, -0.8, 0.8])
-    run = crane.simulate(
-        machine, Signals(machine, times, {"x": wanted}), duration=50.0, step=0.01
-    )
+    run = crane.simulate(machine, Signals(machine, times, {"x": wanted}), duration=50.0, step=0.01)
     u, t = run.channels["spool_x"], run.time
     signal = np.interp(t, times, wanted)
     down, up = (t > 14) & (t < 29), (t > 34) & (t < 49)

@@ -146,9 +146,7 @@ def _turns(tree: TreeBuilder, joint: str) -> bool:
     return joint in tree.joints and tree.joints[joint].kind == "revolute"
 
 
-def part_of(
-    section: Section, kind: type[Part], turning: bool = False, /, **given: Any
-) -> Part:
+def part_of(section: Section, kind: type[Part], turning: bool = False, /, **given: Any) -> Part:
     """A part whose remaining numbers stand in a section."""
     numbers: Any = fields(kind)  # type: ignore[arg-type]
     own = [x for x in numbers if x.name in number_names(kind) and x.name not in given]

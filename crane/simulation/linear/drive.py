@@ -46,7 +46,7 @@ class Drive:
         }
         self.seen: dict[str, str] = {}
         self.own, self.u = np.zeros(0), np.zeros(len(self.inputs))
-        self.scales, self._vapour = np.zeros(0), 0.0
+        self.scales, self._vapour, self._idles = np.zeros(0), 0.0, 0.0
         self._control: ValveDrive | None = None
         self._spread = np.eye(n)[:, machine.driven]
         if valves:
@@ -55,6 +55,8 @@ class Drive:
             circuit = control.circuit
             self.states = dict(circuit.states)
             self._stiff, self.scales = circuit.stiff, circuit.scales[: circuit.stiff]
+            engine = circuit.hydraulics.engine
+            self._idles = engine.droop / engine.speed if engine is not None else 0.0
             self._vapour = circuit.hydraulics.oil.vapour_pressure
             self._owner = {
                 name: joint
@@ -72,12 +74,14 @@ class Drive:
             self.u = control.references(np.zeros(1))[0]
             self._program = self._built(machine)
 
-    def moving(self, v_a: Array) -> Array:
-        """(k + m,) which states and signals belong to joints that move, or to no joint."""
+    def moving(self, v_a: Array, shared: bool) -> Array:
+        """(k + m,) which states and signals belong to joints that move, or perhaps to no joint."""
         assert self._control is not None
         joints = self._control.circuit.joints
         moving = {x for x, i in zip(joints, self._forces, strict=True) if v_a[i]}
-        own = [name not in self._owner or self._owner[name] in moving for name in self.states]
+        own = [
+            self._owner[name] in moving if name in self._owner else shared for name in self.states
+        ]
         mask: Any = np.array([*own, *(joint in moving for joint in joints)])
         return mask
 
@@ -103,6 +107,8 @@ class Drive:
         ways: list[Array] = []
         ends: list[tuple[float, float]] = []
 
+        above: dict[str, int] = {}
+
         def free(name: str, value: float, least: float, most: float) -> None:
             z[at := names.index(name)] = value
             ways.append(np.eye(len(z))[at])
@@ -112,8 +118,12 @@ class Drive:
             top = pump.pressure - self._vapour
             if pump.control == "pressure":
                 free(f"pressure_{name}", top - 0.5 * pump.droop, top - pump.droop, top)
+            elif pump.control == "load-sensing":  # above the loads that are guessed below
+                base = 0.3 * supply.pressure + pump.margin - 0.5 * pump.droop
+                free(f"pressure_{name}", base, base - 0.5 * pump.droop, base + 0.5 * pump.droop)
+                above[name] = names.index(f"pressure_{name}")
             else:
-                free(f"pressure_{name}", 0.4 * top + pump.margin, 0.0, np.inf)
+                free(f"pressure_{name}", 0.4 * top, 0.0, np.inf)
             if f"share_{name}" in names:
                 free(f"share_{name}", 0.5, 0.0, 1.0)
         for name in hydraulics.lines:
@@ -124,7 +134,7 @@ class Drive:
                 at = names.index(f"oil_{name}")
                 free(f"oil_{name}", self.own[at], -np.inf, np.inf)
         if "engine" in names:
-            free("engine", 1.0, 0.0, 2.0)
+            free("engine", 1.0 + 0.5 * self._idles, 1.0, 1.0 + self._idles)
         for i, (joint, valve) in enumerate(hydraulics.valves.items()):
             if not (side := float(np.sign(v_a[self._forces[i]]))):
                 continue
@@ -133,6 +143,8 @@ class Drive:
                     z[at] = max(z[at], 0.3 * supply.pressure)
                     ways.append(np.eye(len(z))[at])
                     ends.append((-z[at], np.inf))
+                    if valve.supply in above and name.endswith("a" if side > 0 else "b"):
+                        ways[-1][above[valve.supply]] = 1.0
             dead, open_to = valve.dead_band, valve.dead_band + share * (1.0 - valve.dead_band)
             way = np.zeros(len(z))
             way[k + i] = side * (valve.full - valve.neutral)
