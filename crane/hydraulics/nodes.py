@@ -3,11 +3,12 @@
 from collections.abc import Mapping, Sequence
 
 from crane.codegen import Expression, Number, maximum
-from crane.codegen.scalar import apply, where_positive
+from crane.codegen.scalar import apply
 from crane.hydraulics.elements import Element
 from crane.hydraulics.flow import Flow, clipped, root
 
 GAS_PRESSURE = 1.0e5  # at which volumes of entrapped gas are given [Pa]
+_SEAT = 1.0e-3  # of an accumulator's precharge or volume, within which it runs empty
 _FULL = 0.02  # of an accumulator's gas, the least that is left
 
 
@@ -47,7 +48,8 @@ def gas_of(
     """Rates of an accumulator's states, and the heat that leaves its gas [W].
 
     See `Accumulator`. Below the precharge the gas keeps its volume, and the port's oil alone gives
-    way.
+    way; which of them does passes from one to the other within `_SEAT` below it, or above the
+    last oil. With w the share of the gas that moves, Q = line p' + w Q_g.
 
     Args:
         gas: Its numbers.
@@ -56,21 +58,19 @@ def gas_of(
         oil: In it, a state where heat leaves the gas [m3].
     """
     line, volume, precharge, n = (gas[x] for x in ("line", "volume", "precharge", "exponent"))
+    lifted = 1.0 + (p / precharge - 1.0) * (1.0 / _SEAT)
     if oil is None:
         # V_g = volume (p0 / p)^(1/n), -dV/dp = V_g / (n p)
         above = maximum(p, precharge)
         thin = apply("log", precharge / above)
         soft = volume * apply("exp", thin / n) / (n * above)
-        return [inflow / (line + where_positive(p - precharge, soft, 0.0))], 0.0
+        return [inflow / (line + clipped(lifted, 0.0, 1.0) * soft)], 0.0
     left = clipped(volume - oil, _FULL * volume, volume)
     isothermal = precharge * volume / left
     cooling = (p - isothermal) * gas["per_time"]
-    slope = (n * p * inflow / left - cooling) / (1.0 + line * n * p / left)
-    holds = maximum(oil, p - precharge)  # the gas, rather than the diaphragm its port
-    slope = where_positive(holds, slope, inflow / line)
-    into = where_positive(holds, inflow - line * slope, 0.0)
-    heat = where_positive(holds, left * cooling / (n - 1.0), 0.0)
-    return [slope, into], heat
+    moves = clipped(maximum(lifted, oil / (_SEAT * volume)), 0.0, 1.0)
+    slope = (n * p * inflow / left - moves * cooling) / (moves + line * n * p / left)
+    return [slope, inflow - line * slope], moves * left * cooling / (n - 1.0)
 
 
 def flow_of(
