@@ -406,8 +406,11 @@ class Circuit:
         total: Number = 0.0
         weighted: Number = 0.0
         for other in names:
-            total = total + rows[other]["power"]
-            weighted = weighted + rows[other]["power"] * pressures[other]
+            power: Number = self.hydraulics.sources[other].power
+            if other in rows:  # else its pressure is measured
+                power = rows[other]["power"]
+            total = total + power
+            weighted = weighted + power * pressures[other]
         return weighted / total
 
 
