@@ -11,6 +11,7 @@ from typed import typed
 import crane
 from crane.common.errors import DescriptionError, InputError
 from crane.control import Signals
+from crane.recordings import timeseries
 
 PUMP = {"control": "load-sensing", "pressure": 2e7, "flow": 6e-4, "margin": 2e6}
 LEAK = {"type": "leak", "from": "supply", "to": "tank", "gain": 1e-12}
@@ -143,6 +144,39 @@ def test_linear_model_moves_on_a_load_sensing_pump(tmp_path):
     model = crane.linearize(machine, [0.2], velocity=[0.05])
     assert {"share_supply", "engine"} <= set(model.states)
     assert np.isfinite(model.A).all()
+
+
+def test_what_knows_cylinders_alone_says_so(tmp_path):
+    machine = everything(tmp_path)
+    told = typed(
+        "simulate", tmp_path / "rig.yaml", "--out", tmp_path / "run", "--controller",
+        "valve-feedforward",
+    )  # fmt: skip
+    assert told.returncode == 2 and not (tmp_path / "run").exists()
+    assert "knows cylinders, 'z' has a motor: take valve-pd" in told.stderr
+    with pytest.raises(InputError, match="that of 'rig' has load-sensing control"):
+        crane.excite_valves(machine, ["oil.bulk_modulus"], trials=2)
+
+
+@pytest.mark.slow
+def test_calibration_finds_numbers_of_pumps_and_elements(tmp_path):
+    """From a recording of the truth, by a machine whose throttles are 7 and 15 % off."""
+    machine = everything(tmp_path)
+    run = crane.simulate(machine, Signals(machine, TIMES, SIGNALS), duration=2.0)
+    names = [f"pressure_{joint}_{side}" for joint in "xyzw" for side in "ab"]
+    units = {"time": "s", **{f"voltage_{x}": "V" for x in "xyzw"}}
+    units |= {x: machine.unit(x) for x in "xyzw"} | dict.fromkeys(names, "Pa")
+    columns = [run.channels[x] for x in (*(f"voltage_{x}" for x in "xyzw"), *names)]
+    values = np.column_stack([run.time, *columns[:4], *run.q.T, *columns[4:]])
+    timeseries.write(tmp_path / "run.csv", timeseries.Table(units, values, {}))
+    true = {"element.cooler.coefficient": 2e-6, "supply.second.throttle": 6e-7}
+    wrong = crane.load(
+        tmp_path / "rig.yaml",
+        {"element.cooler.coefficient": 2.3e-6, "supply.second.throttle": 6.4e-7},
+    )
+    found = crane.calibrate(wrong, tmp_path / "run.csv", dict.fromkeys(true)).values
+    for name, value in true.items():
+        assert found[name] == pytest.approx(value, rel=1e-5)
 
 
 def test_sensitivities_by_numbers_of_the_circuit(tmp_path):
