@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from circuit_state import flow, now
+from circuits import gaps
 from hydraulic_rig import AREA_A, AREA_B, HOSE, ORIFICE, STROKE, rig
 from scipy.optimize import brentq
 
@@ -342,6 +343,17 @@ def test_a_floating_load_sinks_by_its_weight(tmp_path):
     assert a - TANK == pytest.approx((v * AREA_A / 3.4e-6) ** 2, rel=1e-6)
     held = AREA_A * a - AREA_B * b + 300 * v
     assert held == pytest.approx(2000 * 9.81, rel=1e-6)
+
+
+def test_a_floating_load_that_lands_is_followed(tmp_path):
+    """It bounces while both chambers are sucked empty, in a few steps per row."""
+    machine = rig(tmp_path, {**SIMPLE, "float_from": 0.8, "float_coefficient": 3e-6})
+    with pytest.warns(crane.CraneWarning, match="beyond its stroke"):
+        run = moved(machine, {"x": -1.0}, 1.2, initial=[0.5])
+    oil, energy = gaps(run, machine)
+    assert oil < 1e-12 and energy < 1e-6
+    voids = run.channels["pressure_x_a"] <= 1e3
+    assert voids.any() and not voids[-1000:].all()
 
 
 def test_hysteresis_is_as_wide_as_it_says(tmp_path):

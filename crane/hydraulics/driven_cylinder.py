@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from crane.codegen import Number, maximum
 from crane.codegen.scalar import minimum, where_positive
 from crane.hydraulics.components import Counterbalance, Cylinder, Valve
-from crane.hydraulics.flow import Flow, clipped, in_series, root, through
+from crane.hydraulics.flow import LAMINAR, Flow, clipped, in_series, root, through
 from crane.hydraulics.nodes import softness_of
 from crane.hydraulics.sources import TANK
 
@@ -212,7 +212,13 @@ class DrivenCylinder:
             volume = maximum(hose + area * self._left[side], _SLIGHT * hose)
             half = hose + 0.5 * area * part["stroke"]
         softness = softness_of(self._common, volume, hose, gas, p)
-        slope = net / where_positive(self._own[side], softness, self._common["oil"] * half)
+        void = self._common["oil"] * half
+        if self.valve.float_from > 0:
+            # it runs into voids all the time: over a jump steps get a million times shorter
+            filled = clipped(self._own[side] * (1.0 / LAMINAR), 0.0, 1.0)
+            slope = net / (void + (softness - void) * filled)
+        else:
+            slope = net / where_positive(self._own[side], softness, void)
         return Chamber(p, volume, area, valve, net, slope)
 
     def _edge(self, name: str, side: int) -> Number:
