@@ -4,7 +4,7 @@ import itertools
 from collections import Counter
 from dataclasses import replace
 
-import circuits
+import drawn_circuits as circuits
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from test_sketch import overlaps

@@ -271,7 +271,7 @@ def test_series_spring_gives_way_by_force_over_stiffness(tmp_path):
     # at rest: the chamber's volume is that of the stroke and of what the spring gives way
     circuit = Circuit(machine.hydraulics, [STROKE])
     weight = 2000 * G
-    start = circuit.start(np.array([0.2]), np.array([weight]), {}, np.array([0.0]), 0.0, 1e5)
+    start = circuit.start(np.array([0.2]), np.array([weight]), {}, np.array([0.0]), 1e5)
     assert start[2] == pytest.approx(weight / 5e6, rel=1e-12)
     assert recording.q[-1] == pytest.approx(0.2, abs=1e-9)
 
@@ -293,7 +293,7 @@ def test_no_void_is_measured(tmp_path):
     machine = rig(tmp_path)
     circuit = Circuit(machine.hydraulics, [STROKE])
     one, none = np.array([0.2]), np.array([0.0])
-    start = circuit.start(one, none, {"x": (0.0, 1e3)}, none, 9e6, 1e5)
+    start = circuit.start(one, none, {"x": (0.0, 1e3)}, none, 1e5)
     np.testing.assert_array_equal(start[:2], [0.0, 0.0])
 
 

@@ -158,7 +158,7 @@ def test_everything_is_told(mixed):
     assert busy >= {
         "supply.shaft", "second.shaft", "supply.friction", "supply.slip", "second.bypass",
         "x.inlet", "x.compensator", "x.outlet", "x.damper", "x.spring", "x.stored",
-        "x.friction", "x.load", "y.inlet", "y.outlet", "y.float", "y.load",
+        "x.friction", "x.load", "y.inlet", "y.outlet", "y.load",
         "preload.element", "charging.element", "bleed.element", "leak.element", "gas.stored",
         "return.stored", "gas.cooling", "tank.stored",
     }  # fmt: skip

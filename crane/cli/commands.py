@@ -257,11 +257,11 @@ def _describe(machine: "Machine") -> Iterator[str]:
         yield f"  hydraulics  {1e-5 * supply.pressure:.4g} bar{flow}"
         for joint, cylinder in machine.hydraulics.cylinders.items():
             valve = machine.hydraulics.valves[joint]
-            kind = "compensated valve" if valve.margin else "orifice valve"
+            kind = "sharing" if valve.sharing else "compensated" if valve.margin else "orifice"
             unit = "cm2" if machine.unit(joint) == "m" else "cm3/rad"
             size = 1e4 if unit == "cm2" else 1e6
             yield (
-                f"    {joint:<{width}}{kind}, {size * cylinder.area_a:.4g} and "
+                f"    {joint:<{width}}{kind} valve, {size * cylinder.area_a:.4g} and "
                 f"{size * cylinder.area_b:.4g} {unit}"
             )
     for name, sensor in machine.sensors.items():

@@ -79,11 +79,11 @@ class ValveDrive(Law):
         signals: Sequence[Number] = [valve.neutral for valve in hydraulics.valves.values()]
         if not self.period:
             signals = self.command.signals(at._replace(settings=self.command.settings.tolist()))
-        supply, tank = hydraulics.supply.pressure, hydraulics.supply.tank
+        tank = hydraulics.supply.tank
         if self.command.measured:
-            supply, tank = np.array(at.reference[-2:], dtype=np.float64).tolist()
+            tank = float(np.array(at.reference[-1], dtype=np.float64))
         levels = np.array(signals, dtype=np.float64)
-        return list(self.circuit.start(x, weight, self._pressures, levels, supply, tank))
+        return list(self.circuit.start(x, weight, self._pressures, levels, tank))
 
     def references(self, times: Array) -> Array:
         """See `TracedController`."""

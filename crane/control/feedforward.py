@@ -72,6 +72,12 @@ class ValveFeedforward(ValvePD):
             reference = without_sway(machine, reference, "none")
         super().__init__(machine, reference, gains)
         circuit = circuit_of(machine)
+        for joint, cylinder in circuit.cylinders.items():
+            if cylinder.motor:
+                raise InputError(
+                    f"the feedforward of valves knows cylinders, '{joint}' has a motor: take "
+                    "valve-pd"
+                )
         self.planned, self._free = reference, np.flatnonzero(~machine.driven)
         valves = circuit.valves.values()
         lags = [2.0 * x.damping / x.bandwidth if x.bandwidth else 0.0 for x in valves]

@@ -115,7 +115,8 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
                 found[f"{head}.{field.name}"] = getattr(item, field.name)
     if spec.hydraulics is not None:
         for head, part in circuit_parts(spec.hydraulics).items():
-            found |= {f"{head}.{name}": getattr(part, name) for name in number_names(type(part))}
+            of = [x for x in number_names(type(part)) if (head[:7], x) != ("supply.", "tank")]
+            found |= {f"{head}.{name}": getattr(part, name) for name in of}
     if spec.tip is not None:
         found[PAYLOAD] = 0.0
     return found | named_numbers(spec.sensors)

@@ -20,7 +20,7 @@ from crane.hydraulics.driven_cylinder import (
 )
 from crane.hydraulics.elements import Accumulator
 from crane.hydraulics.flow import Flow, clipped
-from crane.hydraulics.nodes import flow_of, gas_of, highest, joined, softness_of
+from crane.hydraulics.nodes import bubbles, flow_of, gas_of, highest, joined
 from crane.hydraulics.pump import Pump
 from crane.hydraulics.sources import MAIN, TANK, Engine, Supply
 
@@ -116,6 +116,7 @@ class Circuit:
             for name, pump in hydraulics.sources.items()
             if pump.flow > 0 and not (measured and name == MAIN)
         }
+        self._ample = {x: y for x, y in hydraulics.supplies.items() if x not in self.pumps}
         self._parts = [
             (cylinder, valve, 0.0 if cylinder.motor else stroke)
             for cylinder, valve, stroke in zip(
@@ -127,6 +128,7 @@ class Circuit:
             self._common(),
             *(row_of(*part) for part in self._parts),
             *(self._pump_row(pump) for pump in self.pumps.values()),
+            *([pump.pressure] for pump in self._ample.values()),
             *([self._engine_row(self._engine)] if self._engine else []),
             *([line.volume / hydraulics.oil.bulk_modulus] for line in hydraulics.lines.values()),
             *(self._gas_row(item) for item in hydraulics.accumulators.values()),
@@ -214,7 +216,6 @@ class Circuit:
         forces: Array,
         pressures: dict[str, tuple[float, float]],
         signals: Array,
-        supply: float,
         tank: float,
     ) -> Array:
         """States (size,) at rest.
@@ -225,8 +226,7 @@ class Circuit:
                 carries it bears the tank's pressure on the other side, too.
             pressures: Those of A and B [Pa] where they are known, by joint.
             signals: (m,) of the valves [V], to which the spools have come.
-            supply: Pressure of the first pump's line [Pa].
-            tank: Of the tank's [Pa].
+            tank: Pressure of the tank [Pa].
         """
         state = np.zeros(self.size)
         least, vapour = tank, self.hydraulics.oil.vapour_pressure
@@ -245,8 +245,7 @@ class Circuit:
                 if name in self._place:
                     state[self._place[name]] = np.clip(u, -1.0, 1.0)
         for name, pump in self.pumps.items():
-            p = supply if name == MAIN else pump.rest
-            state[self._place[f"pressure_{name}"]] = p - vapour
+            state[self._place[f"pressure_{name}"]] = pump.rest(tank) - vapour
             if pump.response > 0:
                 state[self._place[f"share_{name}"]] = pump.least
         for name, line in self.hydraulics.lines.items():
@@ -288,6 +287,7 @@ class Circuit:
         common = row(_COMMON)
         rows = [list(islice(taken, WIDTH)) for _ in self._parts]
         pump_rows = {name: row(_PUMP) for name in self.pumps}
+        ample = {name: next(taken) for name in self._ample}
         engine = row(_ENGINE) if self._engine is not None else {}
         lines = {name: next(taken) for name in self.hydraulics.lines}
         gases = {name: row(_ACCUMULATOR) for name in self.hydraulics.accumulators}
@@ -297,7 +297,7 @@ class Circuit:
         if self.measured:
             supply, tank = given
         pressures: dict[str, Number] = {TANK: tank, MAIN: supply}
-        pressures |= {name: pump.pressure for name, pump in self.hydraulics.supplies.items()}
+        pressures |= ample
         for name in (*self.pumps, *lines, *gases):
             pressures[name] = common["vapour"] + maximum(own[f"pressure_{name}"], 0.0)
         functions: list[DrivenCylinder] = []
@@ -350,7 +350,8 @@ class Circuit:
         speed: Number = own["engine"] if self._engine is not None else 1.0
         pumps = {
             name: Pump(
-                name, pump, pump_rows[name], pressures, loads.get(name, tank), fed[name], speed,
+                name, pump, pump_rows[name], pressures, loads.get(name, tank),
+                self._limiting(name, pressures, pump_rows), fed[name], speed,
                 own.get(f"share_{name}"),
             )
             for name, pump in self.pumps.items()
@@ -363,7 +364,8 @@ class Circuit:
         for name in (*pumps, *lines):
             soft, net = pump_rows[name]["line"] if name in pumps else lines[name], books.nets[name]
             if self.hydraulics.oil.air > 0:
-                soft = softness_of(common, soft / common["oil"], 0.0, 0.0, pressures[name])
+                free = common["air"] * soft / common["oil"]
+                soft = soft + bubbles(common, free, pressures[name])
             rates += [net / soft, *(pumps[name].share_rate if name in pumps else ())]
             stored[name], oil = pressures[name] * net, oil + net
         for name, gas in gases.items():
@@ -397,3 +399,20 @@ class Circuit:
         return any(one.valve.sharing for one in functions) or (
             pump is not None and pump.control == "load-sensing"
         )
+
+    def _limiting(
+        self, name: str, pressures: dict[str, Number], rows: dict[str, dict[str, Number]]
+    ) -> Number:
+        """Pressure that a pump's power is divided by, see `Supply` [Pa]."""
+        names = self.pumps[name].summed
+        if len(names) < 2:
+            return pressures[names[0] if names else name]
+        total: Number = 0.0
+        weighted: Number = 0.0
+        for other in names:
+            power: Number = self.hydraulics.sources[other].power
+            if other in rows:  # else its pressure is measured
+                power = rows[other]["power"]
+            total = total + power
+            weighted = weighted + power * pressures[other]
+        return weighted / total

@@ -4,12 +4,12 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-from crane.common.errors import InputError, known
+from crane.common.errors import known
 from crane.common.magnitudes import meant
 from crane.hydraulics.curve import Curve
 from crane.hydraulics.elements import Accumulator, Element, Line
-from crane.hydraulics.numbers import PartError, above, check_numbers, positive, signed
-from crane.hydraulics.sources import MAIN, TANK, Engine, Supply, check_summed
+from crane.hydraulics.numbers import PartError, PlacedError, above, check_numbers, positive, signed
+from crane.hydraulics.sources import MAIN, TANK, Engine, Supply, check_summed, check_tanks
 
 HOLDING = ("counterbalance_a", "counterbalance_b")  # valves of a cylinder that hold its load
 
@@ -262,7 +262,7 @@ class PDGains:
 
 @dataclass(frozen=True)
 class Hydraulics:
-    """A machine's hydraulic circuit: one supply, and a valve and a cylinder per joint.
+    """A machine's hydraulic circuit: pumps, and a valve and a cylinder or motor per joint.
 
     Pressures count from a vacuum. Forces are those of equation (20) of the electro-hydraulic
     forwarder paper, F = area_a p_A - area_b p_B.
@@ -295,24 +295,35 @@ class Hydraulics:
         check_tank(self.supply, self.oil)
         for cylinder in self.cylinders.values():
             check_relief(self.supply, cylinder)
+        check_tanks(self.sources)
         check_summed(self.sources)
-        nodes = self.nodes
-        if len({*nodes}) < len(nodes):
-            twice = next(name for name in nodes if nodes.count(name) > 1)
-            raise InputError(f"two nodes are called '{twice}', give them names")
+        nodes, chambers = self.nodes, self._chambers
+        channels = [name.replace(".", "_") for name in nodes]  # as pressures are recorded
+        for field_name, own in self._own_nodes.items():
+            for name in own:
+                if channels.count(name) > 1:
+                    raise PlacedError(
+                        (field_name, name), f"two nodes are called '{name}', give them names"
+                    )
         for joint, valve in self.valves.items():
+            at, what = ("valves", joint), f"valve of '{joint}'"
             if valve.supply not in self.sources:
-                raise InputError(
-                    f"valve of '{joint}' is fed by '{valve.supply}', "
-                    f"{known(self.sources, valve.supply)}"
+                raise PlacedError(
+                    (*at, "supply"),
+                    f"{what} is fed by '{valve.supply}', {known(self.sources, valve.supply)}",
                 )
-            _known_nodes(nodes, f"valve of '{joint}'", valve.return_a, valve.return_b)
+            for key in ("return_a", "return_b"):
+                back = getattr(valve, key)
+                _known_node([x for x in nodes if x not in chambers], what, back, (*at, key))
         for name, element in self.elements.items():
-            _known_nodes(nodes, f"element '{name}'", element.source, element.target)
+            at, what = ("elements", name), f"element '{name}'"
+            _known_node(nodes, what, element.source, (*at, "from"))
+            _known_node(nodes, what, element.target, (*at, "to"))
             for joint in element.joints:
                 if joint not in self.valves:
-                    raise InputError(
-                        f"element '{name}' is opened by '{joint}', {known(self.valves, joint)}"
+                    raise PlacedError(
+                        (*at, "joints"),
+                        f"{what} is opened by '{joint}', {known(self.valves, joint)}",
                     )
 
     @property
@@ -324,7 +335,16 @@ class Hydraulics:
     def nodes(self) -> list[str]:
         """Names of all nodes: tank, pumps, lines, accumulators, chambers JOINT.a and JOINT.b."""
         own = [*self.sources, *self.lines, *self.accumulators]
-        return [TANK, *own, *(f"{joint}.{side}" for joint in self.cylinders for side in "ab")]
+        return [TANK, *own, *self._chambers]
+
+    @property
+    def _chambers(self) -> list[str]:
+        return [f"{joint}.{side}" for joint in self.cylinders for side in "ab"]
+
+    @property
+    def _own_nodes(self) -> dict[str, Iterable[str]]:
+        """Nodes that are named freely, by the field that they are in."""
+        return {name: getattr(self, name) for name in ("supplies", "lines", "accumulators")}
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -337,31 +357,44 @@ class Hydraulics:
         return tuple(joint for joint, cylinder in self.cylinders.items() if cylinder.grips)
 
     def only(self, joints: Iterable[str]) -> "Hydraulics | None":
-        """The circuit of some joints, in their order; None if it drives none of them."""
+        """The circuit of some joints, in their order; None if it drives none of them.
+
+        Elements at chambers that are gone go, too, and lines that nothing leads to any more.
+        """
         kept = [joint for joint in joints if joint in self.cylinders]
         if not kept:
             return None
         gone = {
             f"{joint}.{side}" for joint in self.cylinders if joint not in kept for side in "ab"
         }
+        valves = {joint: self.valves[joint] for joint in kept}
+        elements = {
+            name: replace(x, joints=tuple(joint for joint in x.joints if joint in kept))
+            for name, x in self.elements.items()
+            if not gone & {x.source, x.target}
+            and (not x.joints or any(joint in kept for joint in x.joints))
+        }
+        met = _met(elements.values(), valves.values())
         return replace(
             self,
             cylinders={joint: self.cylinders[joint] for joint in kept},
-            valves={joint: self.valves[joint] for joint in kept},
+            valves=valves,
             control={joint: self.control[joint] for joint in kept if self.control},
-            elements={
-                name: replace(x, joints=tuple(joint for joint in x.joints if joint in kept))
-                for name, x in self.elements.items()
-                if not gone & {x.source, x.target}
-                and (not x.joints or any(joint in kept for joint in x.joints))
-            },
+            elements=elements,
+            lines={name: x for name, x in self.lines.items() if name in met},
+            accumulators={name: x for name, x in self.accumulators.items() if name in met},
         )
 
 
-def _known_nodes(nodes: list[str], what: str, *names: str) -> None:
-    for name in names:
-        if name not in nodes:
-            raise InputError(f"{what} leads to '{name}', {known(nodes, name)}")
+def _known_node(nodes: list[str], what: str, name: str, path: tuple[str, ...]) -> None:
+    if name not in nodes:
+        raise PlacedError(path, f"{what} leads to '{name}', {known(nodes, name)}")
+
+
+def _met(elements: Iterable[Element], valves: Iterable[Valve]) -> set[str]:
+    """Nodes that elements and returns of valves lead to."""
+    met = {x for item in elements for x in (item.source, item.target)}
+    return met | {x for valve in valves for x in (valve.return_a, valve.return_b)}
 
 
 def check_tank(supply: Supply, oil: Oil) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from crane.codegen import Number, maximum
 from crane.codegen.scalar import apply, minimum, where_positive
 from crane.hydraulics.components import Counterbalance, Cylinder, Valve
-from crane.hydraulics.flow import Flow, clipped, in_series, root, through
+from crane.hydraulics.flow import LAMINAR, Flow, clipped, in_series, root, through
 from crane.hydraulics.nodes import PER_SENSED, softness_of
 from crane.hydraulics.sources import TANK
 
@@ -157,27 +157,27 @@ class DrivenCylinder:
                 over = maximum(sign * across - part["cross_relief"], 0.0)
                 found.append(Flow(source, target, part["relief_gain"] * over, "cross"))
         if valve.regeneration > 0:
-            rate = part["regeneration"] * self.opened[0] * root(maximum(-across, 0.0))
+            orifice = in_series(part["regeneration"] * self.opened[0], *self._obstacles(1))
+            rate = self._held(orifice * root(maximum(-across, 0.0)), 1)
             found.append(Flow(node_b, node_a, rate, "regeneration"))
         floats: Number = 0.0
         if valve.float_from > 0:
             floats = clipped((-self._spool - part["float_from"]) * part["per_float"], 0.0, 1.0)
-        for side, name in enumerate("ab"):
+        for side in range(2):
             p, back, node = self.pressures[side], backs[side], nodes[side]
             to = valve.return_a if side == 0 else valve.return_b
             inlet = self._edge(*(("c1", 0) if side == 0 else ("c4", 1)))
-            if valve.float_from > 0 and side == 1:
-                inlet = inlet * (1.0 - floats)
             outlet = self._edge(*(("c3", 1) if side == 0 else ("c2", 0)))
+            if valve.float_from > 0:
+                outlet = outlet + part["float_coefficient"] * floats
+                if side == 1:
+                    inlet = inlet * (1.0 - floats)
             fed, drop = self._inflow(supply, inlet, side, load)
+            if drop is None:  # else nothing comes back
+                fed = -self._held(-fed, side) if self._ruptures(side) else fed
             found.append(Flow(valve.supply, node, fed, "inlet", drop))
             drained = -through(back - p, outlet, in_series(outlet, *self._obstacles(side)))
-            if (self._cylinder.rupture_a, self._cylinder.rupture_b)[side] > 0:
-                drained = minimum(drained, part[f"rupture_{name}"])
-            found.append(Flow(node, to, drained, "outlet"))
-            if valve.float_from > 0:
-                rate = part["float_coefficient"] * floats * root(p - back)
-                found.append(Flow(node, to, rate, "float"))
+            found.append(Flow(node, to, self._held(drained, side), "outlet"))
         return found
 
     def around(self, tank: Number) -> list[Flow]:
@@ -212,7 +212,13 @@ class DrivenCylinder:
             volume = maximum(hose + area * self._left[side], _SLIGHT * hose)
             half = hose + 0.5 * area * part["stroke"]
         softness = softness_of(self._common, volume, hose, gas, p)
-        slope = net / where_positive(self._own[side], softness, self._common["oil"] * half)
+        void = self._common["oil"] * half
+        if self.valve.float_from > 0:
+            # it runs into voids all the time: over a jump steps get a million times shorter
+            filled = clipped(self._own[side] * (1.0 / LAMINAR), 0.0, 1.0)
+            slope = net / (void + (softness - void) * filled)
+        else:
+            slope = net / where_positive(self._own[side], softness, void)
         return Chamber(p, volume, area, valve, net, slope)
 
     def _edge(self, name: str, side: int) -> Number:
@@ -257,6 +263,16 @@ class DrivenCylinder:
             drop = clipped(supply - p, 0.0, margin)
             return inlet * root(drop), drop
         return through(supply - p, inlet, in_series(inlet, *self._obstacles(side))), None
+
+    def _ruptures(self, side: int) -> bool:
+        """Whether a chamber has a hose rupture valve."""
+        return (self._cylinder.rupture_a, self._cylinder.rupture_b)[side] > 0
+
+    def _held(self, rate: Number, side: int) -> Number:
+        """A flow out of a chamber, as far as its hose rupture valve lets it."""
+        if not self._ruptures(side):
+            return rate
+        return minimum(rate, self._part["rupture_a" if side == 0 else "rupture_b"])
 
     def _obstacles(self, side: int) -> tuple[Number | None, Number]:
         """In the way of the outflow: coefficient of the holding valve, 1 / c^2 of the cushion."""

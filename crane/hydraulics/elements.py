@@ -100,6 +100,8 @@ class Element:
             raise PartError("type", f"element '{self.kind}' is none of {', '.join(KINDS)}")
         if self.side not in SIDES:
             raise PartError("side", f"side '{self.side}' is none of {', '.join(SIDES)}")
+        if self.side != "both" and not self.joints:
+            raise PartError("side", f"side '{self.side}' is that of valves, give their 'joints'")
         by = "coefficient" if self.kind in ("orifice", "check") else "gain"
         if not getattr(self, by):
             raise PartError(by, f"a {self.kind} has no '{by}', give it")

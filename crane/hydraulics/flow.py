@@ -15,7 +15,7 @@ class Flow(NamedTuple):
         target: Where it goes.
         rate: [m3/s].
         through: What it flows through: "inlet", "outlet", "leak", "relief", "refill", "bypass",
-            "regeneration", "float", "piston", "cross" (relief), "pump", "slip", or an element's
+            "regeneration", "piston", "cross" (relief), "pump", "slip", or an element's
             name.
         drop: Of pressure at the edge that meters it, the rest is its compensator's [Pa]; None
             where there is none.

@@ -3,12 +3,13 @@
 from collections.abc import Iterable, Mapping, Sequence
 
 from crane.codegen import Expression, Number, maximum
-from crane.codegen.scalar import apply, where_positive
+from crane.codegen.scalar import apply
 from crane.hydraulics.elements import Element
 from crane.hydraulics.flow import Flow, clipped, root
 
 GAS_PRESSURE = 1.0e5  # at which volumes of entrapped gas are given [Pa]
 PER_SENSED = 100.0  # one over the opening at which all of a load is reported
+_SEAT = 1.0e-3  # of an accumulator's precharge or volume, within which it runs empty
 _FULL = 0.02  # of an accumulator's gas, the least that is left
 
 
@@ -24,12 +25,17 @@ def softness_of(
         soft = soft + common["steel"] * maximum(volume - hose, 0.0)
     if _is(common["air"]):
         gas = gas + common["air"] * volume
-    if _is(gas):
-        # V = gas (p0 / p)^(1/n), -dV/dp = gas / (n p0) (p0 / p)^(1 + 1/n)
-        power = common["gas_power"]
-        thin = apply("log", maximum(p, 1.0) * (1.0 / GAS_PRESSURE))
-        soft = soft + gas * (power - 1.0) * (1.0 / GAS_PRESSURE) * apply("exp", -power * thin)
-    return soft
+    return soft + bubbles(common, gas, p) if _is(gas) else soft
+
+
+def bubbles(common: Mapping[str, Number], gas: Number, p: Number) -> Number:
+    """Volume per pressure of gas in the oil.
+
+    V = gas (p0 / p)^(1/n), -dV/dp = gas / (n p0) (p0 / p)^(1 + 1/n).
+    """
+    power = common["gas_power"]
+    thin = apply("log", maximum(p, 1.0) * (1.0 / GAS_PRESSURE))
+    return gas * (power - 1.0) * (1.0 / GAS_PRESSURE) * apply("exp", -power * thin)
 
 
 def _is(number: Number) -> bool:
@@ -43,7 +49,8 @@ def gas_of(
     """Rates of an accumulator's states, and the heat that leaves its gas [W].
 
     See `Accumulator`. Below the precharge the gas keeps its volume, and the port's oil alone gives
-    way.
+    way; which of them does passes from one to the other within `_SEAT` below it, or above the
+    last oil. With w the share of the gas that moves, Q = line p' + w Q_g.
 
     Args:
         gas: Its numbers.
@@ -52,21 +59,19 @@ def gas_of(
         oil: In it, a state where heat leaves the gas [m3].
     """
     line, volume, precharge, n = (gas[x] for x in ("line", "volume", "precharge", "exponent"))
+    lifted = 1.0 + (p / precharge - 1.0) * (1.0 / _SEAT)
     if oil is None:
         # V_g = volume (p0 / p)^(1/n), -dV/dp = V_g / (n p)
         above = maximum(p, precharge)
         thin = apply("log", precharge / above)
         soft = volume * apply("exp", thin / n) / (n * above)
-        return [inflow / (line + where_positive(p - precharge, soft, 0.0))], 0.0
+        return [inflow / (line + clipped(lifted, 0.0, 1.0) * soft)], 0.0
     left = clipped(volume - oil, _FULL * volume, volume)
     isothermal = precharge * volume / left
     cooling = (p - isothermal) * gas["per_time"]
-    slope = (n * p * inflow / left - cooling) / (1.0 + line * n * p / left)
-    holds = maximum(oil, p - precharge)  # the gas, rather than the diaphragm its port
-    slope = where_positive(holds, slope, inflow / line)
-    into = where_positive(holds, inflow - line * slope, 0.0)
-    heat = where_positive(holds, left * cooling / (n - 1.0), 0.0)
-    return [slope, into], heat
+    moves = clipped(maximum(lifted, oil / (_SEAT * volume)), 0.0, 1.0)
+    slope = (n * p * inflow / left - moves * cooling) / (moves + line * n * p / left)
+    return [slope, inflow - line * slope], moves * left * cooling / (n - 1.0)
 
 
 def flow_of(

@@ -21,6 +21,19 @@ class PartError(InputError):
         self.key = key
 
 
+class PlacedError(InputError):
+    """A part of the circuit that cannot be beside the others.
+
+    Args:
+        path: Where it stands, as in a machine file.
+        message: See `CraneError`.
+    """
+
+    def __init__(self, path: tuple[str, ...], message: str):
+        super().__init__(message)
+        self.path = path
+
+
 def number_names(kind: type) -> list[str]:
     """Names of the numbers of a kind of part."""
     return [entry.name for entry in fields(kind) if entry.type in (float, "float")]

@@ -9,7 +9,8 @@ from crane.hydraulics.flow import Flow, clipped, root
 from crane.hydraulics.sources import TANK, Supply
 
 _SLIGHT = 1.0e4  # [Pa], below which power limits nothing
-_CLOSED = 1.0e-30  # square of a coefficient that lets nothing pass
+_CENTRED = "fixed", "negative", "positive"  # whose flow goes on to the throttle without valves
+_CLOSED = 1.0e-40  # square of a coefficient that lets nothing pass
 
 
 class Pump:
@@ -21,6 +22,7 @@ class Pump:
         numbers: Its numbers.
         pressures: Of all nodes [Pa].
         load: Highest of its valves [Pa].
+        limiting: Pressure that its power is divided by [Pa].
         fed: What it feeds.
         speed: Of the engine over its set speed.
         share: Of its displacement, where that takes time.
@@ -42,6 +44,7 @@ class Pump:
         numbers: Mapping[str, Number],
         pressures: Mapping[str, Number],
         load: Number,
+        limiting: Number,
         fed: Sequence[DrivenCylinder],
         speed: Number,
         share: Number | None,
@@ -50,7 +53,7 @@ class Pump:
         self._p, self._tank = pressures[name], pressures[TANK]
         self.flows: list[Flow] = []
         before = self._bypass()
-        self.asked = self._regulated(pressures, load, before)
+        self.asked = self._regulated(load, limiting, before)
         self.share = self.asked if share is None else share
         self.share_rate: list[Number] = []
         if share is not None:
@@ -75,13 +78,14 @@ class Pump:
         Throttles in series: 1 / c^2 = sum of 1 / c_i^2, and each has its share of the drop.
         """
         centres = [one.centre() for one in self._fed if one.valve.centre > 0]
-        if not centres:
+        supply = self._supply
+        if not centres and not (supply.throttle > 0 and supply.control in _CENTRED):
             return 0.0
         total: Number = 0.0
         for c in centres:
             total = total + 1.0 / (c * c + _CLOSED)
         last: Number = 0.0
-        if self._supply.throttle > 0:
+        if supply.throttle > 0:
             last = 1.0 / (self._numbers["throttle"] * self._numbers["throttle"])
         total = total + last
         drop = self._p - self._tank
@@ -89,7 +93,7 @@ class Pump:
         self.flows.append(Flow(self._name, TANK, rate, "bypass"))
         return drop * last / total
 
-    def _regulated(self, pressures: Mapping[str, Number], load: Number, before: Number) -> Number:
+    def _regulated(self, load: Number, limiting: Number, before: Number) -> Number:
         """The share that the regulator asks for."""
         numbers, control, p = self._numbers, self._supply.control, self._p
         if control == "fixed":
@@ -104,8 +108,6 @@ class Pump:
         elif control == "positive":
             asked = minimum(sum((one.demand for one in self._fed), 0.0), cut_off)
         if self._supply.power > 0:
-            names = self._supply.summed or (self._name,)
-            mean = sum((pressures[name] for name in names), 0.0) * (1.0 / len(names))
-            most = numbers["flow"] * maximum(mean - self._tank, _SLIGHT)
+            most = numbers["flow"] * maximum(limiting - self._tank, _SLIGHT)
             asked = minimum(asked, numbers["power"] / most)
         return clipped(asked, numbers["least"], 1.0)

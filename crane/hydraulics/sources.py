@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 
-from crane.common.errors import InputError
 from crane.common.magnitudes import meant
-from crane.hydraulics.numbers import PartError, above, check_numbers, positive
+from crane.hydraulics.numbers import PartError, PlacedError, above, check_numbers, positive
 
 CONTROLS = ("pressure", "load-sensing", "negative", "positive", "fixed")
 MAIN = "supply"  # name of the first pump's node
@@ -24,10 +23,12 @@ class Supply:
         fixed:         1,
 
     with p_LS the highest load of its open valves and p_N the pressure before the throttle that
-    ends its open centre. It is at least `least`, and at most (pressure - p) / droop (cut-off; not
-    of a fixed pump) and power / (flow (p - p_tank)), a hyperbola with its corner at power / flow;
-    where `summed` names pumps, of the mean of their p. The share follows within `response`, and
-    the line gets e flow n - slip (p - p_tank), n the engine's speed over its set speed.
+    ends its open centre, which stands there even if no valve has one. It is at least `least`, and
+    at most (pressure - p) / droop (cut-off; not of a fixed pump) and power / (flow (p - p_tank)),
+    a hyperbola with its corner at power / flow; where `summed` names pumps, of their mean p,
+    weighted by their power: together they take up no more than the sum of it, whatever their
+    pressures are. The share follows within `response`, and the line gets
+    e flow n - slip (p - p_tank), n the engine's speed over its set speed.
 
     Attributes:
         pressure: That the pump keeps, or its cut-off [Pa].
@@ -101,6 +102,10 @@ class Supply:
             raise PartError(
                 "relief", f"a pump of {self.control} flow has no 'relief', give it [Pa]"
             )
+        if self.control == "fixed" and self.power:
+            raise PartError("power", "nothing limits the power of a fixed pump, leave it out")
+        if self.summed and not self.power:
+            raise PartError("summed", "a pump with 'summed' has no 'power', give its own")
         for key in ("least", "friction"):
             if getattr(self, key) >= 1:
                 raise PartError(
@@ -114,12 +119,11 @@ class Supply:
                 f"{self.tank:g} Pa, so that it would never close{hint}",
             )
 
-    @property
-    def rest(self) -> float:
-        """Pressure of its line while nothing moves [Pa]."""
+    def rest(self, tank: float) -> float:
+        """Pressure of its line while nothing moves, over a tank's [Pa]."""
         if self.control == "load-sensing":
-            return min(max(self.tank + self.margin, self.standby), self.pressure)
-        return self.pressure if self.control == "pressure" else self.tank
+            return min(max(tank + self.margin, self.standby), self.pressure)
+        return self.pressure if self.control == "pressure" else tank
 
 
 @dataclass(frozen=True)
@@ -158,8 +162,31 @@ def check_summed(supplies: dict[str, Supply]) -> None:
     """
     for name, supply in supplies.items():
         for other in supply.summed:
-            if other not in supplies or not supplies[other].flow:
-                known = ", ".join(x for x, y in supplies.items() if y.flow)
-                raise InputError(
-                    f"'summed' of '{name}' names '{other}', give pumps with a flow: {known}"
+            if other not in supplies or not supplies[other].power:
+                known = ", ".join(x for x, y in supplies.items() if y.power)
+                raise PlacedError(
+                    (*_place(name), "summed"),
+                    f"'summed' of '{name}' names '{other}', give pumps with a power: {known}",
                 )
+
+
+def check_tanks(supplies: dict[str, Supply]) -> None:
+    """Raise where a further pump's pressures are not above the tank's, the first one's.
+
+    Raises:
+        PlacedError: With its name.
+    """
+    tank = supplies[MAIN].tank
+    for name, supply in supplies.items():
+        for key in ("pressure", "relief"):
+            if 0 < getattr(supply, key) <= tank:
+                raise PlacedError(
+                    (*_place(name), key),
+                    f"{key} of '{name}' is {getattr(supply, key):g} Pa, not above the tank's "
+                    f"{tank:g} Pa, give a higher one",
+                )
+
+
+def _place(name: str) -> tuple[str, ...]:
+    """Where a pump stands in a circuit."""
+    return (MAIN,) if name == MAIN else ("supplies", name)

@@ -27,7 +27,7 @@ LOAD, JOINT_FRICTION, _GRIP = "load", "friction", "grip"
 # What an owner's power goes into, in the order in which it is told.
 PARTS = (
     SHAFT, "friction", "slip", "relief", "bypass", "element", "inlet", "compensator", "outlet",
-    "regeneration", "float", "leak", "refill", "damper", "cooling", LOAD, *STORED,
+    "regeneration", "leak", "refill", "damper", "cooling", LOAD, *STORED,
 )  # fmt: skip
 _TOLD = 1e-4  # share of the shafts' energy that a table tells
 _HEAD = ("item", "energy [kJ]", "share", "back [kJ]", "mean [kW]", "peak [kW]")
@@ -49,7 +49,7 @@ class PowerAccount(Brief):
     | slip, relief, bypass | pump | Q (p - p_tank) of leak, relief valve, open centres |
     | inlet | joint | Q times the drop at the edge that meters, or at all where none follows |
     | compensator | joint | Q times the rest of the drop from pump to chamber |
-    | outlet, float, refill | joint | Q times the drop, with load holding and cushion |
+    | outlet, refill | joint | Q times the drop, with load holding and cushion |
     | regeneration | joint | from B to A |
     | leak, relief | joint | to the tank, and from one chamber to the other |
     | damper | joint | heat in the damper of a series spring |

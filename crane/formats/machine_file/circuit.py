@@ -27,7 +27,7 @@ from crane.hydraulics.components import (
 )
 from crane.hydraulics.connections import drained, joined
 from crane.hydraulics.elements import Accumulator, Element, Line
-from crane.hydraulics.numbers import PartError, number_names
+from crane.hydraulics.numbers import PartError, PlacedError, number_names
 from crane.hydraulics.sources import MAIN, Engine, Supply
 
 Made = TypeVar("Made")
@@ -215,6 +215,11 @@ def checked(section: Section, make: Callable[..., Made], *items: object, **given
         return make(*items, **given)
     except PartError as error:
         raise section.fail(error.key, str(error)) from None
+    except PlacedError as error:
+        *path, key = error.path
+        for name in path:
+            section = section.section(name, name) or section
+        raise section.fail(key, str(error)) from None
     except InputError as error:
         raise section.fail(None, str(error)) from None
 
@@ -296,7 +301,7 @@ def _supply(section: Section) -> Supply:
 
 
 def _motor(joint: str, item: Section) -> Cylinder:
-    """A motor by its displacement per turn of its own shaft, whose joint the gear turns slower."""
+    """A motor by its displacement [m3/rad]; its joint turns slower by the gear."""
     displacement = item.number("displacement", minimum=0.0)
     gear = item.number("gear", 1.0, minimum=0.0)
     volume = item.number("volume", minimum=0.0)

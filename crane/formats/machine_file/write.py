@@ -305,9 +305,9 @@ def _hydraulics(circuit: Hydraulics) -> dict[str, Any]:
         "cylinders": {joint: _cylinder(item) for joint, item in circuit.cylinders.items()},
         "valves": {joint: _valve(valve) for joint, valve in circuit.valves.items()},
     }
-    motors = {joint for joint, item in circuit.cylinders.items() if item.motor}
+    motors = [joint for joint, item in circuit.cylinders.items() if item.motor]
     if motors:
-        data["motors"] = {joint: _motor(data["cylinders"].pop(joint)) for joint in motors}
+        data["motors"] = {x: _motor(x, data["cylinders"].pop(x)) for x in motors}
     if circuit.engine is not None:
         data["engine"] = _all_numbers(circuit.engine)
     data |= {
@@ -343,10 +343,18 @@ def _element(element: Element) -> dict[str, Any]:
     return data | ({"joints": [*element.joints], "side": element.side} if element.joints else {})
 
 
-def _motor(cylinder: dict[str, Any]) -> dict[str, Any]:
+def _motor(joint: str, cylinder: dict[str, Any]) -> dict[str, Any]:
     """A motor from what it is as a cylinder."""
     own = {"displacement": cylinder["area_a"], "volume": cylinder["hose_a"]}
-    return own | {key: cylinder[name] for key, name in MOTOR.items() if name is not None}
+    own |= {key: cylinder[name] for key, name in MOTOR.items() if name is not None}
+    usual = _all_numbers(Cylinder(joint, *2 * [own["displacement"]], *2 * [own["volume"]]))
+    for name in cylinder.keys() - own.keys():
+        if cylinder[name] != usual[name]:
+            raise InputError(
+                f"{name} of the motor of '{joint}' is {cylinder[name]:g}, which a machine file "
+                f"has no motor with, leave it at {usual[name]:g}"
+            )
+    return own
 
 
 def _cylinder(cylinder: Cylinder) -> dict[str, Any]:

@@ -121,7 +121,7 @@ def _of_cylinder(
     cylinder, valve = hydraulics.cylinders[joint], hydraulics.valves[joint]
     pressure = hydraulics.supply.pressure
     at = machine.active.index(joint)
-    stroke = float(machine.upper[at] - machine.lower[at])
+    stroke = 0.0 if cylinder.motor else float(machine.upper[at] - machine.lower[at])
     brake = _BRAKED * pressure * cylinder.area_a
     pace = valve.c1 * np.sqrt(pressure) / cylinder.area_a
     for what, size in (("coulomb", brake), ("viscous", brake / pace)):
@@ -142,6 +142,10 @@ def _of_cylinder(
             name = f"cylinder.{joint}.{what}_{side}"
             start = numbers[name]
             yield Candidate(name, start, max(start, size), 0.0)
+    name = f"cylinder.{joint}.leakage"
+    yield Candidate(name, numbers[name], max(numbers[name], leak), 0.0)
+    if cylinder.motor:  # which no boom is in series with
+        return
     oil = hydraulics.oil.bulk_modulus
     spring = sum(
         oil * area**2 / volume
@@ -152,5 +156,3 @@ def _of_cylinder(
     yield Candidate(name, start, start, start / _SOFT, start * _STIFF)
     name = f"cylinder.{joint}.damping"
     yield _scaled(name, numbers[name], 1.0, 20.0)
-    name = f"cylinder.{joint}.leakage"
-    yield Candidate(name, numbers[name], max(numbers[name], leak), 0.0)

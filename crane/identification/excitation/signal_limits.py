@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.control.valves import Signals, circuit_of
 from crane.description.sensors import SIGNAL
@@ -46,7 +47,18 @@ class SignalLimits:
             margin * self._span, [(home - self._lower) / 2, (self._upper - home) / 2]
         )
         self.low, self.high = self._lower + below, self._upper - above
-        flow = self._circuit.supply.flow
+        supply = self._circuit.supply
+        if supply.control != "pressure":
+            raise InputError(
+                f"signals are designed for a pump that keeps its pressure, that of "
+                f"'{machine.name}' has {supply.control} control: record a task instead"
+            )
+        for joint, cylinder in self._circuit.cylinders.items():
+            if cylinder.motor:
+                raise InputError(
+                    f"signals are designed for cylinders, '{joint}' has a motor: lock it"
+                )
+        flow = supply.flow
         self.flow = (1 - margin) * flow if flow else np.inf
         self._doubts = [told.variant(values) for values in _doubts(told.unknowns)]
 

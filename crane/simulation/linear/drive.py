@@ -48,7 +48,7 @@ class Drive:
         }
         self.seen: dict[str, str] = {}
         self.own, self.u = np.zeros(0), np.zeros(len(self.inputs))
-        self.scales, self._vapour = np.zeros(0), 0.0
+        self.scales, self._vapour, self._idles = np.zeros(0), 0.0, 0.0
         self._control: ValveDrive | None = None
         self._spread = np.eye(n)[:, machine.driven]
         if valves:
@@ -57,13 +57,15 @@ class Drive:
             circuit = control.circuit
             self.states = dict(circuit.states)
             self._stiff, self.scales = circuit.stiff, circuit.scales[: circuit.stiff]
+            engine = circuit.hydraulics.engine
+            self._idles = engine.speed_droop / engine.speed if engine is not None else 0.0
             self._vapour = circuit.hydraulics.oil.vapour_pressure
-            ends = [*circuit.starts, circuit.stiff]
             self._owner = {
                 name: joint
-                for joint, first, last in zip(circuit.joints, ends, ends[1:], strict=False)
+                for joint, first, last in zip(
+                    circuit.joints, circuit.starts, circuit.ends, strict=True
+                )
                 for name in list(self.states)[first:last]
-                if name != "pressure_supply"
             }
             self.inputs = {f"voltage_{joint}": "V" for joint in circuit.joints}
             self.seen = dict(control.channels) | {
@@ -74,15 +76,15 @@ class Drive:
             self.u = control.references(np.zeros(1))[0]
             self._program = self._built(machine)
 
-    def moving(self, v_a: Array) -> Array:
-        """(k + m,) which states and signals belong to joints that move, or to the supply."""
+    def moving(self, v_a: Array, shared: bool) -> Array:
+        """(k + m,) which states and signals belong to joints that move, or perhaps to no joint."""
         assert self._control is not None
         joints = self._control.circuit.joints
         moving = {x for x, i in zip(joints, self._forces, strict=True) if v_a[i]}
         own = [
-            self._owner.get(name) in moving or name == "pressure_supply" for name in self.states
+            self._owner[name] in moving if name in self._owner else shared for name in self.states
         ]
-        mask: Any = np.array([*own, *(joint in moving for joint in joints)]) & bool(moving)
+        mask: Any = np.array([*own, *(joint in moving for joint in joints)])
         return mask
 
     def loaded(self, forces: Array) -> Any:
@@ -106,11 +108,35 @@ class Drive:
         z = np.concatenate([self.own, self.u])
         ways: list[Array] = []
         ends: list[tuple[float, float]] = []
-        if "pressure_supply" in names:
-            at = names.index("pressure_supply")
-            z[at] = supply.pressure - 0.5 * supply.droop - self._vapour
+
+        above: dict[str, int] = {}
+
+        def free(name: str, value: float, least: float, most: float) -> None:
+            z[at := names.index(name)] = value
             ways.append(np.eye(len(z))[at])
-            ends.append((-0.5 * supply.droop, 0.5 * supply.droop))
+            ends.append((least - value, most - value))
+
+        for name, pump in self._control.circuit.pumps.items():
+            top = pump.pressure - self._vapour
+            if pump.control == "pressure":
+                free(f"pressure_{name}", top - 0.5 * pump.droop, top - pump.droop, top)
+            elif pump.control == "load-sensing":  # above the loads that are guessed below
+                base = 0.3 * supply.pressure + pump.margin - 0.5 * pump.droop
+                free(f"pressure_{name}", base, base - 0.5 * pump.droop, base + 0.5 * pump.droop)
+                above[name] = names.index(f"pressure_{name}")
+            else:
+                free(f"pressure_{name}", 0.4 * top, 0.0, np.inf)
+            if f"share_{name}" in names:
+                free(f"share_{name}", 0.5, 0.0, 1.0)
+        for name in hydraulics.lines:
+            free(f"pressure_{name}", self.own[names.index(f"pressure_{name}")], 0.0, np.inf)
+        for name in hydraulics.accumulators:
+            free(f"pressure_{name}", self.own[names.index(f"pressure_{name}")], 0.0, np.inf)
+            if f"oil_{name}" in names:
+                at = names.index(f"oil_{name}")
+                free(f"oil_{name}", self.own[at], -np.inf, np.inf)
+        if "engine" in names:
+            free("engine", 1.0 + 0.5 * self._idles, 1.0, 1.0 + self._idles)
         for i, (joint, valve) in enumerate(hydraulics.valves.items()):
             if not (side := float(np.sign(v_a[self._forces[i]]))):
                 continue
@@ -119,6 +145,8 @@ class Drive:
                     z[at] = max(z[at], 0.3 * supply.pressure)
                     ways.append(np.eye(len(z))[at])
                     ends.append((-z[at], np.inf))
+                    if valve.supply in above and name.endswith("a" if side > 0 else "b"):
+                        ways[-1][above[valve.supply]] = 1.0
             dead, open_to = valve.dead_band, valve.dead_band + share * (1.0 - valve.dead_band)
             way = np.zeros(len(z))
             way[k + i] = side * (valve.full - valve.neutral)

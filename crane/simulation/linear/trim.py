@@ -14,7 +14,8 @@ from crane.simulation.linear.drive import Drive
 _STILL = 1e-9  # what is left of a trimmed machine, in its size per its pace squared
 _HANGS = 1e-6  # the same, of free joints that hang still
 _ROUNDS = 50  # of Newton's method
-_BAR, _MILLIMETRE, _SOON = 1e5, 1e-3, 0.1  # [Pa], [m], [s]
+_SHORT = 1e-3  # share of its step below which it is taken all the same
+_BAR, _MILLIMETRE, _THIMBLE, _SOON = 1e5, 1e-3, 1e-6, 0.1  # [Pa], [m], [m3], [s]
 
 
 def trimmed(dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array) -> tuple[Array, Array]:
@@ -28,7 +29,13 @@ def trimmed(dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array) -> tuple[A
     if machine.free:
         _check_hanging(dynamics, q_a, v_a, forces)
     if drive.states:
-        return _on_valves(_Trim(dynamics, drive, q_a, v_a))
+        for shared in (True, False) if not v_a.any() else (True,):
+            found = _on_valves(_Trim(dynamics, drive, q_a, v_a, shared))
+            if found is not None:
+                return found
+        raise SimulationError(
+            "the machine cannot be trimmed there: no pressures and signals keep these velocities"
+        )
     return drive.own, forces[machine.driven]
 
 
@@ -64,19 +71,23 @@ class _Trim:
         drive: The circuit.
         q_a: (n,).
         v_a: (n,).
+        shared: Whether states of no joint, of pumps and lines, have to stay what they are, too.
 
     Attributes:
         start: (k + m,) closed valves.
     """
 
-    def __init__(self, dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array):
+    def __init__(
+        self, dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array, shared: bool = True
+    ):
         self._dynamics, self.drive, self._q_a, self.v_a = dynamics, drive, q_a, v_a
         closure = dynamics.machine.closure
         n, k = len(q_a), len(drive.states)
         pressure = np.array([unit == "Pa" for unit in drive.states.values()])
         spring = np.array([name.startswith("spring_") for name in drive.states])
-        scales = np.where(pressure, _BAR, np.where(spring, _MILLIMETRE, 1.0))
-        moving = drive.moving(v_a)
+        volume = np.array([unit == "m3" for unit in drive.states.values()])
+        scales = np.select([pressure, spring, volume], [_BAR, _MILLIMETRE, _THIMBLE], 1.0)
+        moving = drive.moving(v_a, shared)
         loaded = drive.loaded(dynamics.inverse(q_a, v_a, np.zeros(n)))
         self._free = np.flatnonzero(np.concatenate([loaded | spring | moving[:k], moving[k:]]))
         self._rows = np.concatenate([np.arange(n), n + np.flatnonzero(spring | moving[:k])])
@@ -103,8 +114,12 @@ class _Trim:
         left = np.concatenate([a_a, values[n : n + k]])
         return left[self._rows] / self._units, rows[self._rows] / self._units[:, None]
 
-    def polished(self, z: Array) -> Array | None:
-        """The nearest z at which nothing is left, by Newton's method; None if there is none."""
+    def polished(self, z: Array, damped: bool = False) -> Array | None:
+        """The nearest z at which nothing is left, by Newton's method; None if there is none.
+
+        Damped, its steps are halved until less is left: over a throttle between two nodes it goes
+        back and forth else, root(x) having its zero half the step ahead.
+        """
         z, free = z.copy(), self._free
         for _ in range(_ROUNDS):
             left, slopes = self.left(z)
@@ -114,8 +129,17 @@ class _Trim:
             step = np.linalg.lstsq(rows, left, rcond=1e-10)[0]
             if not np.isfinite(step).all():
                 return None
-            z[free] -= step * self._scales[free]
+            way = np.zeros(len(z))
+            way[free] = step * self._scales[free]
+            share = 1.0
+            while damped and share > _SHORT and not self._less(z - share * way, left):
+                share *= 0.5
+            z -= share * way
         return None
+
+    def _less(self, z: Array, left: Array) -> bool:
+        """Whether less is left at another z."""
+        return bool(np.linalg.norm(self.left(z)[0]) < np.linalg.norm(left))
 
     def searched(self, share: float) -> Array:
         """The best z from valves that are open by a share of their stroke, and stay open."""
@@ -136,21 +160,20 @@ class _Trim:
         return z + ways @ found.x
 
 
-def _on_valves(trim: _Trim) -> tuple[Array, Array]:
+def _on_valves(trim: _Trim) -> tuple[Array, Array] | None:
     drive, k = trim.drive, len(trim.drive.states)
     starts = (trim.searched(share) for share in (0.2, 0.5, 0.8)) if trim.v_a.any() else ()
     done = next(
         (
             z
             for start in itertools.chain(starts, [trim.start])
-            if (z := trim.polished(start)) is not None
+            for damped in (False, True)
+            if (z := trim.polished(start, damped)) is not None
         ),
         None,
     )
     if done is None:
-        raise SimulationError(
-            "the machine cannot be trimmed there: no pressures and signals keep these velocities"
-        )
+        return None
     rates = np.abs(trim.rates(done))
     worst = int(np.argmax(np.where(rates > 1e-3 * drive.scales, rates / drive.scales, 0.0)))
     if rates[worst] > _BAR * _STILL:

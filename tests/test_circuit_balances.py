@@ -1,0 +1,72 @@
+"""A circuit with all parts at once: its balances, and the methods that integrate it."""
+
+import numpy as np
+import pytest
+from circuits import SIGNALS, TIMES, everything, gaps
+from hydraulic_rig import rig
+
+import crane
+from crane.control import Signals
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    machine = everything(tmp_path_factory.mktemp("whole"))
+    signals = Signals(machine, TIMES, SIGNALS)
+    return machine, signals, crane.simulate(machine, signals, duration=3.0, tolerance=1e-10)
+
+
+def test_oil_and_energy_balance(whole):
+    machine, _, run = whole
+    oil, energy = gaps(run, machine)
+    assert oil < 1e-12
+    assert energy < 1e-6
+    c = run.channels
+    assert np.ptp(run.q, axis=0).min() > 0.02
+    for name in ("pressure_quick", "pressure_warm", "pressure_block", "pressure_return"):
+        assert np.ptp(c[name]) > 1e4, name
+    assert c["share_supply"].max() > 0.1 and np.ptp(c["share_second"]) > 0.5
+    assert np.ptp(c["engine_speed"]) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("method", "backend"), [("Radau", "compiled"), ("DOP853", "compiled"), ("LSODA", "pinocchio")]
+)
+def test_methods_agree_on_two_pumps_and_an_accumulator(tmp_path, method, backend):
+    pump = {"control": "load-sensing", "pressure": 2e7, "flow": 6e-4, "margin": 2e6}
+    machine = rig(
+        tmp_path, supply=pump | {"response": 0.1}, supplies={"second": pump},
+        joints=("x", "y"), valves={"y": {"supply": "second"}},
+        accumulators={"gas": {
+            "volume": 1e-3, "precharge": 2e6, "pressure": 3e6, "time_constant": 2.0,
+        }},
+        elements={"throttle": {
+            "from": "x.a", "to": "gas", "type": "orifice", "coefficient": 1e-7,
+        }},
+    )  # fmt: skip
+    signals = Signals(machine, [0.0, 0.1, 0.2], {"x": [0.0, 0.0, 0.4], "y": [0.0, 0.5, 0.5]})
+    one, other = (
+        crane.simulate(machine, signals, duration=0.3, tolerance=1e-10, **options)
+        for options in ({}, {"method": method, "backend": backend})
+    )
+    assert np.abs(one.q - other.q).max() < 1e-6 * np.ptp(one.q)
+    for name in ("x_a", "x_b", "y_a", "y_b", "supply", "second", "gas"):
+        two = other.channels[f"pressure_{name}"]
+        assert np.abs(one.channels[f"pressure_{name}"] - two).max() < 1e-6 * two.max(), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("method", "backend", "tolerance"),
+    [("Radau", "compiled", 1e-10), ("DOP853", "compiled", 1e-12), ("LSODA", "pinocchio", 1e-10)],
+)
+def test_other_methods_agree(whole, method, backend, tolerance):
+    machine, signals, run = whole
+    other = crane.simulate(
+        machine, signals, duration=0.6, method=method, backend=backend, tolerance=tolerance
+    )
+    n = len(other.time)
+    np.testing.assert_allclose(other.q, run.q[:n], atol=1e-6 * np.abs(run.q).max())
+    for name in ("x_a", "x_b", "y_a", "z_a", "w_b", "supply", "second", "warm", "quick"):
+        one, two = other.channels[f"pressure_{name}"], run.channels[f"pressure_{name}"][:n]
+        assert np.abs(one - two).max() < 1e-6 * np.abs(two).max(), name

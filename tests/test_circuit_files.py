@@ -1,0 +1,327 @@
+"""Circuits in machine files: what is read, written, changed, locked, linearized and refused."""
+
+import warnings
+
+import numpy as np
+import pytest
+from circuits import ALL, SIGNALS, TIMES, everything, gaps
+from hydraulic_rig import rig
+from typed import typed
+
+import crane
+from crane.common.errors import DescriptionError, InputError
+from crane.control import Signals
+from crane.recordings import timeseries
+
+PUMP = {"control": "load-sensing", "pressure": 2e7, "flow": 6e-4, "margin": 2e6}
+LEAK = {"type": "leak", "from": "supply", "to": "tank", "gain": 1e-12}
+
+
+def test_everything_is_written_and_read_to_the_last_bit(tmp_path):
+    machine = everything(tmp_path)
+    out = tmp_path / "out"
+    crane.write_machine(machine, out)
+    again = crane.load(out / "rig.yaml")
+    assert again.hydraulics == machine.hydraulics
+    assert list(again.hydraulics.cylinders) == list(machine.hydraulics.cylinders)
+    crane.write_machine(again, tmp_path / "twice")
+    one, two = ((tmp_path / x / "rig.yaml").read_text() for x in ("out", "twice"))
+    assert one.splitlines()[-60:] == two.splitlines()[-60:]
+
+
+def test_all_numbers_are_named_and_can_be_changed(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        machine = everything(tmp_path)
+    told = typed("info", tmp_path / "rig.yaml", "--names")
+    assert told.returncode == 0, told.stderr
+    for name in (
+        "supply.margin", "supply.second.signal", "supply.pilot.pressure", "engine.inertia",
+        "line.block.volume", "accumulator.warm.time_constant", "element.cooler.coefficient",
+        "valve.y.regeneration", "cylinder.z.cross_relief", "oil.air", "supply.tank",
+    ):  # fmt: skip
+        assert name in told.stdout, name
+    assert "supply.second.tank" not in told.stdout
+    changes = {
+        "supply.second.signal": 1.8e6, "engine.speed_droop": 9.0, "line.block.volume": 7e-4,
+        "accumulator.warm.precharge": 2.5e6, "element.drain.gain": 2e-11, "valve.y.c1": 4e-7,
+        "supply.pilot.pressure": 1.7e7,
+    }  # fmt: skip
+    other = crane.load(tmp_path / "rig.yaml", changes)
+    circuit = other.hydraulics
+    assert circuit.supplies["second"].signal == 1.8e6 and circuit.engine.speed_droop == 9.0
+    assert circuit.lines["block"].volume == 7e-4
+    assert circuit.accumulators["warm"].precharge == 2.5e6
+    assert circuit.elements["drain"].gain == 2e-11
+    assert circuit.valves["y"].curves == machine.hydraulics.valves["y"].curves
+    words = [f"--set={name}={value}" for name, value in changes.items()]
+    run = tmp_path / "run"
+    told = typed("simulate", tmp_path / "rig.yaml", "--out", run, "--duration", 0.05, *words)
+    assert told.returncode == 0, told.stderr
+
+
+def test_every_number_of_the_circuit_acts(tmp_path):
+    """What can be set is among the numbers of the formulas."""
+    from circuit_state import circuit_of
+
+    machine = everything(tmp_path)
+    usual = circuit_of(machine).numbers
+    for name, value in {
+        "supply.pilot.pressure": 1.7e7, "engine.torque": 140.0, "line.block.volume": 6e-4,
+        "accumulator.quick.volume": 6e-4, "element.feed.pressure": 2e6, "supply.second.throttle":
+        7e-7, "valve.y.float_from": 0.7, "valve.x.hysteresis": 0.03, "cylinder.x.rupture_a": 1e-3,
+    }.items():  # fmt: skip
+        other = circuit_of(crane.load(tmp_path / "rig.yaml", {name: value})).numbers
+        assert 1 <= np.sum(other != usual) <= 2, name
+
+
+def test_names_of_supplies_do_not_hide_those_of_the_first(tmp_path):
+    leak = {"type": "leak", "from": "pressure", "to": "tank", "gain": 1e-13}
+    rig(tmp_path, supplies={"pressure": {"pressure": 2e7, "flow": 1e-3}}, elements={"drip": leak})
+    machine = crane.load(tmp_path / "rig.yaml", {"supply.pressure": 1e7})
+    assert machine.hydraulics.supply.pressure == 1e7
+    assert machine.hydraulics.supplies["pressure"].pressure == 2e7
+
+
+@pytest.mark.parametrize("held", [["x"], ["y"], ["z"], ["w"], ["x", "y"], ["y", "z", "w"]])
+def test_locked_joints_take_their_elements_along(tmp_path, held):
+    everything(tmp_path)
+    machine = crane.load(tmp_path / "rig.yaml", lock=dict.fromkeys(held, 0.1))
+    circuit = machine.hydraulics
+    assert ("suspension" in circuit.elements) == ("x" not in held)
+    assert ("quick" in circuit.accumulators) == ("x" not in held)
+    assert circuit.elements.keys() >= {"cooler", "fill", "feed"}
+    left = {joint: SIGNALS[joint] for joint in machine.active}
+    run = crane.simulate(machine, Signals(machine, TIMES, left), duration=0.8)
+    oil, energy = gaps(run, machine)
+    assert oil < 1e-12 and energy < 1e-6
+
+
+def test_a_motor_is_written_as_one_or_not_at_all(tmp_path):
+    everything(tmp_path)
+    machine = crane.load(tmp_path / "rig.yaml", {"cylinder.z.area_a": 4e-4})
+    with pytest.raises(InputError) as caught:
+        crane.write_machine(machine, tmp_path / "out")
+    assert "area_b of the motor of 'z'" in str(caught.value) and "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_linear_model_of_two_pumps_at_rest_and_moving(tmp_path):
+    """Its states are those of pumps and lines, too, and its matrix that of differences."""
+    machine = rig(
+        tmp_path, supply=PUMP | {"response": 0.1, "least": 0.01}, joints=("x", "y"),
+        supplies={"second": PUMP}, valves={"y": {"supply": "second"}},
+        accumulators={"gas": {"volume": 1e-3, "precharge": 2e6, "pressure": 3e6}},
+        elements={
+            "leak": LEAK | {"gain": 2e-12},
+            "throttle": {"type": "orifice", "from": "x.a", "to": "gas", "coefficient": 1e-7},
+        },
+        axis="1 0 0", friction={"viscous": 5e4},
+    )  # fmt: skip
+    with pytest.warns(crane.CraneWarning, match="linearized where it does not stay"):
+        model = crane.linearize(machine)  # gas drives it
+    for name in ("pressure_supply", "share_supply", "pressure_second", "pressure_gas"):
+        assert name in model.states
+    assert np.isfinite(model.A).all()
+    rig(
+        tmp_path, supply=PUMP | {"response": 0.1, "least": 0.01}, axis="1 0 0",
+        elements={"leak": LEAK | {"gain": 2e-12}},
+    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model = crane.linearize(tmp_path / "rig.yaml")
+    # V / B p' = Q e - (gain) p with its own time constant, e' = -e / T beside its least
+    values = np.linalg.eigvals(model.A)
+    for wanted in (-2e-12 * 1.2e9 / 2e-3, -10.0):
+        assert np.abs(values - wanted).min() < 1e-9 * abs(wanted)
+
+
+def test_linear_model_moves_on_a_load_sensing_pump(tmp_path):
+    machine = rig(
+        tmp_path, supply=PUMP | {"response": 0.1, "drag": 300.0}, axis="1 0 0",
+        friction={"viscous": 1e5},
+        engine={"speed": 190.0, "torque": 100.0, "inertia": 1.0, "speed_droop": 10.0},
+    )  # fmt: skip
+    model = crane.linearize(machine, [0.2], velocity=[0.05])
+    assert {"share_supply", "engine"} <= set(model.states)
+    assert np.isfinite(model.A).all()
+
+
+def test_what_knows_cylinders_alone_says_so(tmp_path):
+    machine = everything(tmp_path)
+    told = typed(
+        "simulate", tmp_path / "rig.yaml", "--out", tmp_path / "run", "--controller",
+        "valve-feedforward",
+    )  # fmt: skip
+    assert told.returncode == 2 and not (tmp_path / "run").exists()
+    assert "knows cylinders, 'z' has a motor: take valve-pd" in told.stderr
+    with pytest.raises(InputError, match="that of 'rig' has load-sensing control"):
+        crane.excite_valves(machine, ["oil.bulk_modulus"], trials=2)
+
+
+@pytest.mark.slow
+def test_calibration_finds_numbers_of_pumps_and_elements(tmp_path):
+    """From a recording of the truth, by a machine whose throttles are 7 and 15 % off."""
+    machine = everything(tmp_path)
+    run = crane.simulate(machine, Signals(machine, TIMES, SIGNALS), duration=2.0)
+    names = [f"pressure_{joint}_{side}" for joint in "xyzw" for side in "ab"]
+    units = {"time": "s", **{f"voltage_{x}": "V" for x in "xyzw"}}
+    units |= {x: machine.unit(x) for x in "xyzw"} | dict.fromkeys(names, "Pa")
+    columns = [run.channels[x] for x in (*(f"voltage_{x}" for x in "xyzw"), *names)]
+    values = np.column_stack([run.time, *columns[:4], *run.q.T, *columns[4:]])
+    timeseries.write(tmp_path / "run.csv", timeseries.Table(units, values, {}))
+    true = {"element.cooler.coefficient": 2e-6, "supply.second.throttle": 6e-7}
+    wrong = crane.load(
+        tmp_path / "rig.yaml",
+        {"element.cooler.coefficient": 2.3e-6, "supply.second.throttle": 6.4e-7},
+    )
+    found = crane.calibrate(wrong, tmp_path / "run.csv", dict.fromkeys(true)).values
+    for name, value in true.items():
+        assert found[name] == pytest.approx(value, rel=1e-5)
+
+
+def test_sensitivities_by_numbers_of_the_circuit(tmp_path):
+    """Beside differences of simulations."""
+    options = {
+        "supply": PUMP | {"response": 0.1},
+        "supplies": {"pilot": {"pressure": 1.5e7}},
+        "joints": ("x", "y"),
+        "valves": {"y": {"supply": "pilot"}},
+        "lines": {"back": {"volume": 1e-3}},
+        "elements": {
+            "cooler": {"type": "orifice", "from": "back", "to": "tank", "coefficient": 3e-7},
+        },
+        "friction": {"viscous": 1e5},
+        "axis": "1 0 0",
+    }  # fmt: skip
+    options["valves"]["x"] = {"return_b": "back", "return_a": "back"}
+    machine = rig(tmp_path, **options)
+    signals = {"x": [0.0, 0.0, 0.5], "y": [0.0, 0.0, 0.5]}
+
+    def end(changes):
+        other = crane.load(tmp_path / "rig.yaml", changes)
+        control = Signals(other, [0.0, 0.1, 0.2], signals)
+        return crane.simulate(other, control, duration=0.6, tolerance=1e-11).q[-1]
+
+    names = ("supply.margin", "supply.pilot.pressure", "element.cooler.coefficient")
+    found = crane.sensitivities(
+        machine, Signals(machine, [0.0, 0.1, 0.2], signals), duration=0.6, by=list(names)
+    )
+    for name in names:
+        head = found.values[names.index(name)]
+        step = 1e-4 * head
+        slope = (end({name: head + step}) - end({name: head - step})) / (2 * step)
+        assert slope.any()
+        one = [found.of(joint, name)[-1] for joint in "xy"]
+        np.testing.assert_allclose(one, slope, rtol=2e-3, atol=1e-4 * np.abs(slope).max())
+
+
+REFUSED = {
+    "unknown node": (
+        {"elements": {"e": LEAK | {"to": "nowhere"}}}, "to: nowhere", "leads to 'nowhere'"),
+    "to itself": ({"elements": {"e": LEAK | {"to": "supply"}}}, "to: supply", "to itself"),
+    "node twice": (
+        {"lines": {"gas": {"volume": 1e-3}}, "accumulators": {"gas": {"volume": 1e-3,
+         "precharge": 1e6}}, "elements": {"e": LEAK | {"to": "gas"}}},
+        "gas:", "two nodes are called 'gas'"),
+    "node as a chamber": (
+        {"lines": {"x_a": {"volume": 1e-3}}, "elements": {"e": LEAK | {"to": "x_a"}}},
+        "x_a:", "two nodes are called 'x_a'"),
+    "line called tank": (
+        {"lines": {"tank": {"volume": 1e-3}}}, "tank:", "two nodes are called 'tank'"),
+    "no margin": (
+        {"supply": {"control": "load-sensing", "flow": 1e-3}}, "supply:", "has no 'margin'"),
+    "no throttle": (
+        {"supply": {"control": "negative", "flow": 1e-3, "signal": 1e6, "relief": 2e7}},
+        "supply:", "no 'throttle'"),
+    "no signal": (
+        {"supply": {"control": "negative", "flow": 1e-3, "throttle": 1e-6, "relief": 2e7}},
+        "supply:", "no 'signal'"),
+    "no relief": (
+        {"supply": {"control": "fixed", "flow": 1e-3}}, "supply:", "no 'relief'"),
+    "fixed with power": (
+        {"supply": {"control": "fixed", "flow": 1e-3, "relief": 2e7, "power": 1e4}},
+        "power:", "limits the power of a fixed pump"),
+    "no flow": ({"supply": PUMP | {"flow": 0.0}}, "flow:", "has no 'flow'"),
+    "control": ({"supply": PUMP | {"control": "sensing"}}, "control:", "none of pressure, load"),
+    "summed with nobody": (
+        {"supply": PUMP | {"power": 1e4, "summed": ["supply", "third"]}},
+        "summed:", "names 'third', give pumps with a power: supply"),
+    "summed without power": (
+        {"supply": PUMP | {"summed": ["supply"]}}, "summed:", "has no 'power'"),
+    "curve back": (
+        {"valves": {"x": {"c1": [[0, 0], [0.5, 1e-7], [0.5, 2e-7]]}}}, "c1:", "do not increase"),
+    "curve outside": (
+        {"valves": {"x": {"c1": [[0, 0], [1.5, 1e-7]]}}}, "c1:", "from 0 to 1"),
+    "curve empty": ({"valves": {"x": {"c1": []}}}, "c1:", "'c1'"),
+    "curve of one": ({"valves": {"x": {"c1": [[0.5, 1e-7]]}}}, "c1:", "two points"),
+    "curve of zeros": ({"valves": {"x": {"c1": [[0, 0], [1, 0]]}}}, "c1:", "all values"),
+    "curve negative": ({"valves": {"x": {"c1": [[0, 0], [1, -1e-7]]}}}, "c1:", "negative"),
+    "curve without drop": (
+        {"valves": {"x": {"c1": {"flow": [[0, 0], [1, 1e-3]]}}}}, "c1:", "'drop'"),
+    "csv": ({"valves": {"x": {"c1": {"file": "bad.csv", "drop": 1e6}}}}, "c1:", "bad.csv:3"),
+    "csv columns": (
+        {"valves": {"x": {"c1": {"file": "names.csv", "drop": 1e6}}}}, "c1:", "no columns u and"),
+    "csv missing": (
+        {"valves": {"x": {"c1": {"file": "no.csv", "drop": 1e6}}}}, "file:", "no file 'no.csv'"),
+    "float": ({"valves": {"x": {"float_from": 0.8}}}, "float_from:", "give both"),
+    "sharing with margin": (
+        {"valves": {"x": {"type": "sharing", "margin": 1e6}}}, "margin:", "'margin'"),
+    "exponent": (
+        {"accumulators": {"gas": {"volume": 1e-3, "precharge": 1e6, "exponent": 1.0,
+         "time_constant": 1.0}}, "elements": {"e": LEAK | {"to": "gas"}}}, "exponent:", "above 1"),
+    "unknown supply": ({"valves": {"x": {"supply": "third"}}}, "supply: third", "'third'"),
+    "unknown return": (
+        {"valves": {"x": {"return_a": "bank"}}}, "return_a:", "leads to 'bank'"),
+    "return into a chamber": (
+        {"valves": {"x": {"return_a": "x.b"}}}, "return_a:", "leads to 'x.b'"),
+    "percent": ({"supply": PUMP | {"least": 5.0}}, "least:", "below 1"),
+    "tank again": (
+        {"supplies": {"second": PUMP | {"tank": 2e5}}}, "tank:", "unknown key 'tank'"),
+    "below the tank": (
+        {"supply": {"tank": 3e5}, "supplies": {"second": {"pressure": 2e5}}}, "pressure: 200000",
+        "not above the tank's"),
+    "floating line": (
+        {"lines": {"m": {"volume": 1e-3}}}, "m:", "nothing is joined to the line 'm'"),
+    "floating accumulator": (
+        {"accumulators": {"gas": {"volume": 1e-3, "precharge": 1e6}}}, "gas:",
+        "nothing is joined to the accumulator 'gas'"),
+    "side alone": ({"elements": {"e": LEAK | {"side": "out"}}}, "side:", "give their 'joints'"),
+    "joint of nobody": ({"elements": {"e": LEAK | {"joints": ["q"]}}}, "joints:", "'q'"),
+    "kind": ({"elements": {"e": LEAK | {"type": "valve"}}}, "type:", "none of orifice"),
+    "no gain": (
+        {"elements": {"e": {"type": "leak", "from": "supply", "to": "tank"}}}, "e:", "'gain'"),
+    "name": ({"lines": {"a b": {"volume": 1e-3}}}, "a b:", "use letters, digits, _"),
+    "motor and cylinder": (
+        {"motors": {"y": {"displacement": 1e-5, "volume": 1e-4}}, "joints": ("x", "y"),
+         "cylinders": {"y": {}}}, "y:", "a cylinder and a motor"),
+    "engine": ({"engine": {"speed": 0.0, "torque": 1.0, "inertia": 1.0}}, "speed:", "positive"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_cannot_be_is_refused_in_one_line(tmp_path, what):
+    more, at, text = REFUSED[what]
+    (tmp_path / "bad.csv").write_text("u,flow\n0,0\n0.5,much\n")
+    (tmp_path / "names.csv").write_text("stroke,flow\n0,0\n")
+    more = dict(more)
+    with pytest.raises(DescriptionError) as caught:
+        rig(tmp_path, **{"joints": ("x",)} | more)
+    line = str(caught.value)
+    assert text in line and "\n" not in line, line
+    name, number, _ = line.split(":", 2)
+    written = (tmp_path / name).read_text().splitlines()[int(number) - 1]
+    assert at in written, (written, line)
+    before = sorted(tmp_path.iterdir())
+    for words in (("info", "rig.yaml"), ("simulate", "rig.yaml", "--out", "run")):
+        told = typed(*words, cwd=tmp_path)
+        assert told.returncode == 2 and text in told.stderr
+        assert len([x for x in told.stderr.splitlines() if x.startswith("error")]) == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_everything_is_all_that_there_is():
+    """The machine of these tests has every section and every kind of element."""
+    assert {"supplies", "engine", "lines", "accumulators", "elements", "motors"} <= ALL.keys()
+    kinds = {x["type"] for x in ALL["elements"].values()}
+    assert kinds == {"orifice", "check", "relief", "leak"}

@@ -1,0 +1,272 @@
+"""Circuits beside their equations, written out again and integrated by scipy to 1e-10."""
+
+import numpy as np
+import pytest
+from hydraulic_rig import AREA_A, AREA_B, HOSE, STROKE, rig
+from scipy.integrate import solve_ivp
+
+import crane
+from crane.control import Signals
+
+BULK, TANK, G = 1.2e9, 1e5, 9.81
+C = 4e-7
+VALVE = {"type": "orifice", "c1": C, "c2": C, "c3": C, "c4": C}
+LINE = 2e-3 / BULK
+
+
+def root(d):
+    """sqrt beyond 1e4 Pa, an odd cubic of equal value and slope within."""
+    s = min(max(d / 1e4, -1.0), 1.0)
+    return 25 * s * (5 - s * s) if abs(s) < 1 else np.sign(d) * np.sqrt(abs(d))
+
+
+def clip(x, low=0.0, high=1.0):
+    return min(max(x, low), high)
+
+
+def cylinder(
+    x, v, a, b, q_a, q_b, mass=2000.0, viscous=300.0, weight=0.0, area_a=AREA_A, area_b=AREA_B
+):  # noqa: E501
+    """x', v', p_A', p_B'."""
+    return [
+        v,
+        (area_a * a - area_b * b - viscous * v - weight) / mass,
+        BULK / (HOSE + area_a * x) * (q_a - area_a * v),
+        BULK / (HOSE + area_b * (STROKE - x)) * (q_b + area_b * v),
+    ]
+
+
+def orifices(u, p, a, b):
+    """Flows into A and B."""
+    if u >= 0:
+        return C * u * root(p - a), -C * u * root(b - TANK)
+    return C * u * root(a - TANK), -C * u * root(p - b)
+
+
+def functions(joints):
+    """Names of the states of cylinders."""
+    return [
+        name.format(joint)
+        for joint in joints
+        for name in ("{}", "{}.v", "pressure_{}_a", "pressure_{}_b")
+    ]
+
+
+def compare(machine, signals, rates, names, duration, times=None, initial=None, start=()):
+    """Simulate both, and see that pressures and strokes agree to 1e-6.
+
+    Args:
+        machine: The machine.
+        signals: Of the valves by joint, over times.
+        rates: (t, y) -> y'.
+        names: Of y: joints, JOINT.v, channels.
+        duration: [s].
+        times: Of the signals.
+        initial: Of the machine.
+        start: What of y at the start is no channel, by name.
+    """
+    control = Signals(machine, times, signals)
+    run = crane.simulate(machine, control, initial, duration, tolerance=1e-10)
+    found = {}
+    for i, joint in enumerate(machine.active):
+        found[joint], found[f"{joint}.v"] = run.q[:, i], run.v[:, i]
+    found |= run.channels
+    begin = [dict(start)[name] if name in dict(start) else found[name][0] for name in names]
+    edges = [0.0, *[t for t in times if 0 < t < duration], duration]
+    rows = []
+    for one, two in zip(edges, edges[1:], strict=False):  # signals have corners there
+        inside = run.time[(run.time >= one) & (run.time < two)]
+        solved = solve_ivp(
+            rates, (one, two), begin, "Radau", [*inside, two], rtol=1e-10, atol=1e-12
+        )
+        assert solved.success
+        rows.append(solved.y[:, :-1] if two < duration else solved.y[:, :])
+        begin = solved.y[:, -1]
+    y = np.hstack(rows)[:, : len(run.time)]
+    worst = {}
+    for name, row in zip(names, y, strict=True):
+        if name in found:
+            here = found[name][: len(row)]
+            worst[name] = np.abs(here - row).max() / np.abs(row).max()
+            if name.startswith("pressure") or name in machine.active:
+                assert worst[name] < 1e-6, worst
+                assert np.ptp(row) > 1e-3 * np.abs(row).max(), name  # it moved
+            else:
+                assert worst[name] < 1e-5, worst
+    return run
+
+
+def test_load_sensing_with_response(tmp_path):
+    supply = {
+        "control": "load-sensing", "pressure": 25e6, "flow": 1e-3, "margin": 2e6, "droop": 5e5,
+        "standby": 2.5e6, "response": 0.08, "slip": 2e-12,
+    }  # fmt: skip
+    machine = rig(tmp_path, VALVE, supply=supply)
+    times, u = [0.0, 0.2, 0.4, 1.2, 1.4, 2.5], [0.0, 0.0, 0.5, 0.5, -0.3, -0.3]
+
+    def rates(t, y):
+        x, v, a, b, p, e = y
+        s = np.interp(t, times, u)
+        q_a, q_b = orifices(s, p, a, b)
+        load = TANK + max(clip(100 * s) * (a - TANK), clip(-100 * s) * (b - TANK))
+        asked = clip((min(max(load + 2e6, 2.5e6), 25e6) - p) / 5e5)
+        drawn = q_a if s >= 0 else q_b
+        return [
+            *cylinder(x, v, a, b, q_a, q_b, weight=2000 * G),
+            (1e-3 * e - 2e-12 * (p - TANK) - drawn) / LINE,
+            (asked - e) / 0.08,
+        ]
+
+    names = ["x", "x.v", "pressure_x_a", "pressure_x_b", "pressure_supply", "share_supply"]
+    compare(machine, {"x": u}, rates, names, 2.5, times)
+
+
+def test_accumulator_with_heat_under_a_load(tmp_path):
+    """A load that swings on gas: closed valve, chamber A throttled into an accumulator."""
+    v0, p0, n, tau, port = 8e-4, 1.5e6, 1.3, 0.7, 1e-4
+    machine = rig(
+        tmp_path, VALVE,
+        accumulators={"gas": {
+            "volume": v0, "precharge": p0, "exponent": n, "time_constant": tau, "line": port,
+            "pressure": 3.2e6,
+        }},
+        elements={
+            "throttle": {"type": "orifice", "from": "x.a", "to": "gas", "coefficient": 8e-7},
+        },
+    )  # fmt: skip
+
+    def rates(t, y):
+        x, v, a, b, p, oil = y
+        q = 8e-7 * root(a - p)
+        left = v0 - oil
+        cooling = (p - p0 * v0 / left) / tau
+        # port / B p' + V' = q, V = volume of the oil behind the diaphragm, p' = n p V' / left - ..
+        slope = (n * p * q / left - cooling) / (1 + port / BULK * n * p / left)
+        return [
+            *cylinder(x, v, a, b, -q, 0.0, weight=2000 * G), slope, q - port / BULK * slope,
+        ]  # fmt: skip
+
+    names = ["x", "x.v", "pressure_x_a", "pressure_x_b", "pressure_gas", "oil"]
+    compare(
+        machine, {"x": [0.0, 0.0]}, rates, names, 3.0, [0.0, 3.0],
+        start={"oil": v0 * (1 - p0 / 3.2e6)}.items(),
+    )  # fmt: skip
+
+
+def test_engine_with_two_pumps_of_summed_power(tmp_path):
+    engine = {"speed": 190.0, "torque": 40.0, "inertia": 0.5, "speed_droop": 12.0}
+    pump = {
+        "control": "positive", "pressure": 25e6, "relief": 28e6, "flow": 9e-4, "droop": 1e6,
+        "friction": 0.04, "drag": 300.0, "summed": ["supply", "second"], "least": 0.05,
+        "response": 0.1,
+    }  # fmt: skip
+    powers = 5e3, 4e3
+    machine = rig(
+        tmp_path, VALVE | {"centre": 4e-7}, joints=("x", "y"), supply=pump | {"power": powers[0]},
+        supplies={"second": pump | {"power": powers[1]}}, engine=engine,
+        valves={"y": {"supply": "second", "demand": 0.7}}, axis="1 0 0",
+        friction={"viscous": 6e5},
+    )  # fmt: skip
+    times = [0.0, 0.2, 0.5, 1.0, 1.3, 2.2]
+    u = {"x": [0.0, 0.0, 0.8, 0.8, -0.4, -0.4], "y": [0.0, 0.3, 0.3, 0.9, 0.9, 0.0]}
+
+    def rates(t, y):
+        out, shares, torque, n = [], y[10:12], 0.0, y[12]
+        mean = np.dot(powers, y[8:10]) / sum(powers)
+        slopes, moves = [], []
+        for i, joint in enumerate("xy"):
+            s, p = np.interp(t, times, u[joint]), y[8 + i]
+            x, v, a, b = y[4 * i : 4 * i + 4]
+            q_a, q_b = orifices(s, p, a, b)
+            out += cylinder(x, v, a, b, q_a, q_b, viscous=6e5)
+            asked = min((1.0, 0.7)[i] * abs(s), (25e6 - p) / 1e6)
+            asked = clip(min(asked, powers[i] / (9e-4 * max(mean - TANK, 1e4))), 0.05, 1.0)
+            moves.append((asked - shares[i]) / 0.1)
+            centre = 4e-7 * (1 - abs(s)) * root(p - TANK)
+            relief = 1e-8 * max(p - 28e6, 0)
+            given = shares[i] * 9e-4 * n
+            drawn = q_a if s >= 0 else q_b
+            slopes.append((given - centre - relief - drawn) / LINE)
+            torque += (given / n * (p - TANK) * 1.04 + 300 * n) / 190
+        governor = 40 * clip((190 + 12 - 190 * n) / 12)
+        return [*out, *slopes, *moves, (governor - torque) / 0.5 / 190]
+
+    names = [
+        *functions("xy"),
+        "pressure_supply", "pressure_second", "share_supply", "share_second", "n",
+    ]  # fmt: skip
+    run = compare(machine, u, rates, names, 2.2, times, [0.1, 0.1], start={"n": 202 / 190}.items())
+    assert run.channels["engine_speed"].min() < 190  # it was felt
+    power = run.channels["shaft_supply"] + run.channels["shaft_second"]
+    assert power.max() > 0.7 * sum(powers)
+
+
+def test_flow_sharing_of_two_cylinders(tmp_path):
+    supply = {
+        "control": "load-sensing", "pressure": 25e6, "flow": 4e-4, "margin": 2e6, "droop": 5e5,
+    }  # fmt: skip
+    machine = rig(
+        tmp_path, VALVE | {"type": "sharing"}, joints=("x", "y"), supply=supply,
+        cylinders={"y": {"area_a": 4e-3, "area_b": 2e-3}}, friction={"viscous": 5e4},
+    )  # fmt: skip
+    times = [0.0, 0.2, 0.4, 1.2, 1.5, 2.0]
+    u = {"x": [0.0, 0.0, 0.7, 0.7, 0.7, 0.7], "y": [0.0, 0.0, 0.0, 0.6, 0.6, 0.0]}
+    areas = {"x": (AREA_A, AREA_B), "y": (4e-3, 2e-3)}
+
+    def rates(t, y):
+        p, out, drawn, load = y[8], [], 0.0, TANK
+        s = {joint: np.interp(t, times, u[joint]) for joint in "xy"}
+        for i, joint in enumerate("xy"):
+            load = max(load, TANK + clip(100 * s[joint]) * (y[4 * i + 2] - TANK))
+        for i, joint in enumerate("xy"):
+            x, v, a, b = y[4 * i : 4 * i + 4]
+            q_a = C * s[joint] * root(max(p - max(load, a), 0.0))
+            q_b = -C * s[joint] * root(b - TANK)
+            drawn += q_a
+            area_a, area_b = areas[joint]
+            out += cylinder(
+                x, v, a, b, q_a, q_b, viscous=5e4, weight=2000 * G, area_a=area_a, area_b=area_b
+            )
+        share = clip((min(load + 2e6, 25e6) - p) / 5e5)
+        return [*out, (4e-4 * share - drawn) / LINE]
+
+    names = [
+        *functions("xy"),
+        "pressure_supply",
+    ]  # fmt: skip
+    run = compare(machine, u, rates, names, 2.0, times)
+    assert run.channels["share_supply"].max() == 1.0  # it had too little
+
+
+def test_open_centre_with_negative_control(tmp_path):
+    supply = {
+        "control": "negative", "pressure": 25e6, "relief": 27e6, "flow": 1e-3, "signal": 2e6,
+        "throttle": 6e-7, "response": 0.05, "least": 0.05, "droop": 1e6,
+    }  # fmt: skip
+    machine = rig(
+        tmp_path, VALVE | {"centre": 3e-6}, joints=("x", "y"), supply=supply,
+        friction={"viscous": 2e4}, axis="1 0 0",
+    )  # fmt: skip
+    times = [0.0, 0.3, 0.6, 1.2, 1.5, 2.0]
+    u = {"x": [0.0, 0.0, 0.6, 0.6, 0.0, 0.0], "y": [0.0, 0.0, -0.3, -0.3, -0.6, -0.6]}
+
+    def rates(t, y):
+        p, e, out, drawn, series = y[8], y[9], [], 0.0, 1 / 6e-7**2
+        for i, joint in enumerate("xy"):
+            s = np.interp(t, times, u[joint])
+            x, v, a, b = y[4 * i : 4 * i + 4]
+            q_a, q_b = orifices(s, p, a, b)
+            drawn += q_a if s >= 0 else q_b
+            series += 1 / (3e-6 * (1 - abs(s))) ** 2
+            out += cylinder(x, v, a, b, q_a, q_b, viscous=2e4)
+        before = (p - TANK) / 6e-7**2 / series
+        asked = clip(min(1 - before / 2e6, (25e6 - p) / 1e6), 0.05, 1.0)
+        past = root(p - TANK) / np.sqrt(series) + 1e-8 * max(p - 27e6, 0)
+        return [*out, (1e-3 * e - drawn - past) / LINE, (asked - e) / 0.05]
+
+    names = [
+        *functions("xy"),
+        "pressure_supply", "share_supply",
+    ]  # fmt: skip
+    run = compare(machine, u, rates, names, 2.0, times)
+    assert pytest.approx(0.05) == run.channels["share_supply"][0]

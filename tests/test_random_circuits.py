@@ -1,0 +1,19 @@
+"""Random circuits, crippled and starved ones among them: they balance, or say why not."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
+
+from random_circuits import bounded
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(0, 40, 10))
+def test_random_circuits_balance(first):
+    """Oil and energy to 1e-6 of what went through, within a minute each."""
+    found = [bounded(seed) for seed in range(first, first + 10)]
+    assert not [one for one in found if one.bad]
+    assert sum(one.what == "runs" for one in found) > 5
