@@ -453,6 +453,35 @@ def test_elements_that_valves_open(tmp_path):
             assert flow(at, "e") == pytest.approx(expected, rel=1e-12, abs=1e-20)
 
 
+@pytest.mark.parametrize("first", [None, "x", "y"])
+def test_a_valve_of_priority_is_served_first(tmp_path, first):
+    """Two functions ask for twice what the pump has; x has the lower load."""
+    valve = {"type": "compensated", "flow": 6e-4, "margin": 1e6, "dead_band": 0.0}
+    valves = {first: {"priority": True}} if first else {}
+    machine = rig(
+        tmp_path, valve, supply={"pressure": 20e6, "flow": 6e-4, "droop": 2e5}, joints=("x", "y"),
+        axis="1 0 0", friction={"viscous": 1e5}, valves=valves,
+    )  # fmt: skip
+    assert [x.priority for x in machine.hydraulics.valves.values()] == [first == x for x in "xy"]
+    assert (
+        crane.load(crane.write_machine(machine, tmp_path / "written")).hydraulics
+        == machine.hydraulics
+    )
+    loads = [crane.Wrench("load_y", (-3e4, 0, 0))]
+    signals = crane.Signals(machine, [0.0, 4.0], {"x": [1.0, 1.0], "y": [1.0, 1.0]})
+    run = crane.simulate(machine, signals, [0.05, 0.05], duration=2.0, step=5e-3, loads=loads)
+    flows = np.array([run.channels[f"flow_{joint}_a"][-1] for joint in "xy"])
+    assert flows.sum() == pytest.approx(6e-4, rel=1e-3)
+    supply = run.channels["pressure_supply"][-1]
+    if first is None:
+        assert flows[0] > 1.5 * flows[1]
+        return
+    own, other = flows if first == "x" else flows[::-1]
+    load = run.channels[f"pressure_{first}_a"][-1]
+    assert own == pytest.approx(6e-4 * np.sqrt(min((supply - load) / 1e6, 1.0)), rel=1e-6)
+    assert own > 0.88 * 6e-4 and other < 0.12 * 6e-4
+
+
 def test_a_second_pump_doubles_the_speed(tmp_path):
     """Confluence, a check valve that the boom's spool opens."""
     speeds = []

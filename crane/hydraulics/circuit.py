@@ -331,7 +331,9 @@ class Circuit:
         for one, rate in zip(functions, moved, strict=True):
             backs = [pressures[one.valve.return_a], pressures[one.valve.return_b]]
             load = loads.get(one.valve.supply, tank)
-            through = one.flows(pressures[one.valve.supply], backs, load)
+            supplied = pressures[one.valve.supply]
+            left = self._left(one, fed[one.valve.supply], supplied, tank)
+            through = one.flows(supplied, backs, load, left)
             through += one.around(tank)
             books.enter(through)
             hoses = nets_of((x for x in through if x.through not in INSIDE), one.nodes)
@@ -399,6 +401,15 @@ class Circuit:
         return any(one.valve.sharing for one in functions) or (
             pump is not None and pump.control == "load-sensing"
         )
+
+    def _left(
+        self, one: DrivenCylinder, beside: Sequence[DrivenCylinder], supply: Number, tank: Number
+    ) -> Number:
+        """Share of its flow that valves of priority leave to a valve; see `Valve`."""
+        first = [x.missing(supply, tank) for x in beside if x.valve.priority]
+        if not first or one.valve.priority:
+            return 1.0
+        return clipped(1.0 - highest(first), 0.0, 1.0)
 
     def _limiting(
         self, name: str, pressures: dict[str, Number], rows: dict[str, dict[str, Number]]

@@ -183,6 +183,9 @@ class Valve:
         float_coefficient: Of either way to the tank then [m3/(s Pa^0.5)].
         demand: Share of the pump's flow that the wide open valve asks of a positive control.
         sharing: Whether the compensator stands behind the inlet.
+        priority: Whether it is served first: the pump's other valves get the share
+            1 - (load + margin - p_S) / (0.2 margin) of their flows, within 0 and 1, as behind a
+            priority valve.
         supply: Name of the pump that feeds it.
         return_a: Node that chamber A is drained to.
         return_b: Chamber B.
@@ -208,6 +211,7 @@ class Valve:
     float_coefficient: float = 0.0
     demand: float = 1.0
     sharing: bool = False
+    priority: bool = False
     supply: str = MAIN
     return_a: str = TANK
     return_b: str = TANK
@@ -216,6 +220,8 @@ class Valve:
     def __post_init__(self) -> None:
         what = f"the valve of '{self.joint}'"
         check_numbers(self, what)
+        if self.priority and not self.margin:
+            raise PartError("priority", f"{what} has priority and no margin to keep, give it one")
         if self.sharing and self.margin:
             raise PartError("margin", f"{what} shares its flow, leave 'margin' to the pump")
         if (self.float_from > 0) != (self.float_coefficient > 0) or self.float_from >= 1:

@@ -7,11 +7,12 @@ from crane.codegen import Number, maximum
 from crane.codegen.scalar import apply, minimum, where_positive
 from crane.hydraulics.components import Counterbalance, Cylinder, Valve
 from crane.hydraulics.flow import LAMINAR, Flow, clipped, in_series, root, through
-from crane.hydraulics.nodes import PER_SENSED, softness_of
+from crane.hydraulics.nodes import PER_SENSED, highest, softness_of
 from crane.hydraulics.sources import TANK
 
 INSIDE = ("piston", "cross")  # flows that pass no hose
 _PLAY = 500.0  # [1/s], at which a signal takes its play along
+_GIVEN_WAY = 0.2  # of its margin, within which a valve of priority stops the others
 _SLIGHT = 0.1  # of the hose's volume, the least that a chamber holds
 FIELDS = (
     "area_a", "area_b", "hose_a", "hose_b", "gas_a", "gas_b", "leakage", "leakage_a", "leakage_b",
@@ -131,6 +132,12 @@ class DrivenCylinder:
         loads = [share * (p - tank) for share, p in zip(shares, self.pressures, strict=True)]
         return tank + maximum(*loads)
 
+    def missing(self, supply: Number, tank: Number) -> Number:
+        """What a pump's pressure is short of for its flow, over what `Valve.priority` allows."""
+        share = highest([clipped(y * PER_SENSED, 0.0, 1.0) for y in self.opened])
+        needed = self.sensed(tank) + share * self._part["margin"]
+        return (needed - supply) / (_GIVEN_WAY * self._part["margin"])
+
     def centre(self) -> Number:
         """Coefficient of its open centre."""
         size = maximum(self._spool, -self._spool)
@@ -138,13 +145,16 @@ class DrivenCylinder:
             return self._part["centre"] * curve.at(size)
         return self._part["centre"] * (1.0 - maximum(*self.opened))
 
-    def flows(self, supply: Number, backs: Sequence[Number], load: Number) -> list[Flow]:
+    def flows(
+        self, supply: Number, backs: Sequence[Number], load: Number, left: Number
+    ) -> list[Flow]:
         """All through its valve and past its piston.
 
         Args:
             supply: Pressure of what feeds it [Pa].
             backs: Those of what A and B are drained to [Pa].
             load: Highest load of the valves beside it, where it shares its flow [Pa].
+            left: Share of its inlet that valves of priority leave.
         """
         part, valve = self._part, self.valve
         nodes = list(self.nodes)
@@ -175,7 +185,7 @@ class DrivenCylinder:
             fed, drop = self._inflow(supply, inlet, side, load)
             if drop is None:  # else nothing comes back
                 fed = -self._held(-fed, side) if self._ruptures(side) else fed
-            found.append(Flow(valve.supply, node, fed, "inlet", drop))
+            found.append(Flow(valve.supply, node, left * fed, "inlet", drop))
             drained = -through(back - p, outlet, in_series(outlet, *self._obstacles(side)))
             found.append(Flow(node, to, self._held(drained, side), "outlet"))
         return found

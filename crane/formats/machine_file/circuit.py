@@ -103,7 +103,8 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
             cylinders[joint] = _motor(joint, item)
             _check_relief(item, supply, cylinders[joint])
     valves: dict[str, Valve] = {}
-    given = (*number_names(Valve), "type", "flow", "meter_out", "supply", "return_a", "return_b")
+    given = (*number_names(Valve), "type", "flow", "meter_out", "supply", "return_a", "return_b",
+             "priority")  # fmt: skip
     for joint, item in section.mappings("valves", "valve of", *given):
         named["valve"].append(joint)
         with recoverable():
@@ -362,6 +363,10 @@ def _valve(item: Section, joint: str) -> Valve:
     given: dict[str, Any] = {
         key: item.text(key) for key in ("supply", "return_a", "return_b") if key in item
     }
+    if "priority" in item:
+        given["priority"] = item.raw("priority")
+        if not isinstance(given["priority"], bool):
+            raise item.fail("priority", f"'priority' of {item.title} is neither yes nor no")
     curves = {}
     for name in _CURVED:
         if name in item and (found := read_curve(item, name)) is not None:

@@ -374,6 +374,8 @@ def _valve(valve: Valve, by_flow: bool = True) -> dict[str, Any]:
     for name in ("supply", "return_a", "return_b"):
         if getattr(valve, name) != getattr(usual, name):
             rest[name] = getattr(valve, name)
+    if valve.priority:
+        rest["priority"] = True
     for name, curve in valve.curves.items():
         of = rest if name == "centre" else every
         of[name] = curve_data(getattr(valve, name), curve)
