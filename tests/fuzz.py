@@ -225,8 +225,10 @@ def said_xml(data, known=None):
             value = words(value)
             if "axis" in (element.tag, key) and (length := np.hypot.reduce(value)):
                 value = tuple(np.round(np.array(value) / length, 15).tolist())
-            if (element.tag, key) == ("sdf", "version"):  # by which axes count elsewhere
-                value = tuple(isinstance(x, float) and x < 1.5 for x in value)
+            if (element.tag, key) == ("sdf", "version"):
+                if not any(isinstance(x, float) and x < 1.5 for x in value):
+                    continue  # axes count elsewhere before, else it says nothing
+                value = ("old",)
             if key == "polycoef":
                 value += (0.0,) * (5 - len(value))
             said.append((here, key, value))

@@ -51,12 +51,15 @@ def stability(
         with status("tipping"):
             found = tipping_load(loaded, task)
     (moments,), (shares,) = stands.static(q_a)
+    hangs = None
+    if loaded.tip is not None or frame is not None:
+        (mass,), (about,) = stands.tip_over_load(q_a, frame)
+        hangs = mass, about
     print("| tipping line | held by | of the weight |\n| --- | ---: | ---: |")
     for line, moment, share in zip(stands.lines, moments, shares, strict=True):
         print(f"| {' to '.join(line)} | {moment:.4g} N m | {100 * share:.1f} % |")
-    if loaded.tip is not None or frame is not None:
-        (mass,), (about,) = stands.tip_over_load(q_a, frame)
-        name = frame or loaded.tip
+    if hangs is not None:
+        (mass, about), name = hangs, frame or loaded.tip
         print(
             f"\n{mass:.5g} kg at '{name}' tip it about {about}"
             if about
