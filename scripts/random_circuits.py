@@ -201,6 +201,10 @@ def drawn(seed: int, folder: Path) -> tuple[Machine, Signals]:
     for i, name in enumerate([*lines, *gases]):  # which nothing leads to would be refused
         other = str(draw.random.choice([x for x in nodes if x != name]))
         elements[f"to{i}"] = draw.element([name, other], joints)
+    for name in (*[x for x in pumps if x != "supply"], *lines, *gases):  # likewise, no way back
+        elements[f"drip_{name}"] = {
+            "type": "leak", "from": name, "to": "tank", "gain": draw.size(1e-13),
+        }  # fmt: skip
     machine = rig(
         folder,
         joints=tuple(joints),
