@@ -10,7 +10,7 @@ from crane.codegen.scalar import add, apply
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number
 from crane.control.base import At
-from crane.control.openings import demanded, openings
+from crane.control.openings import check_known, demanded, openings
 from crane.control.valves import ValvePD, circuit_of
 from crane.dynamics import Dynamics
 from crane.hydraulics import Hydraulics, PDGains
@@ -72,12 +72,7 @@ class ValveFeedforward(ValvePD):
             reference = without_sway(machine, reference, "none")
         super().__init__(machine, reference, gains)
         circuit = circuit_of(machine)
-        for joint, cylinder in circuit.cylinders.items():
-            if cylinder.motor:
-                raise InputError(
-                    f"the feedforward of valves knows cylinders, '{joint}' has a motor: take "
-                    "valve-pd"
-                )
+        check_known(circuit)
         self.planned, self._free = reference, np.flatnonzero(~machine.driven)
         valves = circuit.valves.values()
         lags = [2.0 * x.damping / x.bandwidth if x.bandwidth else 0.0 for x in valves]

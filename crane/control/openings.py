@@ -54,6 +54,25 @@ def openings(valve: Valve, cylinder: Cylinder, supply: float, force: Array) -> t
     return found[0], found[1]
 
 
+def check_known(circuit: Hydraulics) -> None:
+    """Raise for parts that a circuit turned round does not know.
+
+    Raises:
+        InputError: A motor, a valve that shares its flow, or one with curves.
+    """
+    for joint, valve in circuit.valves.items():
+        for has, what in (
+            (circuit.cylinders[joint].motor, "a motor"),
+            (valve.sharing, "a valve that shares its flow"),
+            (bool(valve.curves), "a valve with curves"),
+        ):
+            if has:
+                raise InputError(
+                    f"the feedforward of valves knows cylinders and valves without curves, "
+                    f"'{joint}' has {what}: take valve-pd"
+                )
+
+
 def demanded(
     circuit: Hydraulics, time: Array, x: Array, v: Array, force: Array, strokes: Array
 ) -> Array:
@@ -143,6 +162,7 @@ def flow_share(machine: Machine, reference: Trajectory) -> float:
         reference: Of its active joints.
     """
     circuit = circuit_of(machine)
+    check_known(circuit)
     time = np.linspace(0.0, reference.duration, int(_PER_SECOND * reference.duration) + 2)
     v = reference.velocity(time)
     most, total = 0.0, np.zeros(len(time))

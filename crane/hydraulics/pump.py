@@ -66,11 +66,11 @@ class Pump:
         if supply.relief > 0:
             over = maximum(self._p - numbers["relief"], 0.0)
             self.flows.append(Flow(name, TANK, numbers["relief_gain"] * over, "relief"))
-        useful = delivered * above
-        self.heat = numbers["friction"] * useful + numbers["drag"] * speed * speed
-        self.shaft = useful + self.heat
-        turned = self.share * numbers["flow"] * above * (1.0 + numbers["friction"])
-        self.torque = turned + numbers["drag"] * speed
+        moved = self.share * numbers["flow"] * above
+        rubbed = numbers["friction"] * apply("abs", moved)  # also where the line drives the pump
+        self.torque = moved + rubbed + numbers["drag"] * speed
+        self.heat = rubbed * speed + numbers["drag"] * speed * speed
+        self.shaft = delivered * above + self.heat
 
     def _bypass(self) -> Number:
         """Pressure over the tank's before the throttle behind its open centres [Pa].
