@@ -8,8 +8,8 @@ PACKAGE = Path(__file__).parents[1] / "crane"
 # A room may import those before it. Within a room, modules may not form a circle either.
 ORDER = [
     "common", "codegen", "hydraulics", "description", "closure", "machine", "formats",
-    "recordings", "dynamics", "motion", "control", "simulation", "identification", "studies",
-    "view", "cli",
+    "recordings", "dynamics", "motion", "ratings", "control", "simulation", "identification",
+    "studies", "view", "cli",
 ]  # fmt: skip
 
 

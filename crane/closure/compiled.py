@@ -163,6 +163,7 @@ class FastClosure:
         self._add_moves(program)
         self._add_close(program)
         self._add_follow(program)
+        self._add_settle(program)
         self._add_gamma(program)
 
     def kept(self, key: tuple, build: Callable[[Program], None]) -> Program:
@@ -220,6 +221,14 @@ class FastClosure:
         targets = np.ascontiguousarray(targets)
         arrays = (self.geometry.numbers, targets, cursor.at, out, self.bounds)
         return self._loops.call("follow", len(targets), *arrays)
+
+    def settle(self, q: Array) -> int:
+        """Close the loops of postures (N, nq) in place, each from itself, until one does not.
+
+        Returns:
+            How many were closed.
+        """
+        return self._loops.call("settle", len(q), self.geometry.numbers, q, self.bounds)
 
     def gamma(self, q: Array, out: Array) -> int:
         """Evaluate gamma at closed postures (N, nq) into out (N, nv, n), while they are regular.
@@ -352,6 +361,17 @@ class FastClosure:
                 r.copy(r.at, guess, nq)
                 r.copy(r.at.at("gamma"), result.at("gamma"), at.parts["gamma"])
                 r.copy(r.out.row(i, nq), guess, nq)
+            r.give(r.count)
+
+    def _add_settle(self, program: Program) -> None:
+        """Close one posture after the other in place, each from itself."""
+        arrays = ("numbers", "q", "bounds")
+        with program.routine("settle", counts=("count",), arrays=arrays) as r:
+            result = r.array("result", program.outputs("newton"))
+            with r.loop(r.count) as i:
+                closed = r.call("close", r.numbers, r.q.row(i, self._nq), result, r.bounds)
+                with r.when(closed < 1):
+                    r.give(i)
             r.give(r.count)
 
     def _add_gamma(self, program: Program) -> None:

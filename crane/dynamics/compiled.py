@@ -45,6 +45,7 @@ QUANTITIES: dict[str, Callable[[Sweep, list[Number]], list[Number]]] = {
     "rates": lambda sweep, x: _rates(sweep, sweep.moved(x, rest=True)),
     "observation": lambda sweep, x: _observed(sweep, sweep.moved(x, rest=True)),
     "resting": lambda sweep, x: sweep.resting(x),
+    "statics": lambda sweep, x: sweep.statics,
     "regressor": lambda sweep, x: [entry for row in sweep.regressor(x) for entry in row],
 }
 _Analytic = Callable[[Sensitivity, list[Number]], tuple[Matrix, Matrix, Matrix]]

@@ -1,6 +1,7 @@
 """The equations of motion in the active coordinates."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +15,7 @@ from crane.dynamics.compiled import FRICTION, SLOPES, NamedCode, QuantityCode
 from crane.dynamics.frames import FrameJacobians
 from crane.dynamics.joint_forces import JointForces
 from crane.dynamics.named import Named
-from crane.dynamics.traced import Form, modes_at, numbers_of
+from crane.dynamics.traced import Form, grips_at, modes_at, numbers_of
 from crane.dynamics.tree import TreeDynamics
 from crane.machine import Machine
 from crane.machine.masses import has_mass
@@ -30,6 +31,7 @@ ARGUMENTS = {  # of the quantities that `derivatives` takes
     "passive": ("q_a", "v_a"),
     "energy": ("q_a", "v_a"),
     "regressor": ("q_a", "v_a", "a_a"),
+    "statics": ("q_a",),
 }
 
 
@@ -88,7 +90,7 @@ class Dynamics:
         self.pattern = self.numbers.copy()
         self._modes = modes_at(machine, self.forces) if self.backend == "compiled" else []
         self.pattern[self._modes] = np.nan
-        self._grips = slice(len(self.numbers) - len(self.forces.gripped), len(self.numbers))
+        self._grips = grips_at(machine, self.forces) if self.backend == "compiled" else []
         self.pattern[self._grips] = np.nan
 
     def __repr__(self) -> str:
@@ -319,7 +321,8 @@ class Dynamics:
 
         Args:
             quantity: "inverse", "forward", "mass_matrix", "bias", "gravity", "friction",
-                "passive", "energy" (kinetic, then potential) or "regressor".
+                "passive", "energy" (kinetic, then potential), "regressor" or "statics" (see
+                `crane.dynamics.statics`).
             q_a: (n,) or (N, n) [m], [rad].
             v_a: The same shape [m/s], [rad/s], where the quantity depends on it.
             x: The second argument of inverse and regressor (a_A) and of forward (tau_A), the same
@@ -389,6 +392,7 @@ class Dynamics:
         shapes = {
             "mass_matrix": (n, n),
             "energy": (2,),
+            "statics": (4 + 4 * n + (0 if self.machine.tip is None else 3 + 3 * n),),
             "regressor": (n, 10 * (model.njoints - 1) + np.count_nonzero(model.armature)),
         }
         return shapes.get(quantity, (n,))
@@ -422,6 +426,7 @@ class Dynamics:
 
     def constants(self, variant: Machine) -> Array:
         """Those of its formulas: geometry, then `numbers`."""
+        variant = replace(variant, tip=self.machine.tip)
         geometry = geometry_of(variant.closure.equations)
         if geometry.parents != self.machine.closure.fast.geometry.parents:
             raise InputError("the tree is not the same")

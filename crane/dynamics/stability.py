@@ -62,6 +62,8 @@ class Stability:
     Attributes:
         names: Of the supports.
         lines: Of each line the names of its two supports.
+        edges: Of each line the indices of its two supports.
+        stands: Whether no support moves.
         mass: Of the machine [kg].
 
     Raises:
@@ -83,15 +85,15 @@ class Stability:
         if not self.stands and len(self._pressing) < len(self._links):
             raise InputError(f"'{machine.name}' has supports that move without being contacts")
         try:
-            hull = ConvexHull(self._points(machine.home[None])[0, :, :2])
+            hull = ConvexHull(self.places(machine.home[None])[0, :, :2])
         except (QhullError, ValueError):
             raise InputError(
                 f"'{machine.name}' has {len(held)} supports and no area between them, name three "
                 "that are not in one line"
             ) from None
         around = [int(i) for i in hull.vertices]
-        self._edges = list(zip(around, around[1:] + around[:1], strict=True))
-        self.lines = [(self.names[i], self.names[j]) for i, j in self._edges]
+        self.edges = list(zip(around, around[1:] + around[:1], strict=True))
+        self.lines = [(self.names[i], self.names[j]) for i, j in self.edges]
         self._model = pin.Model(machine.model)
         self._data = self._model.createData()
         self.mass = float(sum(inertia.mass for inertia in self._model.inertias))
@@ -128,7 +130,7 @@ class Stability:
         moments = self.margins(q, self.ground(q)).moments
         hanging = self._frames.places(q, [link])[:, 0]
         held = np.hstack([-self._gravity + 0 * hanging, np.cross(hanging, -self._gravity)])
-        levers = self._about(self._points(q), held)
+        levers = self._about(self.places(q), held)
         with np.errstate(divide="ignore"):
             every = np.where(levers < 0, moments / -levers, np.inf)
         first = every.argmin(axis=1)
@@ -190,11 +192,11 @@ class Stability:
             q: (N, nv) closed postures.
             ground: (N, 6) see `ground`.
         """
-        points = self._points(q)
+        points = self.places(q)
         weight = self.mass * float(np.linalg.norm(self._gravity))
         moments = self._about(points, ground)
         shares = np.empty_like(moments)
-        for k, (first, second) in enumerate(self._edges):
+        for k, (first, second) in enumerate(self.edges):
             way = points[:, second, :2] - points[:, first, :2]
             across = points[..., :2] - points[:, first, None, :2]
             area = way[:, None, 0] * across[..., 1] - way[:, None, 1] * across[..., 0]
@@ -208,7 +210,7 @@ class Stability:
         Of all forces above 0 that are in balance with the ground's, those with the least sum of
         squares; where it tips, those nearest to balance.
         """
-        points = self._points(q)
+        points = self.places(q)
         x, y, z = np.moveaxis(points, 2, 0)
         force, moment = ground[:, :3], ground[:, 3:]
         level = np.zeros_like(force)
@@ -221,15 +223,15 @@ class Stability:
             out[i] = _shared(balance[i], wanted[i])
         return out
 
-    def _points(self, q: Array) -> Array:
+    def places(self, q: Array) -> Array:
         """(N, s, 3) where the supports are."""
         found = self._frames.places(q[:1] if self.stands else q, self._links)
         return np.broadcast_to(found, (len(q), *found.shape[1:]))
 
     def _about(self, points: Array, wrench: Array) -> Array:
         """(N, k) moments of wrenches (N, 6) about the lines."""
-        out = np.empty((len(points), len(self._edges)))
-        for k, (first, second) in enumerate(self._edges):
+        out = np.empty((len(points), len(self.edges)))
+        for k, (first, second) in enumerate(self.edges):
             way = points[:, second] - points[:, first]
             moment = wrench[:, 3:] - np.cross(points[:, first], wrench[:, :3])
             out[:, k] = (way * moment).sum(axis=1) / np.linalg.norm(way, axis=1)

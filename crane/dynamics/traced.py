@@ -1,6 +1,6 @@
 """One forward sweep (Kane's form) and the forces along joints and distances, as formulas."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -23,6 +23,7 @@ from crane.codegen.scalar import (
     scale,
     subtract,
     times,
+    transposed,
     where_positive,
 )  # fmt: skip
 from crane.common.samples import Array
@@ -48,7 +49,8 @@ def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Arr
     the geometry; per joint the 22 numbers of `JointForces.table`; gravity (3); per joint its rotor
     inertia; per distance its 22 numbers, and where its two ends are on their bodies, likewise;
     whether anything moves; what a circuit adds to the Coulomb friction of joints
-    (`JointForces.gripped`).
+    (`JointForces.gripped`); mass and first moment of what stands (4); where the tip is on its
+    body, likewise, if there is one.
     """
     bodies = []
     for i, joint in enumerate(machine.coordinates.joints, start=1):
@@ -66,7 +68,26 @@ def numbers_of(machine: Machine, geometry: Geometry, forces: JointForces) -> Arr
         turns = (geometry.turns[machine.coordinates.bodies[joint]] for joint, _ in ends)
         places = (turn.T @ place for turn, (_, place) in zip(turns, ends, strict=True))
         numbers += [law, *places]
-    return np.concatenate([*numbers, [forces.moving], forces.grip[list(forces.gripped)]])
+    numbers += [[forces.moving], forces.grip[list(forces.gripped)]]
+    still = machine.model.inertias[0]
+    numbers += [[still.mass], still.mass * still.lever]
+    if machine.tip is not None:
+        body, place = tip_of(machine)
+        numbers.append(geometry.turns[body].T @ place)
+    return np.concatenate(numbers)
+
+
+def tip_of(machine: Machine) -> tuple[int, Array]:
+    """The body of a machine's tip, and where it is on it (3,) [m]."""
+    assert machine.tip is not None
+    frame = machine.model.frames[machine.frame(machine.tip)]
+    return machine.coordinates.bodies[frame.parentJoint], np.array(frame.placement.translation)
+
+
+def grips_at(machine: Machine, forces: JointForces) -> list[int]:
+    """Where `numbers_of` has what `JointForces.set_grip` says."""
+    first = modes_at(machine, forces)[-1] + 1
+    return list(range(first, first + len(forces.gripped)))
 
 
 def modes_at(machine: Machine, forces: JointForces) -> list[int]:
@@ -88,6 +109,7 @@ class Form:
         spans: By distance of `JointForces.lengths` the bodies that its ends are on.
         sticking: Columns of the joints whose friction sticks.
         gripped: Columns of the joints whose Coulomb friction a circuit adds to.
+        tip: Body of the tip, if there is one.
     """
 
     carriers: tuple[int, ...]
@@ -95,6 +117,7 @@ class Form:
     spans: Spans
     sticking: tuple[int, ...]
     gripped: tuple[int, ...]
+    tip: int | None
 
     @classmethod
     def of(cls, machine: Machine, formulation: str, forces: JointForces) -> "Form":
@@ -107,7 +130,8 @@ class Form:
         spans = ((bodies[one], bodies[two]) for (one, _), (two, _) in forces.lengths.ends)
         plan = planned(machine) if formulation == "exact" else ()
         kinds = forces.sticking, forces.gripped
-        return cls(carriers(machine, formulation), plan, tuple(spans), *kinds)
+        tip = None if machine.tip is None else tip_of(machine)[0]
+        return cls(carriers(machine, formulation), plan, tuple(spans), *kinds, tip)
 
 
 @dataclass(frozen=True)
@@ -185,6 +209,9 @@ class Sweep:
         last = after + (NUMBERS + 6) * len(form.spans)
         self._moving = constants[last]
         self.told = constants.vector(last + 1, len(form.gripped))
+        last += len(form.gripped)
+        self._standing = constants.vector(last + 1, 4)
+        self._tip = None if form.tip is None else constants.vector(last + 5)
         self.gamma = loops.gamma
         self.rates: Vector = [0.0, *(dot(self.gamma[i], v_a) for i in range(1, self._size))]
         # the loops' drift is that of the whole machine whatever carries a body
@@ -345,6 +372,48 @@ class Sweep:
             (scale(-mass, self._gravity), [0.0] * 3) for mass, _, _ in self._masses
         ]
         return self.projected(self._along_tree(wrenches))
+
+    @property
+    def statics(self) -> list[Number]:
+        """What loads at rest depend on, a number of `crane.dynamics.statics.layout` each.
+
+        First moment s = sum m c of all masses and ds/dq_A, mass, gamma^T f at rest; tip and
+        dtip/dq_A if there is one; in the world. With what joint j carries, m_j and s_j,
+
+            ds/dq_k = sum_j gamma_jk (m_j l_j + a_j x s_j),
+
+        l_j, a_j its column, linear at the trunk's origin and angular.
+        """
+        posture, parents = self.posture, self.posture.geometry.parents
+        carried: list[tuple[Number, Vector]] = [(0.0, [0.0] * 3)]
+        carried += [(mass, scale(mass, centre)) for mass, centre, _ in self.bodies]
+        for i in range(self._size - 1, 0, -1):
+            mass, moment = carried[parents[i]]
+            carried[parents[i]] = (mass + carried[i][0], add(moment, carried[i][1]))
+        mass, moment = carried[0]
+        moment = self._in_world(subtract(moment, scale(mass, posture.origin[0])))
+        slopes: list[Vector] = [[0.0] * 3 for _ in range(self._n)]
+        for i in range(1, self._size):
+            linear, angular = posture.columns[i]
+            way = add(scale(carried[i][0], linear), cross(angular, carried[i][1]))
+            slopes = [add(x, scale(f, way)) for x, f in zip(slopes, self.gamma[i], strict=True)]
+        out = [*add(moment, self._standing[1:]), *_by_row(map(self._in_world, slopes))]
+        out += [mass + self._standing[0], *self.passive]
+        if self._tip is None or self.form.tip is None:
+            return out
+        body = self.form.tip
+        point = add(posture.origin[body], times(posture.rotation[body], self._tip))
+        slopes = [[0.0] * 3 for _ in range(self._n)]
+        for i in sorted(_carriers(parents, body)):
+            linear, angular = posture.columns[i]
+            way = add(linear, cross(angular, point))
+            slopes = [add(x, scale(f, way)) for x, f in zip(slopes, self.gamma[i], strict=True)]
+        out += self._in_world(subtract(point, posture.origin[0]))
+        return [*out, *_by_row(map(self._in_world, slopes))]
+
+    def _in_world(self, vector: Vector) -> Vector:
+        """A vector in the world's directions."""
+        return times(transposed(self.posture.rotation[0]), vector)
 
     @cached_property
     def _at_joints(self) -> list[Effects]:
@@ -647,6 +716,11 @@ class Sweep:
                 for k in range(self._n):
                     out[k].append(row[k] * rate)
         return out
+
+
+def _by_row(columns: Iterable[Vector]) -> Vector:
+    """The entries of a matrix (3, n), row by row."""
+    return [entry for row in zip(*columns, strict=True) for entry in row]
 
 
 def _least(values: Sequence[Number]) -> Number:

@@ -9,6 +9,7 @@ import pinocchio as pin
 
 from crane.common.errors import MechanismError
 from crane.common.samples import Array, solve
+from crane.dynamics.frames import point_jacobian
 from crane.dynamics.joint_forces import AT_REST, JointForces
 from crane.machine import Machine
 
@@ -80,6 +81,10 @@ class TreeDynamics:
         self._rotors = np.flatnonzero(self._armature)
         self._closure, self._forces = machine.closure, forces
         self._coordinates, self._carriers = machine.coordinates, carriers
+        self._tip: tuple[int, Array] | None = None
+        if machine.tip is not None:
+            frame = self._model.frames[machine.frame(machine.tip)]
+            self._tip = int(frame.parentJoint), np.array(frame.placement.translation)
 
     @cached_property
     def _data(self) -> pin.Data:
@@ -154,9 +159,26 @@ class TreeDynamics:
                 net = x - self._project(motion, motion.drift, False) - along
                 parts = self._mass(motion), gamma[here], motion.drift[here], net
                 return np.concatenate([np.ravel(part) for part in parts])
+            case "statics":
+                return self._statics(q, gamma)
             case "regressor":
                 return (gamma.T @ self._regressor(q, v, gamma @ x + motion.drift)).ravel()
         raise AssertionError(quantity)
+
+    def _statics(self, q: Array, gamma: Array) -> Array:
+        """See `Sweep.statics`."""
+        model, data = self._model, self._data
+        jacobian = pin.jacobianCenterOfMass(model, data, self._coordinates.configuration(q), False)
+        still, moving = model.inertias[0], data.mass[0]
+        moment = moving * data.com[0] + still.mass * still.lever
+        out = [moment, moving * jacobian @ gamma, [moving + still.mass]]
+        out.append(gamma.T @ self._forces.passive(q, np.zeros(model.nv)))
+        if self._tip is not None:
+            joint, place = self._tip
+            pin.computeJointJacobians(model, data, self._coordinates.configuration(q))
+            out.append(data.oMi[joint].act(place))
+            out.append(point_jacobian(model, data, joint, place)[:3] @ gamma)
+        return np.concatenate([np.ravel(part) for part in out])
 
     def _forward(self, motion: ClosedState, tau_a: Array, friction: bool) -> Array:
         return self._accelerated(motion, tau_a - self._project(motion, motion.drift, friction))

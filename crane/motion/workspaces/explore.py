@@ -68,11 +68,11 @@ def workspace(
     """
     samples, seed = as_count(samples, "the number of samples", 100, _MOST), as_seed(seed)
     kinematics = Kinematics(machine, frame)
-    low, high = _limits(machine)
+    low, high = limits_of(machine)
     random = np.random.default_rng(seed)
     slew = slewing(machine, kinematics.frame)
     held = None if slew is None else slew[0]
-    strokes = _strokes(machine, kinematics, low, high, held, random)
+    strokes = strokes_of(machine, kinematics, low, high, held, random)
     if not strokes:
         raise InputError(f"no driven joint moves '{kinematics.frame}', name another frame")
     patches, counted = _patches(machine, strokes, low, high, samples, random)
@@ -129,7 +129,7 @@ def workspace(
     )
 
 
-def _limits(machine: Machine) -> tuple[Array, Array]:
+def limits_of(machine: Machine) -> tuple[Array, Array]:
     """Limits of the active joints; half a turn, or the joint's scale, from home without."""
     home = machine.home[machine.closure.active]
     units = machine.closure.units[machine.closure.active]
@@ -140,7 +140,7 @@ def _limits(machine: Machine) -> tuple[Array, Array]:
     )
 
 
-def _strokes(
+def strokes_of(
     machine: Machine,
     kinematics: Kinematics,
     low: Array,

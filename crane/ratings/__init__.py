@@ -1,0 +1,6 @@
+"""What a machine lifts, how hard it digs, and how far it works."""
+
+from crane.ratings.lifting import Capacity, capacity
+from crane.ratings.rules import RULES, Rule
+
+__all__ = ["RULES", "Capacity", "Rule", "capacity"]

@@ -1,0 +1,268 @@
+"""The postures that put a frame at given places of its section, and the best of them."""
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from crane.common.errors import InputError
+from crane.common.samples import Array, Brief
+from crane.dynamics.statics import AtRest, Statics
+from crane.motion.kinematics import Kinematics
+from crane.motion.workspaces.explore import limits_of, strokes_of
+from crane.motion.workspaces.patch import Patch, fill, last_closed
+from crane.motion.workspaces.section import section_of, slewing
+from crane.ratings.grids import within
+
+_NODES = 49  # values of both strokes of a patch
+_LEVELS = (1, 33, 9)  # values of each further stroke, by how many there are
+_DRAWN = 200  # postures from which it is seen how the frame moves
+_ITERATIONS = 12
+_STRIDE = 0.2  # of a stroke, the farthest that one iteration moves
+_MISS = 1e-11  # of the machine's size
+_SLACK = 1e-9  # of a stroke, beyond its limits
+_SAME = 1e-6  # of a stroke
+_FINE = 1e-8  # of a stroke, to which the best is sought
+_PEAKS = 2  # how many of the best levels are improved
+_ROUNDS = 200
+
+Value = Callable[[Array, AtRest], Array]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Found(Brief):
+    """Postures with the frame at places.
+
+    Attributes:
+        place: (M,) index of the place.
+        q: (M, nq) closed postures.
+        at: What they are at rest.
+    """
+
+    place: NDArray[np.intp]
+    q: Array
+    at: AtRest
+
+    def some(self, which: NDArray[Any]) -> "Found":
+        """Some of them, by index or mask."""
+        return Found(self.place[which], self.q[which], self.at.some(which))
+
+
+class Places:
+    """All ways in which a machine puts a frame at places of its section, within its limits.
+
+    Two strokes, those that move the frame most, follow from the place by Newton's method; further
+    ones are free to choose: of a place, the posture of the largest value is sought over them. A
+    joint that slews the whole machine stays at home, as do strokes that do not move the frame.
+
+    Args:
+        statics: The machine and the frame.
+
+    Attributes:
+        section: Of the frame's places: radius and height.
+        low: (n,) lower limits of the active joints.
+        high: (n,) upper limits.
+        pair: The two strokes, among the active joints.
+        others: Further strokes that move it.
+
+    Raises:
+        InputError: Fewer than two strokes move the frame in its section, or more than four.
+    """
+
+    def __init__(self, statics: Statics):
+        machine = self.machine = statics.machine
+        self.statics = statics
+        frame, active = statics.frame, machine.closure.active
+        self.low, self.high = limits_of(machine)
+        self._span = np.where(self.high > self.low, self.high - self.low, 1.0)
+        slew, random = slewing(machine, frame), np.random.default_rng(0)
+        if machine.free:
+            raise InputError(
+                f"'{machine.free[0]}' of '{machine.name}' is free, hold it: "
+                f"--lock {machine.free[0]}=0"
+            )
+        kinematics = Kinematics(machine, frame)
+        strokes = strokes_of(
+            machine, kinematics, self.low, self.high, None if slew is None else slew[0], random
+        )
+        drawn = np.repeat(machine.home[None], _DRAWN, axis=0)
+        for k in strokes:
+            drawn[:, active[k]] = random.uniform(self.low[k], self.high[k], _DRAWN)
+        closed, good = statics.closed(drawn)
+        for i in np.flatnonzero(np.logical_not(good)).tolist():  # far from home, step by step
+            closed[i] = last_closed(machine, machine.home, drawn[i, active])[0]
+        at = statics.at(closed)
+        self.section = section_of(machine, frame, at.tip, kinematics.position_at(machine.home))
+        moves = np.linalg.norm(self.section.slopes(at.tip, at.ways), axis=1).mean(axis=0)
+        far = moves * self._span
+        strokes = [i for i in strokes if far[i] > _SAME * far[strokes].max()]
+        if not 2 <= len(strokes) <= len(_LEVELS) + 1:
+            names = ", ".join(machine.active[i] for i in strokes)
+            raise InputError(
+                f"{len(strokes)} strokes move '{frame}' in its section ({names}), a chart takes 2 "
+                f"to {len(_LEVELS) + 1}: name another frame, or hold some: --lock"
+            )
+        order = sorted(strokes, key=lambda i: -far[i])
+        self.pair = (min(order[:2]), max(order[:2]))
+        self.others = sorted(order[2:])
+        self._patches = list(self._filled())
+        if not self._patches:
+            raise InputError(f"no posture of '{machine.name}' closes on the way from home")
+        every = np.concatenate([patch.q[patch.closed] for patch in self._patches])
+        self.reach = self.section.coordinates(statics.at(every).tip)
+
+    def _filled(self) -> list[Patch]:
+        """Patches over the pair, at levels of the other strokes."""
+        home = self.machine.home[self.machine.closure.active]
+        count = _LEVELS[len(self.others)]
+        levels = [np.linspace(self.low[i], self.high[i], count) for i in self.others]
+        axes = tuple(np.linspace(self.low[i], self.high[i], _NODES) for i in self.pair)
+        out = []
+        for values in itertools.product(*levels):
+            base = home.copy()
+            base[self.others] = values
+            patch = fill(self.machine, base, self.pair, (axes[0], axes[1]))
+            if patch is not None:
+                out.append(patch)
+        return out
+
+    def all(self, axes: tuple[Array, Array]) -> Found:
+        """Postures at all places of a grid, one and more each, by levels of the other strokes.
+
+        Args:
+            axes: Coordinates (a,), (b,) of the section; place k is (axes[0][k % a],
+                axes[1][k // a]).
+        """
+        starts, places = [], []
+        for patch in self._patches:
+            nodes = np.full((*patch.closed.shape, 2), np.nan)
+            tips = self.statics.at(patch.q[patch.closed]).tip
+            nodes[patch.closed] = self.section.coordinates(tips)
+            place, q = within(patch, nodes, axes)
+            places.append(place)
+            starts.append(q)
+        place, q = np.concatenate(places), np.concatenate(starts)
+        targets = np.column_stack([axes[0][place % len(axes[0])], axes[1][place // len(axes[0])]])
+        q, at, good = self.moved(q, targets)
+        found = Found(place, q, at).some(good)
+        return found.some(self._different(found))
+
+    def best(self, found: Found, axes: tuple[Array, Array], value: Value) -> tuple[Found, Array]:
+        """Of each place the posture of the largest value.
+
+        Among the levels first; from the best of them the other strokes are moved by steps that are
+        halved where none helps.
+
+        Args:
+            found: See `all`.
+            axes: Likewise.
+            value: (q, at rest) -> (M,).
+
+        Returns:
+            One posture per place that has any, and its value.
+        """
+        values = value(found.q, found.at)
+        if not self.others:
+            kept = _peaks(found.place, values, 1)
+            return found.some(kept), values[kept]
+        kept = _peaks(found.place, values, _PEAKS)
+        found, values = found.some(kept), values[kept]
+        targets = np.column_stack(
+            [axes[0][found.place % len(axes[0])], axes[1][found.place // len(axes[0])]]
+        )
+        found, values = self._improved(found, values, targets, value)
+        kept = _peaks(found.place, values, 1)
+        return found.some(kept), values[kept]
+
+    def _improved(
+        self, found: Found, values: Array, targets: Array, value: Value
+    ) -> tuple[Found, Array]:
+        """Move the other strokes of all postures to larger values."""
+        columns = self.machine.closure.active[self.others]
+        span, count = self._span[self.others], len(self.others)
+        step = np.full(len(values), 1.0 / (_LEVELS[count] - 1))
+        q, values, random = found.q.copy(), values.copy(), np.random.default_rng(0)
+        at = AtRest(*(x.copy() for x in found.at))
+        for _ in range(_ROUNDS):
+            here = np.flatnonzero(step > _FINE)
+            if not len(here):
+                break
+            turned = (
+                np.eye(1) if count == 1 else np.linalg.qr(random.normal(size=(count, count)))[0]
+            )
+            better = np.zeros(len(values), dtype=bool)
+            for way in (*turned, *-turned):
+                start = q[here].copy()
+                moved = start[:, columns] + step[here, None] * way * span
+                start[:, columns] = np.clip(moved, self.low[self.others], self.high[self.others])
+                new, there, good = self.moved(start, targets[here])
+                tried = np.full(len(here), -np.inf)
+                tried[good] = value(new[good], there.some(good))
+                up = tried > values[here]
+                k = here[up]
+                q[k], values[k], better[k] = new[up], tried[up], True
+                for old, young in zip(at, there, strict=True):
+                    old[k] = young[up]
+            step[here[~better[here]]] *= 0.5
+        return Found(found.place, q, at), values
+
+    def moved(self, q: Array, targets: Array) -> tuple[Array, AtRest, NDArray[np.bool_]]:
+        """Put the frame at targets (M, 2) by the pair, from postures (M, nq) nearby.
+
+        Returns:
+            Postures, what they are at rest, and whether each is there and within its limits.
+        """
+        closure, pair = self.machine.closure, list(self.pair)
+        columns, longest = closure.active[pair], _STRIDE * self._span[pair]
+        q, good = self.statics.closed(q)
+        at = self.statics.at(q)
+        near = _MISS * closure.size
+        miss = targets - self.section.coordinates(at.tip)
+        here = np.flatnonzero(good & (np.abs(miss).max(axis=1) > near))
+        for _ in range(_ITERATIONS):
+            if not len(here):
+                break
+            slopes = self.section.slopes(at.tip[here], at.ways[here])[:, :, pair]
+            step = _solved(slopes, miss[here])
+            step /= np.maximum(1.0, np.abs(step / longest).max(axis=1))[:, None]
+            start = q[here]
+            start[:, columns] += step
+            q[here], closes = self.statics.closed(start)
+            good[here] = closes
+            for old, new in zip(at, self.statics.at(q[here]), strict=True):
+                old[here] = new
+            miss[here] = targets[here] - self.section.coordinates(at.tip[here])
+            here = here[closes & (np.abs(miss[here]).max(axis=1) > near)]
+        good[here] = False
+        q_a = q[:, closure.active]
+        slack = _SLACK * self._span
+        inside = np.all((q_a >= self.low - slack) & (q_a <= self.high + slack), axis=1)
+        return q, at, good & inside
+
+    def _different(self, found: Found) -> NDArray[np.intp]:
+        """Of postures that are the same at one place, one each."""
+        q_a = found.q[:, self.machine.closure.active] / (_SAME * self._span)
+        keys = np.column_stack([found.place, np.round(q_a[:, [*self.pair, *self.others]])])
+        return np.asarray(np.sort(np.unique(keys, axis=0, return_index=True)[1]))
+
+
+def _solved(matrix: Array, right: Array) -> Array:
+    """Solutions x (M, 2) of matrix (M, 2, 2) x = right (M, 2); 0 where there is none."""
+    (a, b), (c, d) = np.moveaxis(matrix, 0, -1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out = np.column_stack(
+            [d * right[:, 0] - b * right[:, 1], a * right[:, 1] - c * right[:, 0]]
+        )
+        out /= (a * d - b * c)[:, None]
+    return np.nan_to_num(out, nan=0.0, posinf=0.0, neginf=0.0)
+
+
+def _peaks(place: NDArray[np.intp], values: Array, count: int) -> NDArray[np.intp]:
+    """Indices of the `count` largest values of each place, by place."""
+    order = np.lexsort((-values, place))
+    sorted_places = place[order]
+    first = np.searchsorted(sorted_places, sorted_places)
+    return np.asarray(order[np.arange(len(order)) - first < count])

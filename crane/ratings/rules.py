@@ -1,0 +1,62 @@
+"""Rules by which lifting capacities are rated."""
+
+from dataclasses import dataclass
+
+from crane.common.errors import InputError, known
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What share of a load a rule lets count.
+
+    Attributes:
+        name: Of the rule.
+        says: In words.
+        hydraulic: Share of what the drives lift and hold.
+        tipping: Share of what tips the machine.
+        structural: Share of what pins bear.
+        raises: Whether only the drive that raises the load works, at the pressure of its pump, and
+            all others hold behind closed valves, at that of their port relief valves.
+    """
+
+    name: str
+    says: str
+    hydraulic: float = 1.0
+    tipping: float = 1.0
+    structural: float = 1.0
+    raises: bool = False
+
+
+RULES = {
+    rule.name: rule
+    for rule in (
+        Rule("none", "what is possible: all drives work at their pump's pressure, no reserve"),
+        Rule(
+            "iso10567",
+            "ISO 10567 (excavators): the less of 87 % of what the boom's cylinders raise at the "
+            "working pressure, while all others hold at that of their relief valves, and 75 % of "
+            "the load that tips the machine, on firm level ground",
+            hydraulic=0.87,
+            tipping=0.75,
+            raises=True,
+        ),
+        Rule(
+            "en12999",
+            "loader cranes in the manner of EN 12999: what is lifted at the working pressure, and "
+            "no more than 1/1.25 of the load that tips, so that a static test with 1.25 times the "
+            "rated load stands",
+            tipping=0.8,
+        ),
+    )
+}  # fmt: skip
+
+
+def rule_of(name: str) -> Rule:
+    """A rule by its name.
+
+    Raises:
+        InputError: There is none.
+    """
+    if name not in RULES:
+        raise InputError(f"rule '{name}' is unknown, {known(RULES, name)}")
+    return RULES[name]
