@@ -141,21 +141,21 @@ _HOMES = {
 }
 
 __all__ = [
-    "Batch", "Calibration", "Capacity", "Closure", "Command", "Comparison", "ComputedTorque", "Contact",
-    "Controller", "CraneError", "CraneWarning", "Cutting", "Dynamics", "EndStop", "Excitation",
-    "ExternalForce", "ForceElement", "Friction", "GasSpring", "Gradient", "Ground",
+    "Batch", "Calibration", "Capacity", "Closure", "Command", "Comparison", "ComputedTorque",
+    "Contact", "Controller", "CraneError", "CraneWarning", "Cutting", "Dynamics", "EndStop",
+    "Excitation", "ExternalForce", "ForceElement", "Friction", "GasSpring", "Gradient", "Ground",
     "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel", "Machine", "PDGains",
-    "PI", "PIGains", "Payload", "PowerAccount", "Pushing", "Recording", "Rope", "Rule", "SOILS", "Sampled",
-    "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy",
-    "TipVelocity", "Trajectory", "Turning", "ValveDrive", "ValveFeedforward", "ValvePD",
-    "Workspace", "Wrench", "add_cylinder", "add_loops", "calibrate", "capacity", "casadi_function", "check",
-    "cross_validate", "excite", "excite_valves", "fastest", "gradient", "identify",
-    "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
-    "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
-    "power_account", "read_measured", "read_path", "replay", "report", "retimed", "sensitivities",
-    "simulate", "simulate_batch", "sketch", "sketch_circuit", "study", "sway_study",
-    "task_trajectory", "tip_trajectory", "via_attitudes", "via_points", "without_sway", "workspace", "write_machine",
-    "write_mjcf", "write_urdf_plus",
+    "PI", "PIGains", "Payload", "PowerAccount", "Pushing", "Recording", "Rope", "Rule", "SOILS",
+    "Sampled", "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study", "Sway",
+    "SwayStudy", "TipVelocity", "Trajectory", "Turning", "ValveDrive", "ValveFeedforward",
+    "ValvePD", "Workspace", "Wrench", "add_cylinder", "add_loops", "calibrate", "capacity",
+    "casadi_function", "check", "cross_validate", "excite", "excite_valves", "fastest",
+    "gradient", "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
+    "identify_valve", "joystick", "linear_models", "linearize", "load", "point_to_point",
+    "polynomial", "power_account", "read_measured", "read_path", "replay", "report", "retimed",
+    "sensitivities", "simulate", "simulate_batch", "sketch", "sketch_circuit", "study",
+    "sway_study", "task_trajectory", "tip_trajectory", "via_attitudes", "via_points",
+    "without_sway", "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 
