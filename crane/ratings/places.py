@@ -26,7 +26,7 @@ _MISS = 1e-11  # of the machine's size
 _SLACK = 1e-9  # of a stroke, beyond its limits
 _SAME = 1e-6  # of a stroke
 _FINE = 1e-8  # of a stroke, to which the best is sought
-_PEAKS = 2  # how many of the best levels are improved
+_PEAKS, _APART = 4, 2.5  # how many of the best levels are improved, and steps between two of them
 _ROUNDS = 200
 
 Value = Callable[[Array, AtRest], Array]
@@ -166,16 +166,31 @@ class Places:
         """
         values = value(found.q, found.at)
         if not self.others:
-            kept = _peaks(found.place, values, 1)
+            kept = _first(found.place, values)
             return found.some(kept), values[kept]
-        kept = _peaks(found.place, values, _PEAKS)
+        kept = self._peaks(found, values)
         found, values = found.some(kept), values[kept]
         targets = np.column_stack(
             [axes[0][found.place % len(axes[0])], axes[1][found.place // len(axes[0])]]
         )
         found, values = self._improved(found, values, targets, value)
-        kept = _peaks(found.place, values, 1)
+        kept = _first(found.place, values)
         return found.some(kept), values[kept]
+
+    def _peaks(self, found: Found, values: Array) -> NDArray[np.intp]:
+        """Indices of the largest values of each place that are not beside each other."""
+        columns = self.machine.closure.active[self.others]
+        step = self._span[self.others] / (_LEVELS[len(self.others)] - 1)
+        levels = found.q[:, columns] / step
+        left, out = np.arange(len(values)), []
+        while len(left) and len(out) < _PEAKS:
+            first = left[_first(found.place[left], values[left])]
+            out.append(first)
+            taken = np.zeros(found.place.max() + 1, dtype=np.intp)
+            taken[found.place[first]] = first
+            beside = levels[left] - levels[taken[found.place[left]]]
+            left = left[np.abs(beside).max(axis=1) > _APART]
+        return np.concatenate(out)
 
     def _improved(
         self, found: Found, values: Array, targets: Array, value: Value
@@ -260,9 +275,7 @@ def _solved(matrix: Array, right: Array) -> Array:
     return np.nan_to_num(out, nan=0.0, posinf=0.0, neginf=0.0)
 
 
-def _peaks(place: NDArray[np.intp], values: Array, count: int) -> NDArray[np.intp]:
-    """Indices of the `count` largest values of each place, by place."""
+def _first(place: NDArray[np.intp], values: Array) -> NDArray[np.intp]:
+    """Index of the largest value of each place, by place."""
     order = np.lexsort((-values, place))
-    sorted_places = place[order]
-    first = np.searchsorted(sorted_places, sorted_places)
-    return np.asarray(order[np.arange(len(order)) - first < count])
+    return np.asarray(order[np.unique(place[order], return_index=True)[1]])

@@ -1,0 +1,212 @@
+"""Lifting capacity beside statics by hand, cell by cell, and beside brute force."""
+
+import numpy as np
+import pytest
+from free_bodies import balance, moment, places
+from scipy.optimize import root
+
+import crane
+from crane.ratings.cones import largest
+
+G = np.array([0.0, 0.0, -9.81])
+PUMP = 3.5e7  # of the excavator [Pa]
+
+
+@pytest.fixture(scope="module")
+def excavator():
+    return crane.load("excavator")
+
+
+def cells(chart, count, seed=0):
+    """Some that are reached: slew, height, radius."""
+    reached = np.argwhere(np.isfinite(chart.loads))
+    return reached[np.random.default_rng(seed).choice(len(reached), count, replace=False)]
+
+
+def strength(machine, chart, joint, slope):
+    """What a cylinder exerts at most against a load that asks for more with this sign."""
+    cylinder, supply = machine.hydraulics.cylinders[joint], machine.hydraulics.supply
+    pressure = supply.pressure if joint in chart.raising else cylinder.relief
+    a, b, tank = cylinder.area_a, cylinder.area_b, supply.tank
+    return pressure * a - tank * b if slope > 0 else tank * a - pressure * b
+
+
+def by_hand(machine, chart, q):
+    """The load of every cause at a posture, from two balances of all links: [kg]."""
+    (none, _), (some, _) = (balance(machine, q, G, m, chart.frame) for m in (0.0, 1000.0))
+    found = {}
+    for joint in machine.hydraulics.joints:
+        slope = (some[joint] - none[joint]) / 1000.0
+        if joint != "slew":  # which a level load does not turn
+            end = strength(machine, chart, joint, slope)
+            found[joint] = chart.rule.hydraulic * max((end - none[joint]) / slope, 0.0)
+    at = places(machine, q)
+    for cause in chart.causes:
+        if cause.why != "tips":
+            continue
+        one, two = (at[name][:3, 3] for name in cause.what.split(" to "))
+        held, pulled = (moment(machine, q, G, m, chart.frame, one, two) for m in (0.0, 1000.0))
+        slope = (pulled - held) / 1000.0
+        found[cause.what] = chart.rule.tipping * (max(-held / slope, 0.0) if slope > 0 else np.inf)
+    return found
+
+
+def test_every_cell_is_what_statics_by_hand_give(excavator):
+    """At the bucket's pin, by ISO 10567, over the front and over the side."""
+    chart = crane.capacity(excavator, "bucket", rule="iso10567")
+    assert chart.raising == ("X_boom",) and len(chart.slews) == 2
+    for cell in cells(chart, 40):
+        s, b, a = cell
+        found = by_hand(excavator, chart, excavator.closure.solve(chart.q_a[s, b, a]))
+        for k, cause in enumerate(chart.causes):
+            load = found.get(cause.what, np.inf)
+            if load < 1e9:  # what has no lever but that of rounding has no load
+                assert chart.each[s, b, a, k] == pytest.approx(load, rel=1e-9)
+        assert chart.loads[s, b, a] == pytest.approx(min(found.values()), rel=1e-9)
+        tip = crane.Kinematics(excavator, "bucket").position(chart.q_a[s, b, a])
+        away = [np.hypot(tip[0], tip[1]), tip[2]]
+        assert away == pytest.approx([chart.radii[a], chart.heights[b]], abs=1e-9)
+
+
+def test_every_cause_is_reached(excavator):
+    chart = crane.capacity(excavator, slews=[0.0, np.pi / 2, np.pi], rule="iso10567", step=1.0)
+    ends = {str(chart.causes[k]) for k in chart.ends}
+    assert {"X_boom: working pressure", "X_arm: holding pressure"} <= ends
+    assert {"tips over track_front_right to track_front_left",
+            "tips over track_front_left to track_rear_left",
+            "tips over track_rear_left to track_rear_right"} <= ends  # fmt: skip
+    held = crane.capacity(excavator, raising=["X_boom", "X_arm"], step=1.0)
+    assert "X_bucket: holding pressure" in {str(held.causes[k]) for k in held.ends}
+    slope = crane.capacity(
+        crane.load("patu655", changes={"supply.pressure": 1.9e7}), slope=np.deg2rad(35), step=1.0
+    )
+    assert "slew: working pressure" in {str(slope.causes[k]) for k in slope.ends}
+
+
+def test_a_slope_is_the_worst_of_all_sides(excavator):
+    """Gravity that leans to 180 sides, none worse and one as bad."""
+    lean, joints = np.deg2rad(8.0), excavator.hydraulics.joints
+    chart = crane.capacity(excavator, "bucket", rule="iso10567", slope=lean)
+    for cell in cells(chart, 2, seed=1):
+        q = excavator.closure.solve(chart.q_a[tuple(cell)])
+        sides = np.linspace(0, 2 * np.pi, 181)
+        least, gaps, ups = np.inf, [], []
+        at = places(excavator, q)
+        for axis in np.eye(3):  # all is linear in gravity
+            (none, _), (some, _) = (balance(excavator, q, axis, m, "bucket") for m in (0, 1.0))
+            gaps.append([none[joint] for joint in joints])
+            ups.append([some[joint] - none[joint] for joint in joints])
+        for side in sides:
+            g = 9.81 * np.array(
+                [np.sin(lean) * np.cos(side), np.sin(lean) * np.sin(side), -np.cos(lean)]
+            )
+            for joint, rest, slope in zip(joints, g @ gaps, g @ ups, strict=True):
+                if abs(slope) < 1e-6:  # no lever but that of rounding
+                    continue
+                end = strength(excavator, chart, joint, slope)
+                least = min(least, 0.87 * max((end - rest) / slope, 0.0))
+            for cause in chart.causes:
+                if cause.why == "tips":
+                    one, two = (at[name][:3, 3] for name in cause.what.split(" to "))
+                    held = moment(excavator, q, g, 0.0, "bucket", one, two)
+                    slope = moment(excavator, q, g, 1.0, "bucket", one, two) - held
+                    if slope < 0:
+                        least = min(least, 0.75 * max(-held / slope, 0.0))
+        load = chart.loads[tuple(cell)]
+        assert load <= least * (1 + 1e-9)
+        assert load == pytest.approx(least, rel=1e-4)
+
+
+@pytest.mark.parametrize(("name", "free"), [("excavator", "X_bucket"), ("patu655", "X_ext")])
+def test_of_many_postures_it_is_the_one_that_carries_most(name, free):
+    """Its third stroke moved to both sides by 30 steps, the tip held: nothing carries more."""
+    machine = crane.load(name, changes={"supply.pressure": 1.9e7} if name == "patu655" else {})
+    chart = crane.capacity(machine, slews=[0.0])
+    kinematics, i = crane.Kinematics(machine), machine.active.index(free)
+    span = machine.upper - machine.lower
+    others = [k for k in (1, 2, 3) if k != i]
+    tried = 0
+    for _, b, a in cells(chart, 5):
+        best, target = chart.q_a[0, b, a], np.array([chart.radii[a], chart.heights[b]])
+        load = chart.loads[0, b, a]
+        hand = min(by_hand(machine, chart, machine.closure.solve(best)).values())
+        assert load == pytest.approx(hand, rel=1e-8)
+        for step in (-1 / 30, 1 / 30, -1e-4, 1e-4):
+            q_a = best.copy()
+            for _ in range(30):
+                q_a[i] += step * span[i]
+
+                def miss(pair, q_a=q_a, target=target):
+                    q_a = q_a.copy()
+                    q_a[others] = pair
+                    return kinematics.position(q_a)[[0, 2]] - target
+
+                try:
+                    found = root(miss, q_a[others], tol=1e-12)
+                except crane.CraneError:
+                    break
+                q_a[others] = found.x
+                if not found.success or (np.abs(q_a - machine.lower - span / 2) > span / 2).any():
+                    break
+                there = min(by_hand(machine, chart, machine.closure.solve(q_a)).values())
+                assert there <= load * (1 + 1e-7)
+                tried += 1
+                if abs(step) < 1e-3:
+                    break
+    assert tried > 60
+
+
+def test_friction_and_pressure_count(excavator):
+    at = {"radii": [6.0], "heights": [1.5], "frame": "bucket", "raising": ["X_boom"]}
+    free, rubbed = (crane.capacity(excavator, friction=x, **at) for x in (False, True))
+    k = [str(cause) for cause in free.causes].index("X_boom: working pressure")
+    q = excavator.closure.solve(free.q_a[0, 0, 0])
+    (none, _), (some, _) = (balance(excavator, q, G, m, "bucket") for m in (0.0, 1.0))
+    slope = some["X_boom"] - none["X_boom"]
+    lost = free.each[0, 0, 0, k] - rubbed.each[0, 0, 0, k]
+    assert lost == pytest.approx(20000.0 / slope, rel=1e-8)  # Coulomb and stiction of the file
+    half = crane.capacity(crane.load("excavator", changes={"supply.pressure": PUMP / 2}), **at)
+    less = free.each[0, 0, 0, k] - half.each[0, 0, 0, k]
+    assert less == pytest.approx(PUMP / 2 * 2.2619467e-2 / slope, rel=1e-9)
+
+
+def test_cones_end_where_they_say():
+    """A root of a + b x + |c + d x| that all before it stay below."""
+    random = np.random.default_rng(0)
+    a, b = -random.uniform(0.1, 3, 3000), random.normal(size=3000)
+    c, d = 0.4 * random.normal(size=(3000, 3)), random.normal(size=(3000, 3))
+    x = largest(a, b, c, d)
+
+    def value(x):
+        return a + b * x + np.linalg.norm(c + d * x[:, None], axis=1)
+
+    ends = np.isfinite(x) & (x > 0)
+    x[x > 1e9] = np.inf
+    assert 0.3 < ends.mean() < 0.99
+    assert (np.abs(value(np.where(ends, x, 0.0)))[ends] < 1e-9 * (1 + np.abs(x[ends]))).all()
+    for share in np.linspace(0, 0.999, 50):
+        assert (value(share * np.where(ends, x, 0.0))[ends] < 1e-9).all()
+    never = ~np.isfinite(x)
+    for far in np.logspace(-3, 6, 60):
+        assert (value(np.full(3000, far))[never] < 1e-6 * far).all()
+    assert (value(np.zeros(3000))[x == 0] >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"rule": "iso"}, "rule 'iso' is unknown"),
+        ({"frame": "nothing"}, "frame 'nothing' is unknown"),
+        ({"raising": ["boom"]}, "'boom' drives nothing"),
+        ({"slope": 2.0}, "the slope is 2.0 rad"),
+        ({"step": 1e-4}, "more than 400 cells"),
+        ({"slews": [9.0]}, "'slew' turns from"),
+        ({"radii": [3.0, 2.0]}, "radii must be numbers that rise"),
+        ({"radii": [30.0]}, "reaches none of these places"),
+        ({"frame": "upper"}, "0 strokes move"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(excavator, given, said):
+    with pytest.raises(crane.CraneError, match=said) as error:
+        crane.capacity(excavator, **given)
+    assert "\n" not in str(error.value)
