@@ -55,8 +55,8 @@ def balance(machine, q, gravity, load, frame, force=(0.0, 0.0, 0.0)):
         force: (3,) besides, likewise.
 
     Returns:
-        By joint the force of its drive [N], [N m], and by joint and loop the wrench (6,) on what it
-        moves, about its origin.
+        By joint the force of its drive [N], [N m], and by joint and loop the wrench (6,) on what
+        it moves, about its origin.
     """
     at, tree = places(machine, q), machine.tree
     rigid = {}  # link: the link that moves it, which joints move

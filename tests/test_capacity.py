@@ -110,7 +110,7 @@ def test_a_slope_is_the_worst_of_all_sides(excavator):
                     one, two = (at[name][:3, 3] for name in cause.what.split(" to "))
                     held = moment(excavator, q, g, 0.0, "bucket", one, two)
                     slope = moment(excavator, q, g, 1.0, "bucket", one, two) - held
-                    if slope < 0:
+                    if slope > 0:
                         least = min(least, 0.75 * max(-held / slope, 0.0))
         load = chart.loads[tuple(cell)]
         assert load <= least * (1 + 1e-9)

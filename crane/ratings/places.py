@@ -17,8 +17,8 @@ from crane.motion.workspaces.patch import Patch, fill, last_closed
 from crane.motion.workspaces.section import section_of, slewing
 from crane.ratings.grids import within
 
-_NODES = 49  # values of both strokes of a patch
-_LEVELS = (1, 33, 9)  # values of each further stroke, by how many there are
+_NODES = 33  # values of both strokes of a patch
+_LEVELS = (1, 17, 7)  # values of each further stroke, by how many there are
 _DRAWN = 200  # postures from which it is seen how the frame moves
 _ITERATIONS = 12
 _STRIDE = 0.2  # of a stroke, the farthest that one iteration moves
@@ -26,7 +26,7 @@ _MISS = 1e-11  # of the machine's size
 _SLACK = 1e-9  # of a stroke, beyond its limits
 _SAME = 1e-6  # of a stroke
 _FINE = 1e-8  # of a stroke, to which the best is sought
-_PEAKS, _APART = 4, 2.5  # how many of the best levels are improved, and steps between two of them
+_PEAKS, _APART = 3, 1.5  # how many of the best levels are improved, and steps between two of them
 _ROUNDS = 200
 
 Value = Callable[[Array, AtRest], Array]
