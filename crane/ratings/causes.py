@@ -36,6 +36,22 @@ class Cause(NamedTuple):
         return f"{self.why} over {self.what}" if self.why == TIPS else f"{self.what}: {self.why}"
 
 
+class Bound(NamedTuple):
+    """One end of what a cause lets: a + b m + |c + d m| <= 0.
+
+    Attributes:
+        cause: Its index.
+        drive: Whose force it is, None for a line.
+        line: About which, None for a drive.
+        sign: 1 of the most that a drive pushes, -1 of the most that it pulls, and of lines.
+    """
+
+    cause: int
+    drive: Strength | None
+    line: "Line | None"
+    sign: float
+
+
 class Causes:
     """The load at a frame that a machine holds, cause by cause, at rest.
 
@@ -56,54 +72,67 @@ class Causes:
 
     Attributes:
         all: The causes.
+        bounds: Their ends.
     """
 
     def __init__(
         self, statics: Statics, strengths: Iterable[Strength], rule: Rule, slope: float = 0.0
     ):
         machine = self.machine = statics.machine
-        self._strengths = list(strengths)
         self._up = upwards(machine)
         weight = float(np.linalg.norm(machine.model.gravity.linear))
         if not weight:
             raise InputError(f"'{machine.name}' has no gravity, a load has no weight there")
         self._down, self._aside = weight * np.cos(slope), weight * np.sin(slope)
-        self._lines = list(_lines(machine))
+        drives, lines = list(strengths), list(lines_of(machine))
         self.all = tuple(
-            [Cause(x.joint, x.why, rule.hydraulic) for x in self._strengths]
-            + [Cause(x.name, TIPS, rule.tipping) for x in self._lines]
+            [Cause(x.joint, x.why, rule.hydraulic) for x in drives]
+            + [Cause(x.name, TIPS, rule.tipping) for x in lines]
         )
-        self._shares = np.array([cause.share for cause in self.all])
+        self.bounds = [
+            Bound(k, drive, None, sign) for k, drive in enumerate(drives) for sign in (1.0, -1.0)
+        ] + [Bound(k, None, line, -1.0) for k, line in enumerate(lines, start=len(drives))]
+        self.shares = np.array([cause.share for cause in self.all])
 
     def loads(self, at: AtRest) -> Array:
         """The load (N, K) [kg] of each cause, times its share; infinite where it never ends."""
-        out = np.empty((len(at.mass), len(self.all)))
-        for k, drive in enumerate(self._strengths):
-            i = drive.column
-            weighs, lifts = self._parts(at.slopes[:, :, i]), self._parts(at.ways[:, :, i])
-            passive = at.passive[:, i]
-            up = self._ends(weighs, lifts, -passive - drive.most)
-            down = self._ends(weighs, lifts, passive + drive.least, -1.0)
-            out[:, k] = np.minimum(up, down)
-        for k, line in enumerate(self._lines, start=len(self._strengths)):
-            one = np.cross(line.way, at.moment - at.mass[:, None] * line.foot)
-            two = np.cross(line.way, at.tip - line.foot)
-            out[:, k] = self._ends(self._parts(one), self._parts(two), np.zeros(len(out)), -1.0)
-        return out * self._shares
+        out = np.full((len(at.mass), len(self.all)), np.inf)
+        for bound in self.bounds:
+            end = self.end(self.terms(bound, at))
+            out[:, bound.cause] = np.minimum(out[:, bound.cause], end)
+        return np.asarray(out * self.shares)
 
-    def _parts(self, vectors: Array) -> tuple[Array, Array]:
-        """What gravity makes of vectors (N, 3): (N,) by its part downwards, (N, 3) by the rest."""
-        rises = vectors @ self._up
-        return self._down * rises, self._aside * (vectors - rises[:, None] * self._up)
+    def end(self, terms: tuple[Array, ...]) -> Array:
+        """The load (N,) at which a bound of these terms ends."""
+        a, b, c, d = terms
+        return largest(a, b, c, d) if self._aside else largest(a, b)
 
-    def _ends(
-        self, one: tuple[Array, Array], two: tuple[Array, Array], rest: Array, sign: float = 1.0
-    ) -> Array:
-        a, b = sign * one[0] + rest, sign * two[0]
-        return largest(a, b, one[1], two[1]) if self._aside else largest(a, b)
+    def terms(self, bound: Bound, at: AtRest, still: float = 1.0) -> tuple[Array, ...]:
+        """What a bound's a, b (N,), c and d (N, 3) are; linear in `at` but for what stands still.
+
+        Args:
+            bound: One of `bounds`.
+            at: The machine at rest, or derivatives of it.
+            still: 0 for derivatives: what does not depend on the posture is left out.
+        """
+        if bound.drive is not None:
+            i = bound.drive.column
+            weighs, lifts, rest = at.slopes[:, :, i], at.ways[:, :, i], -at.passive[:, i]
+            rest = rest - still * (bound.drive.most if bound.sign > 0 else bound.drive.least)
+        else:
+            assert bound.line is not None
+            foot, way = bound.line.foot, bound.line.way
+            weighs = np.cross(way, at.moment - at.mass[:, None] * foot)
+            lifts, rest = np.cross(way, at.tip - still * foot), np.zeros(len(at.mass))
+        out = []
+        for vectors in (weighs, lifts):
+            rises = vectors @ self._up
+            out.append((self._down * rises, self._aside * (vectors - rises[:, None] * self._up)))
+        (a, c), (b, d) = out
+        return bound.sign * (a + rest), bound.sign * b, c, d
 
 
-class _Line(NamedTuple):
+class Line(NamedTuple):
     """A tipping line: its name, a point on it, and its direction."""
 
     name: str
@@ -111,7 +140,8 @@ class _Line(NamedTuple):
     way: Array
 
 
-def _lines(machine: Machine) -> Iterable[_Line]:
+def lines_of(machine: Machine) -> Iterable[Line]:
+    """The tipping lines of a machine whose supports stand still; none of others."""
     if not has_supports(machine):
         return
     stability = Stability(machine)
@@ -120,4 +150,4 @@ def _lines(machine: Machine) -> Iterable[_Line]:
     (points,) = stability.places(machine.home[None])
     for (first, second), names in zip(stability.edges, stability.lines, strict=True):
         way = points[second] - points[first]
-        yield _Line(" to ".join(names), points[first], way / np.linalg.norm(way))
+        yield Line(" to ".join(names), points[first], way / np.linalg.norm(way))

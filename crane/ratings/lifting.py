@@ -15,6 +15,7 @@ from crane.machine import Machine
 from crane.ratings.causes import Cause, Causes
 from crane.ratings.places import Places
 from crane.ratings.rules import Rule, rule_of
+from crane.ratings.slopes import load_slopes
 from crane.ratings.strength import strengths
 from crane.recordings.timeseries import Table, write
 
@@ -34,6 +35,7 @@ class Capacity(Brief):
         rule: By which it is rated.
         raising: Joints whose drives raise the load; others hold.
         slope: Of the ground [rad].
+        friction: Whether drives that raise overcome friction.
         radii: (a,) first coordinate of the section, as a rule the distance from the slewing axis
             [m].
         heights: (b,) second coordinate [m].
@@ -51,6 +53,7 @@ class Capacity(Brief):
     rule: Rule
     raising: tuple[str, ...]
     slope: float
+    friction: bool
     radii: Array
     heights: Array
     slews: Array
@@ -64,6 +67,20 @@ class Capacity(Brief):
     def ends(self) -> tuple[int, ...]:
         """Indices of the causes that end a load somewhere."""
         return tuple(np.unique(self.cause[self.cause >= 0]).tolist())
+
+    def slopes(self, names: Sequence[str]) -> Array:
+        """Derivatives of the loads by numbers of the machine, see `crane.ratings.slopes`.
+
+        Args:
+            names: Such as "boom_eye.x" or "cylinder.X_boom.area_a".
+
+        Returns:
+            (s, b, a, k) [kg] per unit of each.
+
+        Raises:
+            InputError: There is no such number, or it moves a support.
+        """
+        return load_slopes(self, names)
 
     def to_csv(self, path: str | Path) -> None:
         """Write a row per place: slew, place, load, cause, loads by cause, active coordinates.
@@ -170,7 +187,7 @@ def capacity(
     first = np.where(np.isfinite(least), np.nan_to_num(each, nan=np.inf).argmin(axis=2), -1)
     shape = (len(turns), b, a)
     return Capacity(
-        machine, statics.frame, rule, tuple(raising), slope, axes[0], axes[1], turns, causes.all,
+        machine, statics.frame, rule, tuple(raising), slope, friction, *axes, turns, causes.all,
         least.reshape(shape), first.reshape(shape), each.reshape(*shape, count),
         q_a.reshape(*shape, n),
     )  # fmt: skip

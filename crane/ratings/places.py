@@ -1,7 +1,7 @@
 """The postures that put a frame at given places of its section, and the best of them."""
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -146,15 +146,15 @@ class Places:
             starts.append(q)
         place, q = np.concatenate(places), np.concatenate(starts)
         targets = np.column_stack([axes[0][place % len(axes[0])], axes[1][place // len(axes[0])]])
-        q, at, good = self.moved(q, targets)
+        q, at, good = self.moved(q, targets, self.pair)
         found = Found(place, q, at).some(good)
         return found.some(self._different(found))
 
     def best(self, found: Found, axes: tuple[Array, Array], value: Value) -> tuple[Found, Array]:
         """Of each place the posture of the largest value.
 
-        Among the levels first; from the best of them the other strokes are moved by steps that are
-        halved where none helps.
+        Among the levels first; from the best of them all strokes are moved, the frame held, by
+        steps that are halved where none helps.
 
         Args:
             found: See `all`.
@@ -182,7 +182,8 @@ class Places:
         columns = self.machine.closure.active[self.others]
         step = self._span[self.others] / (_LEVELS[len(self.others)] - 1)
         levels = found.q[:, columns] / step
-        left, out = np.arange(len(values)), []
+        left: NDArray[np.intp] = np.arange(len(values))
+        out: list[NDArray[np.intp]] = []
         while len(left) and len(out) < _PEAKS:
             first = left[_first(found.place[left], values[left])]
             out.append(first)
@@ -195,9 +196,10 @@ class Places:
     def _improved(
         self, found: Found, values: Array, targets: Array, value: Value
     ) -> tuple[Found, Array]:
-        """Move the other strokes of all postures to larger values."""
-        columns = self.machine.closure.active[self.others]
-        span, count = self._span[self.others], len(self.others)
+        """Move all strokes to larger values along the null space of the frame's motion."""
+        strokes = [*self.pair, *self.others]
+        columns, span = self.machine.closure.active[strokes], self._span[strokes]
+        count = len(self.others)
         step = np.full(len(values), 1.0 / (_LEVELS[count] - 1))
         q, values, random = found.q.copy(), values.copy(), np.random.default_rng(0)
         at = AtRest(*(x.copy() for x in found.at))
@@ -205,33 +207,38 @@ class Places:
             here = np.flatnonzero(step > _FINE)
             if not len(here):
                 break
+            slopes = self.section.slopes(at.tip[here], at.ways[here])[:, :, strokes] * span
+            free = np.linalg.svd(slopes)[2][:, 2:]
             turned = (
                 np.eye(1) if count == 1 else np.linalg.qr(random.normal(size=(count, count)))[0]
             )
-            better = np.zeros(len(values), dtype=bool)
+            begun, better = q[here].copy(), np.zeros(len(here), dtype=bool)
             for way in (*turned, *-turned):
-                start = q[here].copy()
-                moved = start[:, columns] + step[here, None] * way * span
-                start[:, columns] = np.clip(moved, self.low[self.others], self.high[self.others])
-                new, there, good = self.moved(start, targets[here])
+                start = begun.copy()
+                start[:, columns] += step[here, None] * (way @ free) * span
+                new, there, good = self.moved(start, targets[here], strokes)
                 tried = np.full(len(here), -np.inf)
                 tried[good] = value(new[good], there.some(good))
                 up = tried > values[here]
-                k = here[up]
-                q[k], values[k], better[k] = new[up], tried[up], True
+                k, better = here[up], better | up
+                q[k], values[k] = new[up], tried[up]
                 for old, young in zip(at, there, strict=True):
                     old[k] = young[up]
-            step[here[~better[here]]] *= 0.5
+            step[here[np.logical_not(better)]] *= 0.5
         return Found(found.place, q, at), values
 
-    def moved(self, q: Array, targets: Array) -> tuple[Array, AtRest, NDArray[np.bool_]]:
-        """Put the frame at targets (M, 2) by the pair, from postures (M, nq) nearby.
+    def moved(
+        self, q: Array, targets: Array, strokes: Sequence[int]
+    ) -> tuple[Array, AtRest, NDArray[np.bool_]]:
+        """Put the frame at targets (M, 2) by some strokes, from postures (M, nq) nearby.
+
+        Newton's method by the shortest steps.
 
         Returns:
             Postures, what they are at rest, and whether each is there and within its limits.
         """
-        closure, pair = self.machine.closure, list(self.pair)
-        columns, longest = closure.active[pair], _STRIDE * self._span[pair]
+        closure, strokes = self.machine.closure, list(strokes)
+        columns, span = closure.active[strokes], self._span[strokes]
         q, good = self.statics.closed(q)
         at = self.statics.at(q)
         near = _MISS * closure.size
@@ -240,11 +247,11 @@ class Places:
         for _ in range(_ITERATIONS):
             if not len(here):
                 break
-            slopes = self.section.slopes(at.tip[here], at.ways[here])[:, :, pair]
-            step = _solved(slopes, miss[here])
-            step /= np.maximum(1.0, np.abs(step / longest).max(axis=1))[:, None]
+            slopes = self.section.slopes(at.tip[here], at.ways[here])[:, :, strokes] * span
+            step = _shortest(slopes, miss[here])
+            step /= np.maximum(1.0, np.abs(step).max(axis=1) / _STRIDE)[:, None]
             start = q[here]
-            start[:, columns] += step
+            start[:, columns] += step * span
             q[here], closes = self.statics.closed(start)
             good[here] = closes
             for old, new in zip(at, self.statics.at(q[here]), strict=True):
@@ -264,15 +271,17 @@ class Places:
         return np.asarray(np.sort(np.unique(keys, axis=0, return_index=True)[1]))
 
 
-def _solved(matrix: Array, right: Array) -> Array:
-    """Solutions x (M, 2) of matrix (M, 2, 2) x = right (M, 2); 0 where there is none."""
-    (a, b), (c, d) = np.moveaxis(matrix, 0, -1)
+def _shortest(matrix: Array, right: Array) -> Array:
+    """The shortest x (M, k) with matrix (M, 2, k) x = right (M, 2); 0 where there is none."""
+    square = matrix @ np.swapaxes(matrix, 1, 2)
+    a, b, c = square[:, 0, 0], square[:, 0, 1], square[:, 1, 1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        out = np.column_stack(
-            [d * right[:, 0] - b * right[:, 1], a * right[:, 1] - c * right[:, 0]]
+        both = np.column_stack(
+            [c * right[:, 0] - b * right[:, 1], a * right[:, 1] - b * right[:, 0]]
         )
-        out /= (a * d - b * c)[:, None]
-    return np.nan_to_num(out, nan=0.0, posinf=0.0, neginf=0.0)
+        both /= (a * c - b * b)[:, None]
+    both = np.nan_to_num(both, nan=0.0, posinf=0.0, neginf=0.0)
+    return np.asarray(np.einsum("mik,mi->mk", matrix, both))
 
 
 def _first(place: NDArray[np.intp], values: Array) -> NDArray[np.intp]:
