@@ -8,6 +8,7 @@ from scipy.optimize import root
 import crane
 from crane.formats.loading import Variants
 from crane.ratings.cones import largest
+from crane.ratings.moments import torques
 
 G = np.array([0.0, 0.0, -9.81])
 PUMP = 3.5e7  # of the excavator [Pa]
@@ -250,3 +251,39 @@ def test_slopes_refuse_what_moves_the_supports(excavator):
         chart.slopes(["track_front_left.x"])
     with pytest.raises(crane.CraneError, match="boom_eye"):
         chart.slopes(["boom_ey.x"])
+
+
+def test_lifting_torque_is_force_times_lever():
+    """The lever by the places of three pins; net at 4 m no less than what a chart has there."""
+    machine = crane.load("patu655", changes={"supply.pressure": 1.9e7})
+    found = torques(machine)
+    assert (found.raising, found.pivot) == ("X_lift", "q2")
+    q_a = machine.home[machine.closure.active].copy()
+    i = machine.active.index("X_lift")
+    levers = []
+    for stroke in (*np.linspace(0.01, 0.52, 30), found.stroke):
+        q_a[i] = stroke
+        at = places(machine, machine.closure.solve(q_a))
+        pivot, base, eye = (at[x][:3, 3] for x in ("lift_boom", "lift_barrel", "lift_eye"))
+        levers.append(
+            np.linalg.norm(np.cross(base - pivot, eye - pivot)) / np.linalg.norm(eye - base)
+        )
+    cylinder, tank = machine.hydraulics.cylinders["X_lift"], 1.0e5
+    force = 1.9e7 * cylinder.area_a - tank * cylinder.area_b
+    assert found.gross == pytest.approx(force * levers[-1], rel=1e-9)
+    assert max(levers) == pytest.approx(levers[-1], rel=1e-12)
+    chart = crane.capacity(machine, radii=[4.0], heights=np.linspace(-2, 6, 33))
+    assert np.nanmax(chart.loads) <= found.load * (1 + 1e-9)
+    assert np.nanmax(chart.loads) == pytest.approx(found.load, rel=0.01)
+    assert found.net == pytest.approx(found.load * 9.81 * 4.0)
+    assert found.slewing == pytest.approx((1.9e7 - tank) * 1.4137e-3)
+
+
+def test_the_rule_for_timber_cranes_leans_the_ground(excavator):
+    at = {"radii": [6.0], "heights": [1.0], "frame": "bucket", "slews": [1.5]}
+    by_rule = crane.capacity(excavator, rule="sfs4677", **at)
+    by_hand = crane.capacity(
+        excavator, rule=crane.Rule("own", "", tipping=1 / 1.1), slope=np.deg2rad(5), **at
+    )
+    assert by_rule.loads[0, 0, 0] == by_hand.loads[0, 0, 0]
+    assert by_rule.causes[by_rule.cause[0, 0, 0]].why == "tips"

@@ -2,5 +2,6 @@
 
 from crane.ratings.lifting import Capacity, capacity
 from crane.ratings.rules import RULES, Rule
+from crane.ratings.moments import Torques, torques
 
-__all__ = ["RULES", "Capacity", "Rule", "capacity"]
+__all__ = ["RULES", "Capacity", "Rule", "Torques", "capacity", "torques"]

@@ -145,7 +145,7 @@ def capacity(
             two to four strokes do not move in a plane through the slewing axis.
     """
     rule = rule_of(rule) if isinstance(rule, str) else rule
-    slope = abs(as_number(slope, "the slope", "rad", most=_STEEPEST))
+    slope = max(abs(as_number(slope, "the slope", "rad", most=_STEEPEST)), rule.slope)
     if machine.motors and any(
         drive.name not in machine.active or len(drive.factors) > 1 for drive in machine.motors
     ):
@@ -155,7 +155,7 @@ def capacity(
     statics = Statics(machine, frame)
     places = Places(statics)
     if raising is None:
-        raising = [_raiser(places)] if rule.raises else machine.driven_joints
+        raising = [raiser(places)] if rule.raises else machine.driven_joints
     causes = Causes(statics, strengths(machine, raising, friction), rule, slope)
     axes = _axes(places, step, radii, heights)
     turns = _slews(machine, places, slews, tips=len(causes.all) > len(machine.driven_joints))
@@ -193,7 +193,7 @@ def capacity(
     )  # fmt: skip
 
 
-def _raiser(places: Places) -> str:
+def raiser(places: Places) -> str:
     """The drive that carries most: whose stroke moves the machine's first moment farthest."""
     machine, strokes = places.machine, [*places.pair, *places.others]
     at = places.statics.at(machine.home[None])

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from crane.common.errors import InputError, known
 
 
@@ -17,6 +19,7 @@ class Rule:
         structural: Share of what pins bear.
         raises: Whether only the drive that raises the load works, at the pressure of its pump, and
             all others hold behind closed valves, at that of their port relief valves.
+        slope: Of the ground, at least [rad].
     """
 
     name: str
@@ -25,6 +28,7 @@ class Rule:
     tipping: float = 1.0
     structural: float = 1.0
     raises: bool = False
+    slope: float = 0.0
 
 
 RULES = {
@@ -42,10 +46,16 @@ RULES = {
         ),
         Rule(
             "en12999",
-            "loader cranes in the manner of EN 12999: what is lifted at the working pressure, and "
-            "no more than 1/1.25 of the load that tips, so that a static test with 1.25 times the "
-            "rated load stands",
+            "in the manner of EN 12999 (loader cranes): what is lifted at the working pressure, "
+            "and 1/1.25 of the load that tips, so that a test with 1.25 times the load stands",
             tipping=0.8,
+        ),
+        Rule(
+            "sfs4677",
+            "SFS 4677 (tractor cranes for timber, as the Farmi 4670's manual gives it): 10 % more "
+            "than the load does not tip the machine on ground that leans by 5 degrees",
+            tipping=1 / 1.1,
+            slope=np.deg2rad(5.0),
         ),
     )
 }  # fmt: skip

@@ -1,0 +1,142 @@
+"""Lifting and slewing torque, as makers of loader and forestry cranes print them."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from crane.common.errors import InputError
+from crane.common.samples import Array, as_number
+from crane.dynamics.statics import Statics
+from crane.machine import Machine
+from crane.motion.workspaces.section import slewing
+from crane.ratings.lifting import capacity, raiser
+from crane.ratings.places import Places
+from crane.ratings.rules import Rule, rule_of
+from crane.ratings.strength import strengths
+
+_STEPS = 200  # of the stroke, between which the largest lever is sought
+_BESIDE = 1e-3  # of the reach
+
+
+class Torques(NamedTuple):
+    """What a crane's drives do about its axes.
+
+    Attributes:
+        raising: The joint that raises the boom.
+        pivot: The joint that it turns.
+        gross: The largest torque of its drive about the pivot, own weight included [N m].
+        stroke: At which stroke [m].
+        radius: At which distance from the slewing axis the net torque holds [m].
+        load: The largest load there, at whatever height carries most [kg].
+        height: That height [m].
+        net: The torque of that load about the slewing axis, load * g * radius [N m].
+        slewing: Torque of the slewing drive [N m]; NaN where nothing slews.
+    """
+
+    raising: str
+    pivot: str
+    gross: float
+    stroke: float
+    radius: float
+    load: float
+    height: float
+    net: float
+    slewing: float
+
+
+def torques(
+    machine: Machine,
+    frame: str | None = None,
+    *,
+    radius: float = 4.0,
+    rule: str | Rule = "none",
+    friction: bool = False,
+) -> Torques:
+    """Gross and net lifting torque, and slewing torque.
+
+    With F the force of the drive that raises and phi the angle of its pivot, virtual work gives
+    the gross torque F dX/dphi, whose largest value over the stroke is printed. The net torque is
+    that of a load: the largest that hangs at a distance, whatever ends it.
+
+    Args:
+        machine: The machine.
+        frame: Where the load hangs; the tip if not given.
+        radius: Of the net torque [m].
+        rule: By which the load is rated, see `capacity`.
+        friction: Whether drives overcome friction.
+
+    Raises:
+        InputError: Nothing raises a load, or the frame does not reach that far.
+    """
+    radius = as_number(radius, "the radius", "m", above=0.0)
+    statics = Statics(machine, frame)
+    places = Places(statics)
+    joint = raiser(places)
+    found = {x.joint: x for x in strengths(machine, machine.driven_joints, friction)}
+    if joint not in found:
+        raise InputError(f"nothing limits '{joint}', give it a cylinder, or an effort in <limit>")
+    i = machine.active.index(joint)
+    pivot = _pivot(machine, statics.frame, i)
+    column = machine.column(pivot)
+    home = machine.home[machine.closure.active]
+
+    def torque(stroke: float) -> float:
+        q_a = home.copy()
+        q_a[i] = stroke
+        rate = float(machine.closure.gamma(machine.closure.solve(q_a))[column, i])
+        at = statics.at(machine.closure.solve(q_a)[None])
+        lifts = at.under(machine.model.gravity.linear)[0, i] > 0
+        return abs((found[joint].most if lifts else found[joint].least) / rate)
+
+    strokes = np.linspace(places.low[i], places.high[i], _STEPS + 1)
+    values = np.array([torque(x) for x in strokes])
+    best = int(values.argmax())
+    around = strokes[max(best - 1, 0)], strokes[min(best + 1, _STEPS)]
+    finer = minimize_scalar(lambda x: -torque(x), bounds=around, method="bounded",
+                            options={"xatol": 1e-9})  # fmt: skip
+    gross, stroke = max((float(values[best]), float(strokes[best])), (-float(finer.fun), float(finer.x)))
+    slew = slewing(machine, statics.frame)
+    turns = np.nan
+    if slew is not None and machine.active[slew[0]] in found:
+        drive = found[machine.active[slew[0]]]
+        turns = min(drive.most, -drive.least)
+    load, height = _at(machine, statics.frame, radius, rule, friction, places.reach)
+    weight = float(np.linalg.norm(machine.model.gravity.linear))
+    return Torques(
+        joint, pivot, gross, stroke, radius, load, height, load * weight * radius, turns
+    )
+
+
+def _pivot(machine: Machine, frame: str, i: int) -> str:
+    """The joint nearest to the ground that carries the frame and that stroke i turns."""
+    model, moves = machine.model, machine.closure.gamma(machine.home)[:, i]
+    for joint in model.supports[model.frames[machine.frame(frame)].parentJoint]:
+        name = model.names[joint]
+        if joint and machine.unit(name) == "rad" and abs(moves[machine.column(name)]) > 0:
+            return str(name)
+    raise InputError(f"'{machine.active[i]}' turns nothing that carries '{frame}'")
+
+
+def _at(
+    machine: Machine, frame: str, radius: float, rule: str | Rule, friction: bool, reach: Array
+) -> tuple[float, float]:
+    """The largest load at a radius, and the height where it hangs."""
+    rule = rule_of(rule) if isinstance(rule, str) else rule
+    low, high = reach.min(axis=0), reach.max(axis=0)
+    if not low[0] <= radius <= high[0]:
+        raise InputError(
+            f"'{frame}' reaches from {low[0]:.3g} to {high[0]:.3g} m, not {radius:g} m"
+        )
+    heights = np.linspace(low[1], high[1], 61)
+    for _ in range(3):  # finer and finer about the best
+        chart = capacity(machine, frame, rule=rule, friction=friction, slews=None,
+                         radii=[radius], heights=heights.tolist())  # fmt: skip
+        least = np.nanmin(np.where(np.isnan(chart.loads), np.inf, chart.loads), axis=0)[:, 0]
+        loads = np.where(np.isfinite(least), least, -np.inf)
+        best = int(loads.argmax())
+        step = heights[1] - heights[0]
+        if step < _BESIDE * (high[1] - low[1]):
+            break
+        heights = np.linspace(heights[best] - step, heights[best] + step, 21)
+    return float(loads[best]), float(heights[best])
