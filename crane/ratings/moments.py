@@ -95,7 +95,8 @@ def torques(
     around = strokes[max(best - 1, 0)], strokes[min(best + 1, _STEPS)]
     finer = minimize_scalar(lambda x: -torque(x), bounds=around, method="bounded",
                             options={"xatol": 1e-9})  # fmt: skip
-    gross, stroke = max((float(values[best]), float(strokes[best])), (-float(finer.fun), float(finer.x)))
+    coarse = float(values[best]), float(strokes[best])
+    gross, stroke = max(coarse, (-float(finer.fun), float(finer.x)))
     slew = slewing(machine, statics.frame)
     turns = np.nan
     if slew is not None and machine.active[slew[0]] in found:
