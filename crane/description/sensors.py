@@ -81,8 +81,14 @@ class Sensor:
         return (y - self.zero) / self.scale
 
     def quantity(self, name: str, time: Array, reading: Array) -> Array:
-        """What a channel (N,) of a log stands for; where it ends first, its end goes on."""
+        """What a channel (N,) of a log stands for; where it ends first, its end goes on.
+
+        Raises:
+            InputError: A signal is late, which its valve would have to be.
+        """
         if name.startswith(SIGNAL):
+            if self.delay:
+                raise late_signal(name, name)
             return self.out(reading)
         moved = np.interp(time + self.delay, time, reading) if self.delay else reading
         return self.into(moved)
@@ -139,9 +145,14 @@ def parsed(name: str) -> tuple[str, str]:
     if what not in NUMBERS:
         raise InputError(f"'{name}': a sensor has no '{what}', {known(NUMBERS, what)}")
     if what == "delay" and quantity.startswith(SIGNAL):
-        joint = quantity.removeprefix(SIGNAL)
-        raise InputError(f"'{name}': the valve is late, give 'valve.{joint}.delay'")
+        raise late_signal(name, quantity)
     return quantity, what
+
+
+def late_signal(name: str, quantity: str) -> InputError:
+    """What to say of a delay that a signal is given by a name."""
+    joint = quantity.removeprefix(SIGNAL)
+    return InputError(f"'{name}': a signal is not late, its valve is: give 'valve.{joint}.delay'")
 
 
 def with_numbers(sensors: Mapping[str, Sensor], numbers: Mapping[str, float]) -> dict[str, Sensor]:
