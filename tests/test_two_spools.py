@@ -14,6 +14,7 @@ from test_circuit_transients import VALVE, C, G, clip, compare, cylinder, root
 import crane
 from crane.common.errors import CraneError
 from crane.control import Signals
+from crane.view.plots.recording import plot_recording
 
 TANK, SUPPLY = 1e5, 9.25e6
 C1, C2, C3, C4 = (ORIFICE[name] for name in ("c1", "c2", "c3", "c4"))
@@ -161,6 +162,26 @@ def test_levers_and_programs_move_the_second_spool_alone(tmp_path):
     short = crane.Sampled(lambda t, q, v, p: [0.3], machine, period=0.01)
     with pytest.raises(CraneError, match=r"the signals at t = 0 s .*x_b"):
         crane.simulate(machine, short, duration=0.1)
+
+
+def test_a_task_of_levers_goes_with_its_joints(tmp_path):
+    machine = everything_apart(tmp_path)
+    text = (tmp_path / "rig.yaml").read_text()
+    levers = "x: [0, 0, 1, 0.5], x_b: [0, 0, 1, 0.2], y: [0, 0, 1, -0.3]"
+    text += f"\ntasks: {{lower: {{duration: 1, joystick: {{{levers}}}}}}}\n"
+    (tmp_path / "rig.yaml").write_text(text)
+    machine = crane.load(tmp_path / "rig.yaml")
+    assert crane.joystick(machine, "lower").references(np.array([1.0]))[0, 1] == pytest.approx(0.2)
+    locked = crane.load(tmp_path / "rig.yaml", lock={"x": 0.2})
+    assert set(locked.tasks["lower"].levers) == {"y"}
+    crane.simulate(locked, crane.joystick(locked, "lower"), duration=0.05)
+    for path, what in ((tmp_path / "machine.png", "sketch"), (tmp_path / "run.png", "plot")):
+        if what == "sketch":
+            crane.sketch_circuit(machine, path)
+        else:
+            run = crane.simulate(machine, crane.joystick(machine, "lower"), duration=0.05)
+            plot_recording(run, path)
+        assert path.stat().st_size > 1000
 
 
 def test_a_recording_of_two_signals_is_replayed(tmp_path):

@@ -334,6 +334,8 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
     tree = spec.tree.replacing(*held)
     body = tree.bodies()
 
+    spools = spec.hydraulics.spools if spec.hydraulics else {}
+
     def moves(force: ExternalForce) -> bool:
         return body[force.frame] != body[tree.root]
 
@@ -365,7 +367,11 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
         tasks={
             name: dataclasses.replace(
                 task,
-                levers={x: lever for x, lever in task.levers.items() if x not in lock},
+                levers={
+                    x: lever
+                    for x, lever in task.levers.items()
+                    if x not in lock and (x not in spools or spools[x].joint not in lock)
+                },
                 start={x: value for x, value in task.start.items() if x not in lock},
                 loads=tuple(filter(moves, task.loads)),
             )
