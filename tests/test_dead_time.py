@@ -9,6 +9,7 @@ import crane
 from crane.common.errors import CraneError
 from crane.control import Command, Signals
 from crane.control.base import At
+from crane.identification.excitation.levers import Levers
 
 W = 40.0  # of a critically damped spool [rad/s]
 LATE = 0.01337  # [s], no multiple of anything
@@ -197,3 +198,15 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path):
     at_once = rig(tmp_path, ORIFICE, control=GAINS)
     with pytest.raises(CraneError, match="has no derivative at a delay of 0"):
         crane.sensitivities(at_once, crane.ValvePD(at_once, reference), by=["valve.x.delay"])
+
+
+def test_pulses_that_meet_the_machine_arrive_late(tmp_path):
+    """Also those of slots that have passed: the spool is where the signal was a delay ago."""
+    machine = rig(tmp_path, ORIFICE | {"delay": 0.137})
+    plan = np.array([[[0.6, 1.0]], [[-0.5, 0.7]], [[0.3, 1.0]]])
+    pulses = Levers(machine, plan, 0.2, 8.0, machine.lower, machine.upper, np.inf)
+    run = crane.simulate(machine, pulses, duration=1.0)
+    signal = run.channels["voltage_x"]
+    assert signal.max() > 0.2 and signal.min() < -0.2
+    late = np.interp(run.time - 0.137, run.time, signal)
+    np.testing.assert_allclose(run.channels["spool_x"], late, atol=1e-6)
