@@ -249,7 +249,7 @@ inclination_tilt_boom [deg] = z2_deg
         "payload.mass": None, "valve.X_lift.dead_band": (0.1143, 0.02, 0.3),
         "valve.X_lift.c1": None, "valve.X_lift.c2": None,
         "valve.X_lift.bandwidth": (31.4, 5.0, 200.0),
-        "sensor.voltage_X_lift.delay": (0.02, 0.0, 0.6),
+        "valve.X_lift.delay": (0.02, 0.0, 0.6),
         "cylinder.X_lift.stiffness": (2e7, 2e6, 1e9), "cylinder.X_lift.damping": (2e4, 1e3, 1e6),
         "cylinder.X_*.leakage_*": (1.0, 0.0, 3.0), "friction.X_lift.coulomb": (210.0, 0.0, 3000.0),
         "cylinder.X_lift.gas_b": (1e-4, 0.0, 3e-3), "sensor.inclination_lift_boom.zero": None,

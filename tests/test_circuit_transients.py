@@ -52,7 +52,9 @@ def functions(joints):
     ]
 
 
-def compare(machine, signals, rates, names, duration, times=None, initial=None, start=()):
+def compare(
+    machine, signals, rates, names, duration, times=None, initial=None, start=(), corners=None
+):
     """Simulate both, and see that pressures and strokes agree to 1e-6.
 
     Args:
@@ -64,6 +66,7 @@ def compare(machine, signals, rates, names, duration, times=None, initial=None, 
         times: Of the signals.
         initial: Of the machine.
         start: What of y at the start is no channel, by name.
+        corners: Where signals turn as they arrive, if not at times.
     """
     control = Signals(machine, times, signals)
     run = crane.simulate(machine, control, initial, duration, tolerance=1e-10)
@@ -72,7 +75,7 @@ def compare(machine, signals, rates, names, duration, times=None, initial=None, 
         found[joint], found[f"{joint}.v"] = run.q[:, i], run.v[:, i]
     found |= run.channels
     begin = [dict(start)[name] if name in dict(start) else found[name][0] for name in names]
-    edges = [0.0, *[t for t in times if 0 < t < duration], duration]
+    edges = [0.0, *[t for t in corners or times if 0 < t < duration], duration]
     rows = []
     for one, two in zip(edges, edges[1:], strict=False):  # signals have corners there
         inside = run.time[(run.time >= one) & (run.time < two)]

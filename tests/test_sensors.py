@@ -104,8 +104,14 @@ def test_a_sensor_reads_late_scaled_and_off_and_is_corrected():
     assert found.values[-1, 0] == pytest.approx(3.9)  # what comes later it has not told
     np.testing.assert_allclose(found.values[:, 1], found.values[:, 0] ** 2, atol=1e-12)
     signal = Table({"time": "s", "voltage_q": "V"}, np.column_stack([time, time**2]), {})
-    at_valve = corrected(signal, {"voltage_q": Sensor(zero=0.3, delay=0.1)}).values[:, 1]
-    np.testing.assert_allclose(at_valve[10:], (time[10:] - 0.1) ** 2 + 0.3, atol=1e-12)
+    at_valve = corrected(signal, {"voltage_q": Sensor(zero=0.3, scale=2.0)}).values[:, 1]
+    np.testing.assert_allclose(at_valve, 2.0 * time**2 + 0.3, atol=1e-12)
+    for late in (
+        lambda: corrected(signal, {"voltage_q": Sensor(delay=0.1)}),
+        lambda: crane.load("patu655", changes={"sensor.voltage_q.delay": 0.1}),
+    ):
+        with pytest.raises(InputError, match=r"its valve is: give 'valve.q.delay'$"):
+            late()
 
 
 def test_what_a_machine_knows_of_its_sensors_corrects_a_recording(machine, motion, tmp_path):

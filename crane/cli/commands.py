@@ -260,8 +260,9 @@ def _describe(machine: "Machine") -> Iterator[str]:
             kind = "sharing" if valve.sharing else "compensated" if valve.margin else "orifice"
             unit = "cm2" if machine.unit(joint) == "m" else "cm3/rad"
             size = 1e4 if unit == "cm2" else 1e6
+            kind += " valve of two spools" if valve.spool_b else " valve"
             yield (
-                f"    {joint:<{width}}{kind} valve, {size * cylinder.area_a:.4g} and "
+                f"    {joint:<{width}}{kind}, {size * cylinder.area_a:.4g} and "
                 f"{size * cylinder.area_b:.4g} {unit}"
             )
     for name, sensor in machine.sensors.items():

@@ -58,12 +58,13 @@ def check_known(circuit: Hydraulics) -> None:
     """Raise for parts that a circuit turned round does not know.
 
     Raises:
-        InputError: A motor, a valve that shares its flow, or one with curves.
+        InputError: A motor, a valve that shares its flow, has two spools, or curves.
     """
     for joint, valve in circuit.valves.items():
         for has, what in (
             (circuit.cylinders[joint].motor, "a motor"),
             (valve.sharing, "a valve that shares its flow"),
+            (valve.spool_b is not None, "a valve with two spools"),
             (bool(valve.curves), "a valve with curves"),
         ):
             if has:

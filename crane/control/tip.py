@@ -101,9 +101,10 @@ class TipVelocity(Sampled):
                 size = min(size, out * abs(v[i]) / (outlet * np.sqrt(load)))
             opening[i] = np.copysign(size, v[i]) if v[i] else 0.0
         opening /= max(1.0, np.abs(opening).max())
-        signals = np.zeros(len(v))
-        for i, valve in enumerate(self._circuit.valves.values()):
-            jump = valve.dead_band * np.tanh(opening[i] / _EASE)
-            u = opening[i] * (1.0 - valve.dead_band) + jump
-            signals[i] = valve.neutral + (valve.full - valve.neutral) * u
-        return signals
+        openings = dict(zip(self._circuit.joints, opening, strict=True))
+        signals = []
+        for spool in self._circuit.spools.values():
+            y = openings[spool.joint]
+            u = y * (1.0 - spool.dead_band) + spool.dead_band * np.tanh(y / _EASE)
+            signals.append(spool.neutral + (spool.full - spool.neutral) * u)
+        return np.array(signals)

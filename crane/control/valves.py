@@ -1,5 +1,6 @@
 """Signals of valves: from a controller, a joystick, or a recording."""
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
@@ -19,14 +20,17 @@ from crane.motion.trajectories import with_free
 
 _LONGEST = 4000.0  # of levers [s], what a simulation can have of milliseconds
 _LOGGED = 0.02  # [s] between samples of a log, at most
+_STRAIGHT = 1e-12  # of a signal, that slopes differ by over its shortest step where it goes on
+_SAME = 1e-9  # of a period, between instants that are one
 _JUMP = 0.01  # of the spool's stroke, over which the feedforward jumps the dead band
 
 
 @runtime_checkable
 class Command(Protocol):
-    """Where the signals of m valves come from.
+    """Where the signals of m spools come from, one per valve and one more per second spool.
 
-    What is written here is what those have that say nothing else.
+    What is written here is what those have that say nothing else. A valve with dead time gets the
+    signal of an earlier instant: `ValveDrive` asks for it.
 
     Attributes:
         reference: The reference motion, or None.
@@ -34,6 +38,8 @@ class Command(Protocol):
         measured: Whether the last two references are the pressures of supply and tank.
         settings: (s,) its numbers.
         period: Time between calls of `update` [s]; 0 if it wants none.
+        given: Whether the first m references are the signals, whatever the machine does, and those
+            of instants that have passed are remembered.
     """
 
     reference: Trajectory | None = None
@@ -41,6 +47,7 @@ class Command(Protocol):
     measured: bool = False
     settings: Array = np.zeros(0)
     period: float = 0.0
+    given: bool = False
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """Think about the next period, given (nq,), (n,), (m, 2) [Pa]."""
@@ -75,7 +82,8 @@ class Signals(Command):
     Args:
         machine: The machine.
         time: Instants (N,) [s], increasing.
-        signals: [V] (N,) by joint; valves that are not named stay neutral.
+        signals: [V] (N,) by joint, and by JOINT_b of second spools, which get that of the first
+            one if they are not named; valves that are not named stay neutral.
         supply: Measured pressure of the supply (N,) [Pa], if it is to be used.
         tank: Measured pressure of the tank (N,) [Pa]; that of the machine file if not given.
 
@@ -87,6 +95,7 @@ class Signals(Command):
     """
 
     title = "given valve signals"
+    given = True
 
     def __init__(
         self,
@@ -103,15 +112,17 @@ class Signals(Command):
         self._time = as_sample(time, shape[0], "time of the signals").copy()
         if not (np.diff(self._time) > 0).all():
             raise InputError("time of the signals does not increase, sort it")
-        for joint in signals:
-            if joint not in circuit.joints:
-                raise InputError(f"no valve for '{joint}', {known(circuit.joints, joint)}")
-        columns = [
-            self._column(signals[joint], f"signal of '{joint}'")
-            if joint in signals
-            else np.full(len(self._time), circuit.valves[joint].neutral)
-            for joint in circuit.joints
-        ]
+        for name in signals:
+            if name not in circuit.spools:
+                raise InputError(f"no valve for '{name}', {known(circuit.spools, name)}")
+        columns = []
+        for name, spool in circuit.spools.items():
+            by = name if name in signals else spool.joint
+            columns.append(
+                self._column(signals[by], f"signal of '{by}'")
+                if by in signals
+                else np.full(len(self._time), spool.neutral)
+            )
         self.measured = supply is not None or tank is not None
         if self.measured:
             for given, usual, what in (
@@ -132,7 +143,7 @@ class Signals(Command):
                     + (meant("pressure", highest) or ", give it in Pa from a vacuum")
                 )
         self._values = np.asfortranarray(np.column_stack(columns))  # read column by column
-        self._count = len(circuit.joints)
+        self._count = len(circuit.spools)
 
     def _column(self, values: ArrayLike, what: str) -> Array:
         return as_sample(values, len(self._time), what)
@@ -148,6 +159,16 @@ class Signals(Command):
             return np.zeros(0)
         return self._time
 
+    def corners(self, i: int) -> Array:
+        """Times (k,) [s] at which the signal of a spool turns."""
+        time, values = self._time, self._values[:, i]
+        if len(time) < 2:
+            return time
+        slopes = np.concatenate([[0.0], np.diff(values) / np.diff(time), [0.0]])
+        least = _STRAIGHT * np.abs(values).max() / np.diff(time).min()
+        found: Array = time[np.abs(np.diff(slopes)) > least]
+        return found
+
     def references(self, times: Array) -> Array:
         """See `Command`."""
         return np.column_stack([np.interp(times, self._time, x) for x in self._values.T])
@@ -162,7 +183,8 @@ def joystick(
 ) -> Signals:
     """Signals of levers: per joint a polygon of (time [s], lever from -1 to 1), or a task's name.
 
-    A task begins at its own `start`. The lever asks for a share of the valve's flow: beyond zero
+    A lever moves both spools of a valve that has two; JOINT_b names a lever of the second alone. A
+    task begins at its own `start`. The lever asks for a share of the valve's flow: beyond zero
     it jumps over the dead band, as the electronics of such machines do.
 
     Raises:
@@ -186,8 +208,8 @@ def joystick(
         points, last = task.levers, task.duration
     corners: dict[str, tuple[Array, Array]] = {}
     for joint, polygon in points.items():
-        if joint not in circuit.joints:
-            raise InputError(f"no valve for '{joint}', {known(circuit.joints, joint)}")
+        if joint not in circuit.spools:
+            raise InputError(f"no valve for '{joint}', {known(circuit.spools, joint)}")
         try:
             table = np.array(polygon, dtype=np.float64)
         except (TypeError, ValueError):
@@ -205,18 +227,20 @@ def joystick(
         raise InputError(f"the levers end at {last:g} s, give times up to {_LONGEST:g} s")
     fine = np.linspace(0.0, last, max(2, round(last / 1e-3) + 1))
     signals = {}
-    for joint, (times, levers) in corners.items():
-        valve = circuit.valves[joint]
-        lever = np.interp(fine, times, levers)
-        u = lever * (1.0 - valve.dead_band) + valve.dead_band * np.sign(lever)
-        signals[joint] = valve.neutral + (valve.full - valve.neutral) * u
+    for name, spool in circuit.spools.items():
+        by = name if name in corners else spool.joint
+        if by not in corners:
+            continue
+        lever = np.interp(fine, *corners[by])
+        u = lever * (1.0 - spool.dead_band) + spool.dead_band * np.sign(lever)
+        signals[name] = spool.neutral + (spool.full - spool.neutral) * u
     found = Signals(machine, fine, signals)
     found.title, found.start = "joystick", start
     return found
 
 
 class ValvePD(Command):
-    """One PD controller per valve, equation (37) of the electro-hydraulic forwarder paper.
+    """One PD controller per spool, equation (37) of the electro-hydraulic forwarder paper.
 
     u = K_p (q_ref - q) + K_d (q_ref' - q') + F_f, with the feedforward F_f that jumps over the
     dead band d: F_f = d tanh(w / 0.01), w the sum of the other terms. q are the active joints'
@@ -243,14 +267,14 @@ class ValvePD(Command):
                     "under 'control' of its 'hydraulics'"
                 )
         self.reference: Trajectory = with_free(machine, reference)
-        self._which = [machine.active.index(joint) for joint in circuit.joints]
-        valves = circuit.valves.values()
+        spools = circuit.spools.values()
+        self._which = [machine.active.index(spool.joint) for spool in spools]
         numbers = [
-            [gains[joint].kp for joint in circuit.joints],
-            [gains[joint].kd for joint in circuit.joints],
-            [valve.dead_band for valve in valves],
-            [valve.neutral for valve in valves],
-            [valve.full - valve.neutral for valve in valves],
+            [gains[spool.joint].kp for spool in spools],
+            [gains[spool.joint].kd for spool in spools],
+            [spool.dead_band for spool in spools],
+            [spool.neutral for spool in spools],
+            [spool.full - spool.neutral for spool in spools],
         ]
         self.settings = np.array(numbers, dtype=np.float64).ravel()
 
@@ -276,11 +300,14 @@ class Sampled(Command):
     """A program of the user that sets the valves once per period, as a control unit does.
 
     Args:
-        function: (t, q_a, v_a, pressures) -> signals, in the order of `machine.hydraulics.joints`;
-            t [s], q_a and v_a (n,), pressures (m, 2) of A and B [Pa], signals (m,) [V].
+        function: (t, q_a, v_a, pressures) -> signals, in the order of `machine.hydraulics.spools`,
+            which are its joints where no valve has two; t [s], q_a and v_a (n,), pressures (m, 2)
+            of A and B by joint [Pa], signals (s,) [V].
         machine: The machine.
         period: [s], a whole number of steps of the simulation.
     """
+
+    given = True
 
     def __init__(
         self,
@@ -292,20 +319,25 @@ class Sampled(Command):
             raise InputError(f"{function!r} is no function (t, q_a, v_a, pressures) -> signals")
         self._function = function
         circuit = circuit_of(machine)
-        self._joints = circuit.joints
+        self._spools = tuple(circuit.spools)
         self._active = machine.closure.active
         self.period = as_number(period, "the period", "s", above=0)
-        self._held = np.array([valve.neutral for valve in circuit.valves.values()])
+        self._held = [np.array([spool.neutral for spool in circuit.spools.values()])]
+        self._since = [0.0]  # when each of them was set [s]
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """See `Command`."""
         answer = self._function(time, q[self._active].copy(), v_a.copy(), pressures)
         what = f"the signals at t = {time:g} s"
-        self._held = as_sample(answer, len(self._joints), what, self._joints)
+        kept = bisect_left(self._since, time - _SAME * self.period)  # what is later is of before
+        self._since[kept:] = [time]
+        self._held[kept:] = [as_sample(answer, len(self._spools), what, self._spools)]
 
     def references(self, times: Array) -> Array:
-        """See `Command`."""
-        return np.tile(self._held, (len(times), 1))
+        """See `Command`; between two jumps, at which steps end, it holds one signal."""
+        middle = 0.5 * (times[0] + times[-1]) + _SAME * self.period
+        held = self._held[max(bisect_right(self._since, middle) - 1, 0)]
+        return np.tile(held, (len(times), 1))
 
     def signals(self, at: At) -> Sequence[Number]:
         """See `Command`."""

@@ -258,6 +258,7 @@ def _warn_of_units(spec: MachineSpec, part: str, values: Mapping[str, float]) ->
             warnings.warn(what, CraneWarning, stacklevel=2)
 
 
+SPOOL_B = "spool_b"  # second spool of a valve, whose numbers are those of a part of their own
 CIRCUIT = {
     "cylinder.": "cylinders", "valve.": "valves", "valve_control.": "control",
     "supply.": "supplies", "line.": "lines", "accumulator.": "accumulators",
@@ -276,12 +277,23 @@ def circuit_parts(hydraulics: Hydraulics) -> dict[str, Any]:
         | {f"element.{name}": part for name, part in hydraulics.elements.items()}
         | {f"cylinder.{joint}": part for joint, part in hydraulics.cylinders.items()}
         | {f"valve.{joint}": part for joint, part in hydraulics.valves.items()}
+        | {
+            f"valve.{x.joint}.{SPOOL_B}": x.spool_b
+            for x in hydraulics.valves.values()
+            if x.spool_b
+        }
         | {f"valve_control.{joint}": part for joint, part in hydraulics.control.items()}
     )
 
 
 def _circuit(hydraulics: Hydraulics, parts: Mapping[str, Any]) -> Hydraulics:
     """A circuit with these parts in place of its own."""
+    parts = dict(parts)
+    for joint, valve in hydraulics.valves.items():
+        second = parts.pop(f"valve.{joint}.{SPOOL_B}", None)
+        if valve.spool_b is not None:
+            of = parts[f"valve.{joint}"]
+            parts[f"valve.{joint}"] = dataclasses.replace(of, spool_b=second)
     kinds: dict[str, Any] = {
         field: {
             name.removeprefix(kind): part for name, part in parts.items() if name.startswith(kind)
@@ -322,6 +334,8 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
     tree = spec.tree.replacing(*held)
     body = tree.bodies()
 
+    spools = spec.hydraulics.spools if spec.hydraulics else {}
+
     def moves(force: ExternalForce) -> bool:
         return body[force.frame] != body[tree.root]
 
@@ -353,7 +367,11 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
         tasks={
             name: dataclasses.replace(
                 task,
-                levers={x: lever for x, lever in task.levers.items() if x not in lock},
+                levers={
+                    x: lever
+                    for x, lever in task.levers.items()
+                    if x not in lock and (x not in spools or spools[x].joint not in lock)
+                },
                 start={x: value for x, value in task.start.items() if x not in lock},
                 loads=tuple(filter(moves, task.loads)),
             )

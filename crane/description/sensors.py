@@ -6,6 +6,7 @@ A quantity is called by the column of a recording that holds it, X the name of a
     pressure_X_a, pressure_X_b        in the chambers of its cylinder
     pressure_supply, pressure_tank
     voltage_X, spool_X                the signal of its valve, and its spool
+    voltage_X_b, spool_X_b            of a second spool, of a valve that has two
     inclination_LINK                  of a link's x axis above the horizon, by an inclinometer
     inclination_LINK_velocity         its rate, by a gyro
     time
@@ -38,7 +39,8 @@ class Sensor:
         y(t) = scale x(t - delay) + zero + n
 
     The quantity enters a sensor and its reading comes out. A signal `voltage_X` goes the other
-    way: it enters as it was logged, and what comes out is what the valve gets.
+    way: it enters as it was logged, and what comes out is what the valve gets; how late that acts
+    is the valve's `delay`, not the sensor's.
 
     Attributes:
         column: Where a log has the reading, see `crane.recordings.logs`; "" where it is called as
@@ -79,10 +81,17 @@ class Sensor:
         return (y - self.zero) / self.scale
 
     def quantity(self, name: str, time: Array, reading: Array) -> Array:
-        """What a channel (N,) of a log stands for; where it ends first, its end goes on."""
-        late = -self.delay if name.startswith(SIGNAL) else self.delay
-        moved = np.interp(time + late, time, reading) if late else reading
-        return self.out(moved) if name.startswith(SIGNAL) else self.into(moved)
+        """What a channel (N,) of a log stands for; where it ends first, its end goes on.
+
+        Raises:
+            InputError: A signal is late, which its valve would have to be.
+        """
+        if name.startswith(SIGNAL):
+            if self.delay:
+                raise late_signal(name, name)
+            return self.out(reading)
+        moved = np.interp(time + self.delay, time, reading) if self.delay else reading
+        return self.into(moved)
 
     def numbers(self) -> dict[str, float]:
         """By the last word of their names."""
@@ -104,13 +113,16 @@ def unit_of(tree: Tree, name: str) -> str | None:
         if what in tree.links:
             return "rad"
         return "rad/s" if what.removesuffix(VELOCITY) in tree.links else None
-    for head, unit, ends in ((PRESSURE, "Pa", ("_a", "_b")), (SIGNAL, "V", ("",))):
+    chambers, spools = ("_a", "_b"), ("", "_b")
+    for head, unit, ends in (
+        (PRESSURE, "Pa", chambers), (SIGNAL, "V", spools), ("spool_", "", spools),
+    ):  # fmt: skip
         for end in ends:
             if name.startswith(head) and name.endswith(end):
                 joint = name[len(head) : len(name) - len(end)]
                 if joint in kinds:
                     return unit
-    return "" if name.removeprefix("spool_") in kinds and name.startswith("spool_") else None
+    return None
 
 
 def quantities(tree: Tree) -> list[str]:
@@ -132,7 +144,15 @@ def parsed(name: str) -> tuple[str, str]:
     quantity, _, what = name.removeprefix(SENSOR).rpartition(".")
     if what not in NUMBERS:
         raise InputError(f"'{name}': a sensor has no '{what}', {known(NUMBERS, what)}")
+    if what == "delay" and quantity.startswith(SIGNAL):
+        raise late_signal(name, quantity)
     return quantity, what
+
+
+def late_signal(name: str, quantity: str) -> InputError:
+    """What to say of a delay that a signal is given by a name."""
+    joint = quantity.removeprefix(SIGNAL)
+    return InputError(f"'{name}': a signal is not late, its valve is: give 'valve.{joint}.delay'")
 
 
 def with_numbers(sensors: Mapping[str, Sensor], numbers: Mapping[str, float]) -> dict[str, Sensor]:
@@ -158,4 +178,5 @@ def named_numbers(sensors: Mapping[str, Sensor]) -> dict[str, float]:
         for quantity, sensor in sensors.items()
         if quantity != TIME
         for what, value in sensor.numbers().items()
+        if what != "delay" or not quantity.startswith(SIGNAL)
     }

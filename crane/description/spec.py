@@ -385,7 +385,7 @@ class Task:
             "joystick" (levers of valves).
         coefficients: Per coordinate the polynomial in time [s], lowest power first [m], [rad].
         via: Points in the place of polynomials.
-        levers: Per joint a polygon of time [s] and lever, -1 to 1.
+        levers: Per joint, or JOINT_b of a second spool, a polygon of time [s] and lever, -1 to 1.
         loads: What acts from outside while it is done, beside what always does.
         start: Active coordinates where levers begin [m], [rad]; at home where not given.
     """

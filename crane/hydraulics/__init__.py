@@ -7,6 +7,7 @@ from crane.hydraulics.components import (
     Hydraulics,
     Oil,
     PDGains,
+    Spool,
     Valve,
 )
 from crane.hydraulics.curve import Curve
@@ -15,5 +16,5 @@ from crane.hydraulics.sources import Engine, Supply
 
 __all__ = [
     "Accumulator", "Circuit", "Counterbalance", "Curve", "Cylinder", "Element", "Engine",
-    "Hydraulics", "Line", "Oil", "PDGains", "Supply", "Valve",
+    "Hydraulics", "Line", "Oil", "PDGains", "Spool", "Supply", "Valve",
 ]  # fmt: skip

@@ -11,12 +11,15 @@ from crane.common.samples import Array
 from crane.hydraulics.books import Books, nets_of
 from crane.hydraulics.components import Hydraulics
 from crane.hydraulics.driven_cylinder import (
+    FIELDS,
     INSIDE,
+    SPOOL,
     WIDTH,
     Chamber,
     DrivenCylinder,
     row_of,
     spool_of,
+    spool_row,
 )
 from crane.hydraulics.elements import Accumulator
 from crane.hydraulics.flow import Flow, clipped
@@ -50,7 +53,7 @@ class Instant:
         forces: (m,) of the cylinders, F = area_a p_A - area_b p_B, equation (20) [N], [N m].
         grips: (m,) Coulomb friction that they add to that of their joints [N], [N m].
         rates: (k,) of the states.
-        spools: (m,) positions u.
+        spools: (s,) positions u.
         chambers: (m,) pairs A, B.
         supply: Pressure [Pa].
         tank: Pressure [Pa].
@@ -82,7 +85,7 @@ class Circuit:
     """The formulas of one circuit: nodes with pressures, and what flows between them.
 
     States per cylinder: those of the pressures in A and B, the compression of the series spring
-    if there is one, the signal behind its play, position and rate of the spool if these are;
+    if there is one, per spool the signal behind its play, position and rate if these are;
     then per pump that of its line's pressure if its flow is limited, and of its displacement if
     that takes time; per line and accumulator that of its pressure, and the oil in it if heat
     leaves its gas; the engine's speed; then `BALANCES`.
@@ -98,6 +101,7 @@ class Circuit:
 
     Attributes:
         joints: Those driven, in order.
+        spools: (s,) names of the valves' signals, see `Hydraulics.spools`.
         numbers: Of the circuit, as the formulas read them.
         stiff: Number of states that need an implicit method; the others are integrals.
         size: Number of all states.
@@ -110,6 +114,7 @@ class Circuit:
 
     def __init__(self, hydraulics: Hydraulics, strokes: Sequence[float], measured: bool = False):
         self.hydraulics, self.joints = hydraulics, hydraulics.joints
+        self.spools = tuple(hydraulics.spools)
         self.measured = measured
         self.pumps = {
             name: pump
@@ -127,6 +132,7 @@ class Circuit:
         rows = [
             self._common(),
             *(row_of(*part) for part in self._parts),
+            *(spool_row(valve.spool_b) for _, valve, _ in self._parts if valve.spool_b),
             *(self._pump_row(pump) for pump in self.pumps.values()),
             *([pump.pressure] for pump in self._ample.values()),
             *([self._engine_row(self._engine)] if self._engine else []),
@@ -154,11 +160,12 @@ class Circuit:
             pressure(f"{joint}_b", cylinder.hose_b + 0.5 * cylinder.area_b * stroke)
             if cylinder.stiffness > 0:
                 add(f"spring_{joint}", "m", 1e-10)
-            if valve.hysteresis > 0:
-                add(f"play_{joint}", "", 1e-7)
-            if valve.bandwidth > 0:
-                add(f"spool_{joint}", "", 1e-7)
-                add(f"spool_rate_{joint}", "1/s", 1e-5)
+            for name, spool in valve.spools.items():
+                if spool.hysteresis > 0:
+                    add(f"play_{name}", "", 1e-7)
+                if spool.bandwidth > 0:
+                    add(f"spool_{name}", "", 1e-7)
+                    add(f"spool_rate_{name}", "1/s", 1e-5)
         self.ends = [*self.starts[1:], len(scales)]
         for name, pump in self.pumps.items():
             pressure(name, pump.volume)
@@ -225,22 +232,23 @@ class Circuit:
             forces: (m,) that hold the machine [N], [N m]: of each cylinder, the chamber that
                 carries it bears the tank's pressure on the other side, too.
             pressures: Those of A and B [Pa] where they are known, by joint.
-            signals: (m,) of the valves [V], to which the spools have come.
+            signals: (s,) of the spools [V], to which these have come.
             tank: Pressure of the tank [Pa].
         """
         state = np.zeros(self.size)
         least, vapour = tank, self.hydraulics.oil.vapour_pressure
-        for i, (cylinder, valve, _) in enumerate(self._parts):
+        for i, (cylinder, _, _) in enumerate(self._parts):
             held = forces[i] - least * (cylinder.area_a - cylinder.area_b)
             a = least + max(held, 0.0) / cylinder.area_a
             b = least + max(-held, 0.0) / cylinder.area_b
             a, b = pressures.get(cylinder.joint, (a, b))
-            at, joint = self.starts[i], cylinder.joint
+            at = self.starts[i]
             state[at : at + 2] = max(a - vapour, 0.0), max(b - vapour, 0.0)
             if cylinder.stiffness > 0:
                 force = cylinder.area_a * a - cylinder.area_b * b
                 state[at + 2] = force / cylinder.stiffness
-            u = (signals[i] - valve.neutral) / (valve.full - valve.neutral)
+        for signal, (joint, spool) in zip(signals, self.hydraulics.spools.items(), strict=True):
+            u = (signal - spool.neutral) / (spool.full - spool.neutral)
             for name in (f"play_{joint}", f"spool_{joint}"):
                 if name in self._place:
                     state[self._place[name]] = np.clip(u, -1.0, 1.0)
@@ -276,7 +284,7 @@ class Circuit:
             x: (m,) coordinates above the lower limits [m], [rad].
             v: (m,) velocities [m/s], [rad/s].
             state: (size,).
-            signals: (m,) of the valves [V].
+            signals: (s,) that reach the spools [V].
             given: Pressures of supply and tank where they are measured, else nothing.
         """
         taken = iter(numbers)
@@ -286,6 +294,7 @@ class Circuit:
 
         common = row(_COMMON)
         rows = [list(islice(taken, WIDTH)) for _ in self._parts]
+        second = [row(SPOOL) if valve.spool_b else {} for _, valve, _ in self._parts]
         pump_rows = {name: row(_PUMP) for name in self.pumps}
         ample = {name: next(taken) for name in self._ample}
         engine = row(_ENGINE) if self._engine is not None else {}
@@ -303,13 +312,19 @@ class Circuit:
         functions: list[DrivenCylinder] = []
         spools: list[Number] = []
         moved: list[list[Number]] = []
+        reaching = iter(signals)
         for i, (cylinder, valve, _) in enumerate(self._parts):
-            spool, rate = spool_of(valve, rows[i], own, signals[i])
-            spools.append(spool)
-            moved.append(rate)
+            parts = dict(zip(FIELDS, rows[i], strict=False)), second[i]
+            both = [
+                spool_of(name, spool, part, own, next(reaching))
+                for part, (name, spool) in zip(parts, valve.spools.items(), strict=False)
+            ]
+            here = [u for u, _ in both]
+            spools += here
+            moved.append([x for _, rate in both for x in rate])
             mine = state[self.starts[i] : self.ends[i]]
             functions.append(
-                DrivenCylinder(common, rows[i], cylinder, valve, spool, x[i], v[i], mine)
+                DrivenCylinder(common, rows[i], cylinder, valve, here, second[i], x[i], v[i], mine)
             )
             pressures |= functions[i].nodes
         fed = {name: [one for one in functions if one.valve.supply == name] for name in pressures}

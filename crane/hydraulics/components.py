@@ -141,16 +141,53 @@ class Cylinder:
 
 
 @dataclass(frozen=True)
+class Spool:
+    """What moves a second spool of a valve, that of chamber B: numbers as of `Valve`.
+
+    Attributes:
+        joint: Its cylinder's joint.
+        neutral: Signal of the middle position [V].
+        full: Signal of u = 1, which drains chamber B [V].
+        dead_band: Share of the spool's stroke without flow.
+        bandwidth: Natural frequency of the spool [rad/s]; 0 for a spool without inertia.
+        damping: Its damping ratio.
+        rate: The fastest it moves, in strokes per second; 0 for no limit.
+        hysteresis: Width of the play between signal and spool, as a share of the stroke.
+        delay: Dead time of its electric stage [s].
+    """
+
+    joint: str
+    neutral: float = signed(0.0)
+    full: float = signed(1.0)
+    dead_band: float = 0.0
+    bandwidth: float = 0.0
+    damping: float = above(1.0)
+    rate: float = 0.0
+    hysteresis: float = 0.0
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        what = f"the second spool of '{self.joint}'"
+        check_numbers(self, what)
+        _check_spool(self, what)
+
+
+@dataclass(frozen=True)
 class Valve:
     """A proportional directional valve of one cylinder.
 
     The signal U [V] asks for the spool position u = (U - neutral) / (full - neutral), from -1 to
     1; the spool follows. Its opening is y = sign(u) (|u| - dead_band) / (1 - dead_band) outside of
-    the dead band. Flows through the open edges are equations (21), (22) of the electro-hydraulic
-    forwarder paper,
+    the dead band. After a dead time it follows the signal of t - delay, at first the first one.
+    Flows through the open edges are equations (21), (22) of the electro-hydraulic forwarder
+    paper,
 
         y > 0:  Q_A = c1 y sqrt(p_S - p_A),  Q_B = -c2 y sqrt(p_B - p_R),
         y < 0:  Q_A = c3 y sqrt(p_A - p_R),  Q_B = -c4 y sqrt(p_S - p_B).
+
+    With a second spool the first one has chamber A alone, Q_A(y), and the second chamber B,
+    Q_B(y_b), each with a signal of its own: an outflow is metered apart from the inflow then, both
+    chambers can be joined to the pump (which regenerates) or to the tank (where it floats).
 
     With a margin the inlets c1, c4 are pressure compensated: the pressure drop is at most that
     margin, so the flow is c1 y sqrt(margin) until the supply no longer suffices; nothing flows
@@ -177,6 +214,7 @@ class Valve:
         damping: Its damping ratio.
         rate: The fastest it moves, in strokes (of u from 0 to 1) per second; 0 for no limit.
         hysteresis: Width of the play between signal and spool, as a share of the stroke.
+        delay: Dead time of the electric stage [s].
         centre: Coefficient of the open centre at rest [m3/(s Pa^0.5)]; 0 for a closed one.
         regeneration: Coefficient of the check valve from B to A [m3/(s Pa^0.5)]; 0 for none.
         float_from: |u| beyond which a negative spool floats; 0 for none.
@@ -190,6 +228,7 @@ class Valve:
         return_a: Node that chamber A is drained to.
         return_b: Chamber B.
         curves: By "c1" to "c4" and "centre", share of the coefficient over |u|.
+        spool_b: That of chamber B, where each chamber has one.
     """
 
     joint: str
@@ -205,6 +244,7 @@ class Valve:
     damping: float = above(1.0)
     rate: float = 0.0
     hysteresis: float = 0.0
+    delay: float = 0.0
     centre: float = 0.0
     regeneration: float = 0.0
     float_from: float = 0.0
@@ -216,6 +256,7 @@ class Valve:
     return_a: str = TANK
     return_b: str = TANK
     curves: Mapping[str, Curve] = field(default_factory=dict)
+    spool_b: Spool | None = None
 
     def __post_init__(self) -> None:
         what = f"the valve of '{self.joint}'"
@@ -230,24 +271,44 @@ class Valve:
                 f"{what} floats from {self.float_from:g} with the coefficient "
                 f"{self.float_coefficient:g}, give both, from below 1",
             )
-        if self.hysteresis >= 0.5:
-            raise PartError("hysteresis", f"hysteresis of {what} is {self.hysteresis:g}, give a "
-                            "share of the stroke, below 0.5")  # fmt: skip
-        if self.full == self.neutral:
-            text = f"full and neutral of {what} are both {self.full:g}, give two"
-            raise PartError("full", text)
-        if self.dead_band >= 1:
-            text = f"dead_band of {what} is {self.dead_band:g}, it must be below 1"
-            if self.dead_band < 100:
-                text += f": looks like percent, write {self.dead_band / 100:g}"
-            raise PartError("dead_band", text)
-        if self.rate and not self.bandwidth:
-            raise PartError("rate", f"{what} has a rate but no bandwidth, give both")
+        _check_spool(self, what)
+        for key in ("centre", "regeneration", "float_from") if self.spool_b else ():
+            if getattr(self, key):
+                raise PartError(
+                    key, f"{what} has two spools and '{key}', which goes with one, remove it"
+                )
+
+    @property
+    def spools(self) -> "dict[str, Valve | Spool]":
+        """What moves its spools, by the names of their signals."""
+        own: dict[str, Valve | Spool] = {self.joint: self}
+        return own | ({f"{self.joint}_b": self.spool_b} if self.spool_b else {})
 
     def opening(self, u: float) -> float:
         """Opening y of a spool position u."""
         size = min(max((abs(u) - self.dead_band) / (1.0 - self.dead_band), 0.0), 1.0)
         return math.copysign(size, u)
+
+
+def _check_spool(spool: Spool | Valve, what: str) -> None:
+    """Raise for what no spool can have.
+
+    Raises:
+        PartError: Of the number.
+    """
+    if spool.hysteresis >= 0.5:
+        raise PartError("hysteresis", f"hysteresis of {what} is {spool.hysteresis:g}, give a "
+                        "share of the stroke, below 0.5")  # fmt: skip
+    if spool.full == spool.neutral:
+        text = f"full and neutral of {what} are both {spool.full:g}, give two"
+        raise PartError("full", text)
+    if spool.dead_band >= 1:
+        text = f"dead_band of {what} is {spool.dead_band:g}, it must be below 1"
+        if spool.dead_band < 100:
+            text += f": looks like percent, write {spool.dead_band / 100:g}"
+        raise PartError("dead_band", text)
+    if spool.rate and not spool.bandwidth:
+        raise PartError("rate", f"{what} has a rate but no bandwidth, give both")
 
 
 @dataclass(frozen=True)
@@ -318,6 +379,12 @@ class Hydraulics:
                     (*at, "supply"),
                     f"{what} is fed by '{valve.supply}', {known(self.sources, valve.supply)}",
                 )
+            if valve.spool_b and f"{joint}_b" in self.valves:
+                raise PlacedError(
+                    (*at, "spool_b"),
+                    f"the second spool of '{joint}' is called as the joint '{joint}_b', give that "
+                    "another name",
+                )
             for key in ("return_a", "return_b"):
                 back = getattr(valve, key)
                 _known_node([x for x in nodes if x not in chambers], what, back, (*at, key))
@@ -356,6 +423,11 @@ class Hydraulics:
     def joints(self) -> tuple[str, ...]:
         """The joints that it drives."""
         return tuple(self.cylinders)
+
+    @property
+    def spools(self) -> dict[str, Valve | Spool]:
+        """What moves each spool, by the name of its signal: JOINT, and JOINT_b of a second one."""
+        return {name: x for valve in self.valves.values() for name, x in valve.spools.items()}
 
     @property
     def gripped(self) -> tuple[str, ...]:

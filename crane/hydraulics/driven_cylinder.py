@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from crane.codegen import Number, maximum
 from crane.codegen.scalar import apply, minimum, where_positive
-from crane.hydraulics.components import Counterbalance, Cylinder, Valve
+from crane.hydraulics.components import Counterbalance, Cylinder, Spool, Valve
 from crane.hydraulics.flow import LAMINAR, Flow, clipped, in_series, root, through
 from crane.hydraulics.nodes import PER_SENSED, highest, softness_of
 from crane.hydraulics.sources import TANK
@@ -21,6 +21,10 @@ FIELDS = (
     "bandwidth", "spool_damping", "rate", "cross_relief", "rupture_a", "rupture_b", "centre",
     "regeneration", "float_from", "per_float", "float_coefficient", "demand", "hysteresis",
     "seal_friction", "brake", "per_release",
+)  # fmt: skip
+SPOOL = (
+    "neutral", "per_signal", "dead_band", "per_stroke", "bandwidth", "spool_damping", "rate",
+    "hysteresis",
 )  # fmt: skip
 _HOLDING = ("pressure", "pilot_ratio", "per_range", "coefficient")
 WIDTH = len(FIELDS) + 2 * len(_HOLDING)
@@ -55,7 +59,8 @@ class DrivenCylinder:
         numbers: `row_of` the parts, as floats or traced.
         cylinder: What it is.
         valve: Likewise.
-        spool: Position u.
+        spools: Position u; those of the spools of A and of B where there are two.
+        second: Numbers of the second spool, `SPOOL`.
         x: Coordinate above the lower limit [m], [rad].
         v: Its rate [m/s], [rad/s].
         own: States: those of the pressures in A and B, then the series spring's compression.
@@ -64,7 +69,8 @@ class DrivenCylinder:
         joint: Whose cylinder it is.
         valve: Its valve.
         pressures: Of A and B [Pa].
-        opened: Openings y of the spool on its positive and its negative side.
+        opened: Openings y of the inlets to A and to B: of one spool on its positive and its
+            negative side.
         force: Of the cylinder, equation (20) [N], [N m].
         spring_rate: Rate of the series spring's compression, if there is one.
         spring_power: What goes into it [W].
@@ -78,13 +84,14 @@ class DrivenCylinder:
         numbers: Sequence[Number],
         cylinder: Cylinder,
         valve: Valve,
-        spool: Number,
+        spools: Sequence[Number],
+        second: Mapping[str, Number],
         x: Number,
         v: Number,
         own: Sequence[Number],
     ):
         self._common, width = common, len(_HOLDING)
-        self._cylinder, self.valve, self._own, self._spool = cylinder, valve, own, spool
+        self._cylinder, self.valve, self._own, self._spools = cylinder, valve, own, spools
         self.joint = cylinder.joint
         part = self._part = dict(zip(FIELDS, numbers[: len(FIELDS)], strict=True))
         ends = [len(FIELDS) + side * width for side in range(3)]
@@ -111,10 +118,16 @@ class DrivenCylinder:
             self.damped = part["damping"] * squeezed * squeezed
         self._left = [x, part["stroke"] - x]
         self._v = v
-        self.opened = [
-            clipped((side - part["dead_band"]) * part["per_stroke"], 0.0, 1.0)
-            for side in (spool, -spool)
+        self._laws = [part, second][: len(spools)]
+        sides = [
+            [
+                clipped((side - law["dead_band"]) * law["per_stroke"], 0.0, 1.0)
+                for side in (spool, -spool)
+            ]
+            for spool, law in zip(spools, self._laws, strict=True)
         ]
+        self.opened = [sides[0][0], sides[-1][1]]
+        self._drained = [sides[0][1], sides[-1][0]]
 
     @property
     def nodes(self) -> dict[str, Number]:
@@ -140,7 +153,7 @@ class DrivenCylinder:
 
     def centre(self) -> Number:
         """Coefficient of its open centre."""
-        size = maximum(self._spool, -self._spool)
+        size = maximum(self._spools[0], -self._spools[0])
         if (curve := self.valve.curves.get("centre")) is not None:
             return self._part["centre"] * curve.at(size)
         return self._part["centre"] * (1.0 - maximum(*self.opened))
@@ -172,12 +185,13 @@ class DrivenCylinder:
             found.append(Flow(node_b, node_a, rate, "regeneration"))
         floats: Number = 0.0
         if valve.float_from > 0:
-            floats = clipped((-self._spool - part["float_from"]) * part["per_float"], 0.0, 1.0)
+            floats = clipped((-self._spools[0] - part["float_from"]) * part["per_float"], 0.0, 1.0)
         for side in range(2):
             p, back, node = self.pressures[side], backs[side], nodes[side]
             to = valve.return_a if side == 0 else valve.return_b
-            inlet = self._edge(*(("c1", 0) if side == 0 else ("c4", 1)))
-            outlet = self._edge(*(("c3", 1) if side == 0 else ("c2", 0)))
+            forwards = 1.0 if side == 0 else -1.0
+            inlet = self._edge(("c1", "c4")[side], side, forwards, self.opened[side])
+            outlet = self._edge(("c3", "c2")[side], side, -forwards, self._drained[side])
             if valve.float_from > 0:
                 outlet = outlet + part["float_coefficient"] * floats
                 if side == 1:
@@ -231,19 +245,20 @@ class DrivenCylinder:
             slope = net / where_positive(self._own[side], softness, void)
         return Chamber(p, volume, area, valve, net, slope)
 
-    def _edge(self, name: str, side: int) -> Number:
-        """Coefficient of an edge as far as it is open."""
+    def _edge(self, name: str, side: int, way: float, opened: Number) -> Number:
+        """Coefficient of a chamber's edge as far as its spool opens it, `way` 1 or -1."""
         if (curve := self.valve.curves.get(name)) is not None:
-            stroke = clipped(self._spool if side == 0 else -self._spool, 0.0, 1.0)
+            spool = self._spools[-1 if side else 0]
+            stroke = clipped(spool if way > 0 else -spool, 0.0, 1.0)
             return self._part[name] * where_positive(stroke, curve.at(stroke), 0.0)
-        return self._part[name] * self.opened[side]
+        return self._part[name] * opened
 
     def grip(self, tank: Number) -> Number:
         """Coulomb friction that seals and brake add to the joint's [N], [N m].
 
         F_K = mu (max(p_A - p_R, 0) + max(p_B - p_R, 0)) + B (1 - (|u| - d) / e), with mu and B of
         the seals and the brake, its last factor within 0 and 1, d the dead band and e the travel
-        that releases it.
+        that releases it; of two spools the one that goes farther counts.
 
         Args:
             tank: p_R [Pa].
@@ -254,7 +269,10 @@ class DrivenCylinder:
             above = [maximum(p - tank, 0.0) for p in self.pressures]
             grip = grip + part["seal_friction"] * (above[0] + above[1])
         if self._cylinder.brake > 0:
-            travel = (apply("abs", self._spool) - part["dead_band"]) * part["per_release"]
+            travel = highest([
+                (apply("abs", spool) - law["dead_band"]) * part["per_release"]
+                for spool, law in zip(self._spools, self._laws, strict=True)
+            ])  # fmt: skip
             grip = grip + part["brake"] * (1.0 - clipped(travel, 0.0, 1.0))
         return grip
 
@@ -299,7 +317,11 @@ class DrivenCylinder:
 
 
 def spool_of(
-    valve: Valve, numbers: Sequence[Number], own: Mapping[str, Number], signal: Number
+    name: str,
+    spool: Valve | Spool,
+    part: Mapping[str, Number],
+    own: Mapping[str, Number],
+    signal: Number,
 ) -> tuple[Number, list[Number]]:
     """A spool's position u, and the rates of its states: u'' = w^2 (wanted - u) - 2 d w u'.
 
@@ -307,26 +329,27 @@ def spool_of(
     beyond the play.
 
     Args:
-        valve: What it is.
-        numbers: `row_of` it.
+        name: Of its signal.
+        spool: What it is.
+        part: Its numbers, `SPOOL` among them.
         own: States by name.
-        signal: [V].
+        signal: That reaches it [V].
     """
-    part, rates = dict(zip(FIELDS, numbers, strict=False)), []
+    rates: list[Number] = []
     wanted = clipped((signal - part["neutral"]) * part["per_signal"], -1.0, 1.0)
-    if valve.hysteresis > 0:
-        behind = own[f"play_{valve.joint}"]
+    if spool.hysteresis > 0:
+        behind = own[f"play_{name}"]
         gap, half = wanted - behind, 0.5 * part["hysteresis"]
         rates.append(_PLAY * (gap - clipped(gap, -1.0 * half, half)))
         wanted = behind
-    if not valve.bandwidth > 0:
+    if not spool.bandwidth > 0:
         return wanted, rates
-    spool, speed = own[f"spool_{valve.joint}"], own[f"spool_rate_{valve.joint}"]
+    u, speed = own[f"spool_{name}"], own[f"spool_rate_{name}"]
     w, moved = part["bandwidth"], speed
-    if valve.rate > 0:
+    if spool.rate > 0:
         moved = clipped(speed, -1.0 * part["rate"], part["rate"])
-    pull = w * (w * (wanted - spool) - 2.0 * part["spool_damping"] * speed)
-    return spool, [*rates, moved, pull]
+    pull = w * (w * (wanted - u) - 2.0 * part["spool_damping"] * speed)
+    return u, [*rates, moved, pull]
 
 
 def row_of(cylinder: Cylinder, valve: Valve, stroke: float) -> list[float]:
@@ -337,24 +360,26 @@ def row_of(cylinder: Cylinder, valve: Valve, stroke: float) -> list[float]:
         "stroke": stroke,
         "c1": valve.c1, "c2": valve.c2, "c3": valve.c3, "c4": valve.c4,
         "margin": valve.margin,
-        "neutral": valve.neutral,
-        "per_signal": 1.0 / (valve.full - valve.neutral),
-        "dead_band": valve.dead_band,
-        "per_stroke": 1.0 / (1.0 - valve.dead_band),
-        "bandwidth": valve.bandwidth,
-        "spool_damping": valve.damping,
-        "rate": valve.rate,
+        **dict(zip(SPOOL, spool_row(valve), strict=True)),
         "centre": valve.centre,
         "regeneration": valve.regeneration,
         "float_from": valve.float_from,
         "per_float": 1.0 / (1.0 - valve.float_from),
         "float_coefficient": valve.float_coefficient,
         "demand": valve.demand,
-        "hysteresis": valve.hysteresis,
         "per_release": 1.0 / cylinder.brake_release,
     }  # fmt: skip
     holding = [_holding(cylinder.counterbalance_a), _holding(cylinder.counterbalance_b)]
     return [*(float(values[name]) for name in FIELDS), *holding[0], *holding[1]]
+
+
+def spool_row(spool: Valve | Spool) -> list[float]:
+    """The numbers of what moves a spool, in the order of `SPOOL`."""
+    return [
+        spool.neutral, 1.0 / (spool.full - spool.neutral), spool.dead_band,
+        1.0 / (1.0 - spool.dead_band), spool.bandwidth, spool.damping, spool.rate,
+        spool.hysteresis,
+    ]  # fmt: skip
 
 
 def _holding(valve: Counterbalance | None) -> list[float]:

@@ -81,8 +81,12 @@ def _channels(machine: Machine, control: Controller, time: Array, rows: Parts) -
     if isinstance(control, ValveDrive):
         integrals = rows.own[:, -len(BALANCES) :]
         units = [*control.channels, *BALANCES.items()]
+        late: dict[str, Array] = {}
+        if control.delays.any():  # a log has what was commanded, not what arrives
+            spools = (f"voltage_{name}" for name in control.circuit.spools)
+            late = dict(zip(spools, control.commanded(time).T, strict=True))
         for (name, unit), values in zip(units, [*rows.channels.T, *integrals.T], strict=True):
-            yield name, values, unit
+            yield name, late.get(name, values), unit
 
 
 def _outside(machine: Machine, rows: Parts) -> Iterator[Column]:

@@ -183,11 +183,13 @@ class Inputs:
 
     Attributes:
         time: (N,) [s] from zero.
-        signals: Of the valves that were moved, (N,) by joint [V].
+        signals: Of the spools that were moved, (k,) by name [V].
         supply: (N,) pressure of the supply [Pa], None where it was not measured.
         tank: Likewise.
         pressures: Of A and B at the start [Pa] by joint, where they were measured.
         initial: q_A and v_A at the start, None where nothing tells.
+        logged: (k,) times of the signals [s], from before zero where these are known; None for
+            `time`.
     """
 
     time: Array
@@ -196,10 +198,15 @@ class Inputs:
     tank: Array | None
     pressures: dict[str, tuple[float, float]]
     initial: tuple[Array, Array] | None
+    logged: Array | None = None
 
     def drive(self, machine: Machine) -> ValveDrive:
         """The valves' drive of a machine."""
-        signals = Signals(machine, self.time, self.signals, self.supply, self.tank)
+        time, around = self.time, [self.supply, self.tank]
+        if self.logged is not None:
+            time = self.logged
+            around = [None if x is None else np.interp(time, self.time, x) for x in around]
+        signals = Signals(machine, time, self.signals, *around)
         return ValveDrive(machine, signals, self.pressures)
 
 
@@ -211,6 +218,7 @@ def inputs_of(machine: Machine, table: Table) -> Inputs:
         InputError: The machine has no valves.
     """
     joints = machine.hydraulics.joints if machine.hydraulics else ()
+    spools = tuple(machine.hydraulics.spools) if machine.hydraulics else ()
     if not joints:
         raise InputError(
             f"machine '{machine.name}' has no valves, describe its circuit under 'hydraulics' of "
@@ -222,7 +230,7 @@ def inputs_of(machine: Machine, table: Table) -> Inputs:
         raise RecordingError("has one sample, give at least two")
     signals, pressures, missing = {}, {}, Missing(machine, table)
     with missing.noted():
-        signals = _signals(machine, joints, table)
+        signals = _signals(machine, spools, table)
     check_pressures(machine, table)
     supply, tank = (
         column(table, name, "Pa") if name in table.units else None for name in (SUPPLY, TANK)
@@ -242,18 +250,18 @@ def inputs_of(machine: Machine, table: Table) -> Inputs:
     return Inputs(time, signals, supply, tank, pressures, initial)
 
 
-def _signals(machine: Machine, joints: Sequence[str], table: Table) -> dict[str, Array]:
-    """Of the valves that were moved, by joint [V]."""
+def _signals(machine: Machine, spools: Sequence[str], table: Table) -> dict[str, Array]:
+    """Of the spools that were moved, by name [V]."""
     signals = {}
     for name in (name for name in table.units if name.startswith(SIGNAL)):
-        joint = name.removeprefix(SIGNAL)
-        if joint in machine.locks:
+        spool = name.removeprefix(SIGNAL)
+        if spool in machine.locks or spool.removesuffix("_b") in machine.locks:
             continue  # the valve of a joint that is held moves nothing
-        if joint not in joints:
-            raise RecordingError(f"column '{name}' is of no valve, {known(joints, joint)}")
-        signals[joint] = column(table, name, "V")
+        if spool not in spools:
+            raise RecordingError(f"column '{name}' is of no valve, {known(spools, spool)}")
+        signals[spool] = column(table, name, "V")
     if not signals:
-        names = ", ".join(f"'{SIGNAL}{joint} [V]'" for joint in joints)
+        names = ", ".join(f"'{SIGNAL}{joint} [V]'" for joint in spools)
         raise RecordingError(f"no signal of a valve, give at least one of {names}")
     return signals
 

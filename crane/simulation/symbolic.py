@@ -156,7 +156,7 @@ def _simulation(machine: Machine) -> tuple[dict[str, int], list[Any], Outputs]:
     # the signals are a command's references
     drive = ValveDrive(machine, Signals(machine, [0.0], {}))
     chart, layout = Chart.of(Dynamics(machine)), state_layout(machine, drive.circuit.size)
-    tape, m = Tape(), len(drive.circuit.joints)
+    tape, m = Tape(), len(drive.circuit.spools)
     traced = machine_at(chart, tape, layout, 4, [])
     # zeros among the settings are parts that the circuit has not
     at = traced.seen(settings_of(drive, tape, 2, True), tape.loads(3, 0, m))

@@ -294,7 +294,7 @@ class _Columns:
     def __init__(self, recording: Recording, circuit: Circuit, machine: Machine):
         self._recording, self._circuit, self._machine = recording, circuit, machine
         self._there = recording.channels
-        self._valves = circuit.hydraulics.valves
+        self._spools = circuit.hydraulics.spools
 
     def check(self) -> None:
         """See that all channels are there, in their units.
@@ -319,9 +319,9 @@ class _Columns:
                 yield (name,)
             elif name == "engine":
                 yield ("engine_speed",)
-        for joint, valve in self._valves.items():
-            plain = not valve.bandwidth and not valve.hysteresis
-            yield (f"spool_{joint}", f"voltage_{joint}") if plain else (f"spool_{joint}",)
+        for name, spool in self._spools.items():
+            plain = not spool.bandwidth and not spool.hysteresis and not spool.delay
+            yield (f"spool_{name}", f"voltage_{name}") if plain else (f"spool_{name}",)
 
     def state(self, name: str) -> Array:
         """(N,) of one state: s = p - p_vapour of a pressure."""
@@ -338,17 +338,17 @@ class _Columns:
         return self._spool(owner) if word in ("play", "spool") else self._there[name]
 
     def signals(self) -> list[Array]:
-        """(N,) of each valve [V], at which it would stand as recorded."""
+        """(N,) of each spool [V], at which it would stand as recorded."""
         return [
-            valve.neutral + (valve.full - valve.neutral) * self._spool(joint)
-            for joint, valve in self._valves.items()
+            spool.neutral + (spool.full - spool.neutral) * self._spool(name)
+            for name, spool in self._spools.items()
         ]
 
-    def _spool(self, joint: str) -> Array:
-        if (spool := self._there.get(f"spool_{joint}")) is not None:
-            return spool
-        valve = self._valves[joint]
-        return (self._there[f"voltage_{joint}"] - valve.neutral) / (valve.full - valve.neutral)
+    def _spool(self, name: str) -> Array:
+        if (u := self._there.get(f"spool_{name}")) is not None:
+            return u
+        spool = self._spools[name]
+        return (self._there[f"voltage_{name}"] - spool.neutral) / (spool.full - spool.neutral)
 
     def given(self) -> list[Array]:
         """(N,) pressures of supply and tank [Pa]."""
@@ -365,7 +365,7 @@ def _evaluated(circuit: Circuit, rows: Array) -> tuple[list[str], Array]:
     def build(program: Program) -> None:
         tape, m, taken = Tape(), len(circuit.joints), 0
         given = []
-        for count in (m, m, circuit.stiff, m, 2 if circuit.measured else 0):
+        for count in (m, m, circuit.stiff, len(circuit.spools), 2 if circuit.measured else 0):
             given.append(tape.loads(0, taken, count))
             taken += count
         now = circuit.at(circuit.numbers.tolist(), *given)

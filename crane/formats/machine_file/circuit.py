@@ -21,6 +21,7 @@ from crane.hydraulics.components import (
     Hydraulics,
     Oil,
     PDGains,
+    Spool,
     Valve,
     check_relief,
     check_tank,
@@ -104,7 +105,7 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
             _check_relief(item, supply, cylinders[joint])
     valves: dict[str, Valve] = {}
     given = (*number_names(Valve), "type", "flow", "meter_out", "supply", "return_a", "return_b",
-             "priority")  # fmt: skip
+             "priority", "spool_b")  # fmt: skip
     for joint, item in section.mappings("valves", "valve of", *given):
         named["valve"].append(joint)
         with recoverable():
@@ -372,6 +373,9 @@ def _valve(item: Section, joint: str) -> Valve:
         if name in item and (found := read_curve(item, name)) is not None:
             given[name], curves[name] = found
     given["curves"] = curves
+    if (second := item.section("spool_b", f"'spool_b' of {item.title}")) is not None:
+        second.only(*number_names(Spool))
+        given["spool_b"] = _spool(second, item, joint)
     if kind != "compensated":
         return part_of(item, Valve, joint=joint, sharing=kind == "sharing", **given)
     margin = item.number("margin", minimum=0.0)
@@ -393,3 +397,18 @@ def _valve(item: Section, joint: str) -> Valve:
         warn_of_unit(item, "meter_out", outlet)
     given |= {"c1": inlet, "c2": outlet, "c3": outlet, "c4": inlet}
     return part_of(item, Valve, joint=joint, **given)
+
+
+def _spool(section: Section, valve: Section, joint: str) -> Spool:
+    """A second spool, which is moved as the first one where it does not say how itself."""
+    numbers, usual = {}, Spool(joint)
+    for entry in fields(Spool):
+        if entry.name != "joint":
+            of = section if entry.name in section else valve
+            least = -math.inf if entry.metadata.get("signed") else 0.0
+            numbers[entry.name] = of.number(entry.name, getattr(usual, entry.name), minimum=least)
+    spool = checked(section, Spool, joint, **numbers)
+    for name in number_names(Spool):
+        if name in section:
+            warn_of_unit(section, name, numbers[name], kind="spool")
+    return spool

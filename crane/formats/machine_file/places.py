@@ -3,10 +3,18 @@
 from dataclasses import dataclass
 from typing import Any
 
-from crane.description.changes import CIRCUIT, circuit_parts, elements, number_at, tree_numbers
+from crane.description.changes import (
+    CIRCUIT,
+    SPOOL_B,
+    circuit_parts,
+    elements,
+    number_at,
+    tree_numbers,
+)
 from crane.description.sensors import SENSOR
 from crane.description.tree import Link
 from crane.formats.machine_file.text import Way
+from crane.hydraulics import Spool
 from crane.machine import Machine
 
 _LISTS = ("forces", "ropes")  # of which a machine file has lists, of the rest mappings
@@ -73,7 +81,10 @@ def places(machine: Machine) -> dict[str, InURDF | InFile]:
         parts[head] = (field, i if field in _LISTS else item.joint), item
     for head, part in circuit_parts(machine.hydraulics).items() if machine.hydraulics else ():
         kind, _, joint = head.partition(".")
-        own = (CIRCUIT[f"{kind}."], joint) if joint else (kind,)
+        own: Way = (kind,)
+        if joint:
+            outer = joint.removesuffix(f".{SPOOL_B}") if isinstance(part, Spool) else joint
+            own = (CIRCUIT[f"{kind}."], outer, *([SPOOL_B] if outer != joint else []))
         parts[head] = ("hydraulics", *own), part
     for quantity, sensor in machine.sensors.items():
         parts[f"{SENSOR}{quantity}"] = ("sensors", quantity), sensor

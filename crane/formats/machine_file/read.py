@@ -157,7 +157,7 @@ def _read_machine(path: Path) -> MachineSpec:
         if hydraulics is not None:
             where |= circuit_places(top)
         if hydraulics is not None and not isinstance(active, Anything):
-            valves = hydraulics.joints
+            valves = tuple(hydraulics.spools)
         tasks = _part(read_tasks, tasks, top, tree, active, tip, valves)
         control = _part(_control, control, top, active)
     outside = _part(read_outside, (), top, tree)

@@ -3,7 +3,15 @@
 from crane.common.errors import InputError, known
 from crane.common.units import spellings
 from crane.description.findings import recoverable
-from crane.description.sensors import NUMBERS, TIME, Sensor, quantities, unit_of
+from crane.description.sensors import (
+    NUMBERS,
+    SIGNAL,
+    TIME,
+    Sensor,
+    late_signal,
+    quantities,
+    unit_of,
+)
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
 
@@ -28,6 +36,8 @@ def _sensor(name: str, item: Section, tree: TreeBuilder) -> Sensor:
         raise item.fail("unit", problem)
     if name == TIME and any(key in item for key in NUMBERS):
         raise item.fail(None, "time has a column and a unit, and no numbers of a sensor")
+    if name.startswith(SIGNAL) and "delay" in item:
+        raise item.fail("delay", str(late_signal(name, name)))
     default = Sensor()
     numbers = {key: item.number(key, getattr(default, key)) for key in NUMBERS}
     try:

@@ -127,7 +127,8 @@ class Draft:
                 return False
             parent = parent[key]
         circuit = self._machine.hydraulics
-        if circuit is not None and way[:2] == ("hydraulics", "valves") and way[-1] not in parent:
+        valves = way[:2] == ("hydraulics", "valves") and len(way) == 4
+        if circuit is not None and valves and way[-1] not in parent:
             edges = _valve(circuit.valves[str(way[2])], by_flow=False)
             parent.clear()
             parent.update(edges)
@@ -376,6 +377,8 @@ def _valve(valve: Valve, by_flow: bool = True) -> dict[str, Any]:
             rest[name] = getattr(valve, name)
     if valve.priority:
         rest["priority"] = True
+    if valve.spool_b:
+        rest["spool_b"] = _all_numbers(valve.spool_b)
     for name, curve in valve.curves.items():
         of = rest if name == "centre" else every
         of[name] = curve_data(getattr(valve, name), curve)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.description.sensors import INCLINATION, SENSOR, SIGNAL
-from crane.hydraulics import Hydraulics
+from crane.description.sensors import INCLINATION, SENSOR
+from crane.hydraulics import Hydraulics, Spool, Valve
 from crane.identification.calibration.problem import Case
 from crane.machine import Machine
 
@@ -17,7 +17,7 @@ _TILTED = 0.05  # [rad] that inclinometers are mounted off
 _PRESSED = 2e5  # [Pa] that pressure sensors are off
 _GAS = 5e-3  # of a chamber's volume
 _LEAKED = 1e-2  # of a valve's full flow at the supply's pressure
-_OPEN = {1: ("c1", "c2"), -1: ("c3", "c4")}  # orifices, by way
+_OPEN = {1: ("c1", "c2"), -1: ("c3", "c4")}  # orifices of the spools of A and of B, by way
 _SOFT, _STIFF = 20.0, 4.0  # of the oil's stiffness or what is known, beyond which it is rigid
 _BRAKED = 2e-2  # of a cylinder's force at the supply's pressure
 
@@ -57,10 +57,15 @@ def candidates(
     hydraulics = machine.hydraulics
     if hydraulics is None:
         return found
-    for joint in hydraulics.joints:
-        ways = _ways(joint, hydraulics, cases)
-        if ways:
-            found += _of_valve(joint, hydraulics, numbers, ways)
+    for joint, valve in hydraulics.valves.items():
+        ways = {name: _ways(name, hydraulics, cases) for name in valve.spools}
+        for name, spool in valve.spools.items():
+            if ways[name]:
+                edges = slice(None)
+                if len(ways) > 1:  # each has its own chamber
+                    edges = slice(0, 1) if spool is valve else slice(1, 2)
+                found += _of_spool(spool, numbers, ways[name], edges)
+        if any(ways.values()):
             found += _of_cylinder(joint, machine, hydraulics, numbers)
     if numbers.get("payload.mass", 0.0):
         found.append(_scaled("payload.mass", numbers["payload.mass"], 0.5, 3.0))
@@ -73,13 +78,18 @@ def _scaled(name: str, start: float, share: float, most: float) -> Candidate:
     return Candidate(name, start, share * start, start / most, start * most)
 
 
-def _ways(joint: str, hydraulics: Hydraulics, cases: Sequence[Case]) -> set[int]:
-    """In which ways a valve is opened, 1 and -1."""
-    valve = hydraulics.valves[joint]
-    signals = [case.inputs.signals[joint] for case in cases if joint in case.inputs.signals]
+def _ways(name: str, hydraulics: Hydraulics, cases: Sequence[Case]) -> set[int]:
+    """In which ways a spool is opened, 1 and -1."""
+    spool = hydraulics.spools[name]
+    signals = [
+        case.inputs.signals[by]
+        for case in cases
+        for by in [name if name in case.inputs.signals else spool.joint]
+        if by in case.inputs.signals
+    ]
     if not signals:
         return set()
-    u = (np.concatenate(signals) - valve.neutral) / (valve.full - valve.neutral)
+    u = (np.concatenate(signals) - spool.neutral) / (spool.full - spool.neutral)
     return {way for way, most in ((1, u.max()), (-1, -u.min())) if most > _MOVED}
 
 
@@ -93,26 +103,26 @@ def _of_sensor(name: str, numbers: Mapping[str, float]) -> Iterator[Candidate]:
         yield Candidate(delay, numbers.get(delay, 0.0), _LATE, 0.0, _LATEST)
 
 
-def _of_valve(
-    joint: str, hydraulics: Hydraulics, numbers: Mapping[str, float], ways: set[int]
+def _of_spool(
+    spool: Valve | Spool, numbers: Mapping[str, float], ways: set[int], edges: slice
 ) -> Iterator[Candidate]:
-    valve, name = hydraulics.valves[joint], f"valve.{joint}"
-    stroke = abs(valve.full - valve.neutral)
-    drift, dead = 0.02 * stroke, valve.dead_band
+    """What moves a spool, and orifices that it opened."""
+    name = f"valve.{spool.joint}" + ("" if isinstance(spool, Valve) else ".spool_b")
+    stroke = abs(spool.full - spool.neutral)
+    drift, dead = 0.02 * stroke, spool.dead_band
     if len(ways) == 2:  # else neutral and dead band cannot be told apart
-        least, most = valve.neutral - 3.0 * drift, valve.neutral + 3.0 * drift
-        yield Candidate(f"{name}.neutral", valve.neutral, drift, least, most)
+        least, most = spool.neutral - 3.0 * drift, spool.neutral + 3.0 * drift
+        yield Candidate(f"{name}.neutral", spool.neutral, drift, least, most)
     yield Candidate(f"{name}.dead_band", dead, 0.05, max(dead - 0.15, 0.0), dead + 0.15)
-    for orifice in (x for way in sorted(ways, reverse=True) for x in _OPEN[way]):
-        one = f"{name}.{orifice}"
+    for orifice in (x for way in sorted(ways, reverse=True) for x in _OPEN[way][edges]):
+        one = f"valve.{spool.joint}.{orifice}"
         if numbers[one]:
             yield _scaled(one, numbers[one], 0.3, 2.5)
-    if valve.bandwidth:
-        low, high = min(valve.bandwidth, _SLOW), max(valve.bandwidth, _FAST)
-        yield Candidate(f"{name}.bandwidth", valve.bandwidth, valve.bandwidth, low, high)
-    delay = f"{SENSOR}{SIGNAL}{joint}.delay"
-    late = numbers.get(delay, 0.0)
-    yield Candidate(delay, late, _LATE, 0.0, max(late, _LATEST))
+    if spool.bandwidth:
+        low, high = min(spool.bandwidth, _SLOW), max(spool.bandwidth, _FAST)
+        yield Candidate(f"{name}.bandwidth", spool.bandwidth, spool.bandwidth, low, high)
+    late = spool.delay
+    yield Candidate(f"{name}.delay", late, _LATE, 0.0, max(late, _LATEST))
 
 
 def _of_cylinder(

@@ -55,8 +55,6 @@ class Case:
         table: As it was read.
         starts: (s,) standard deviations of the start's deviations: q_A, v_A, pressures A and B.
         first: Where its start is among all unknowns.
-        signals: Of valves in the whole recording that this is a part of, with their times: what
-            comes late began before.
     """
 
     name: str
@@ -69,7 +67,6 @@ class Case:
     table: Table
     starts: Array
     first: int = 0
-    signals: tuple[Array, Mapping[str, Array]] | None = None
 
     def parts(self, machine: Machine, length: float) -> list["Case"]:
         """Parts of what is fitted [s], each of which starts where it was measured.
@@ -87,8 +84,9 @@ class Case:
         for some in np.array_split(fitted, count):
             table = Table(self.table.units, self.table.values[some], self.table.notes)
             part = case_of(machine, self.name, table, self.known, self.sensors, ALWAYS)
-            signals = time - time[some[0]], self.inputs.signals
-            found.append(replace(part, signals=signals))
+            # what comes late began before the part
+            inputs = replace(part.inputs, signals=self.inputs.signals, logged=time - time[some[0]])
+            found.append(replace(part, inputs=inputs))
         return found
 
 
@@ -114,7 +112,7 @@ def case_of(
         RecordingError: See `inputs_of`.
         InputError: Too few instants, or nothing to compare.
     """
-    # what starts is read off without delays, signals stay as they were logged
+    # what starts is read off without delays
     at_once = {x: replace(s, delay=0.0) for x, s in known.items() if not x.startswith(SIGNAL)}
     inputs = inputs_of(machine, corrected(table, at_once))
     if not sensors:
@@ -244,7 +242,7 @@ class Problem:
         """Inputs with another start."""
         moved = case.starts * z[case.first : case.first + len(case.starts)]
         inputs, n = case.inputs, len(self.machine.active)
-        values, signals = self.values(z), dict(inputs.signals)
+        values = self.values(z)
         initial = inputs.initial
         if initial is not None:
             low, high = self.machine.lower, self.machine.upper
@@ -255,11 +253,10 @@ class Problem:
             place = np.clip(np.array(places) + moved[:n], low, high)
             initial = place, initial[1] + moved[n : 2 * n]
             moved = moved[2 * n :]
-        whole, recorded = case.signals or (inputs.time, inputs.signals)
-        some = slice(begun := int(np.searchsorted(whole, 0.0)), begun + len(inputs.time))
-        for joint, x in recorded.items():
-            name = SIGNAL + joint
-            signals[joint] = self._sensor(case, name, values).quantity(name, whole, x)[some]
+        signals = {
+            name: self._sensor(case, SIGNAL + name, values).out(x)
+            for name, x in inputs.signals.items()
+        }
         pairs = moved.reshape(-1, 2)
         pressures = {
             joint: (

@@ -119,6 +119,9 @@ def _unknown(
     if name not in numbers:
         raise InputError(unknown_parameter(spec, numbers, name))
     begin = numbers[name] if start is None else start
+    if name.endswith(".delay"):
+        least = 0.0 if low is None else low
+        return _made(name, begin, least, high, _DELAY, ((name, numbers[name]),))
     signed = name.endswith(tuple("." + word for word in _SIGNED))
     if not signed and begin >= 0:
         low = _LEAST * begin if low is None else low

@@ -39,6 +39,8 @@ class Levers(Command):
         flow: The most that the valves ask the pump for [m3/s]; infinite where it has no limit.
     """
 
+    given = True
+
     def __init__(
         self,
         machine: Machine,
@@ -57,15 +59,22 @@ class Levers(Command):
         self._neutral = np.array([valve.neutral for valve in valves])
         self._span = np.array([valve.full - valve.neutral for valve in valves])
         self._dead = np.array([valve.dead_band for valve in valves])
-        self._begin, self._top = 0.0, np.zeros(len(valves))
-        self._last = np.zeros(len(valves))
+        self._of = [circuit.joints.index(spool.joint) for spool in circuit.spools.values()]
+        # slots from when on, how far they open, and for how long
+        self._begins = [0.0]
+        self._tops, self._lasts = [np.zeros(len(valves))], [np.zeros(len(valves))]
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """See `Command`."""
         number = round(time / self.period) - 1
-        self._begin, self._top = time, np.zeros(len(self._span))
-        if not 0 <= number < len(self._plan):
-            return
+        top = self._last = np.zeros(len(self._span))
+        if 0 <= number < len(self._plan):
+            top = self._pulse(number, q, pressures)
+        kept = max(0, number + 1)
+        self._begins[kept:], self._tops[kept:], self._lasts[kept:] = [time], [top], [self._last]
+
+    def _pulse(self, number: int, q: Array, pressures: Array) -> Array:
+        """(m,) how far valves open in a slot."""
         opening, share = self._plan[number].T
         x = q[self._columns]
         speeds = self._speeds(pressures)
@@ -75,14 +84,17 @@ class Levers(Command):
         ])  # fmt: skip
         wanted *= min(1.0, self._flow / max(self._asked(wanted, speeds), 1e-30))
         u = self._dead + (1.0 - self._dead) * np.abs(wanted)
-        self._top = np.where(wanted, np.copysign(u, wanted), 0.0)
+        return np.where(wanted, np.copysign(u, wanted), 0.0)
 
     def references(self, times: Array) -> Array:
         """See `Command`."""
-        since = np.asarray(times)[:, None] - self._begin
-        ramps = self._rate * np.clip(np.minimum(since, self._last - since), 0.0, None)
-        u = np.copysign(np.minimum(np.abs(self._top), ramps), self._top)
-        return np.asarray(self._neutral + self._span * u)
+        at = np.maximum(np.searchsorted(self._begins, times, "right") - 1, 0)
+        top, last = np.array(self._tops)[at], np.array(self._lasts)[at]
+        since = np.asarray(times)[:, None] - np.array(self._begins)[at, None]
+        ramps = self._rate * np.clip(np.minimum(since, last - since), 0.0, None)
+        u = np.copysign(np.minimum(np.abs(top), ramps), top)
+        # a second spool gets the signal of the first one, as `Signals` have it
+        return np.asarray(self._neutral + self._span * u)[:, self._of]
 
     def signals(self, at: At) -> Sequence[Number]:
         """See `Command`."""

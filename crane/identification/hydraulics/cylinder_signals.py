@@ -61,6 +61,11 @@ def parts(machine: Machine, joint: str) -> tuple[Cylinder, Valve]:
         raise InputError(f"'{machine.name}' has no hydraulics, add the section to its file")
     if joint not in circuit.cylinders:
         raise InputError(f"'{joint}' has no cylinder, {known(circuit.cylinders, joint)}")
+    if circuit.valves[joint].spool_b:
+        raise InputError(
+            f"the valve of '{joint}' has two spools, which this does not tell apart: fit its "
+            "numbers with crane calibrate"
+        )
     return circuit.cylinders[joint], circuit.valves[joint]
 
 
@@ -168,9 +173,9 @@ def opening(valve: Valve, u: Array) -> Array:
 def spool_position(valve: Valve, voltage: Array, step: float) -> Array:
     """Spool position u (N,) that follows a signal (N,) [V].
 
-    u'' + 2 damping w u' + w^2 u = w^2 (U - neutral) / (full - neutral), w the bandwidth, from rest
-    at the first sample, the signal straight between samples, which is exact to second order in
-    the step. Without bandwidth the spool follows at once.
+    u'' + 2 damping w u' + w^2 u = w^2 (U - neutral) / (full - neutral), w the bandwidth, U the
+    signal of t - delay, from rest at the first sample, straight between samples, which is exact to
+    second order in the step. Without bandwidth the spool follows at once.
 
     Raises:
         RecordingError: It would move faster than the valve's rate, which this leaves out.
@@ -178,6 +183,9 @@ def spool_position(valve: Valve, voltage: Array, step: float) -> Array:
     from scipy.signal import cont2discrete, dlsim
 
     asked = (voltage - valve.neutral) / (valve.full - valve.neutral)
+    if valve.delay:
+        samples = np.arange(len(asked), dtype=np.float64)
+        asked = np.interp(samples - valve.delay / step, samples, asked)
     if not valve.bandwidth:
         return np.asarray(asked)
     w = valve.bandwidth

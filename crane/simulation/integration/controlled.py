@@ -166,7 +166,10 @@ class ControlledStepper(Stepper):
         while done < len(rows) or offset < 0:
             count = min(most, len(rows) - done)
             now, begins, ends = first + step * done, offset, count * step
-            ahead = self._breaks[np.searchsorted(self._breaks, now + begins + _SAME * step)] - now
+            behind = now + begins + _SAME * step
+            ahead = self._breaks[np.searchsorted(self._breaks, behind)] - now
+            if isinstance(self._control, ValveDrive) and self._control.period:
+                ahead = min(ahead, self._control.jumps(behind) - now)
             if ahead < ends - _SAME * step:
                 ends = ahead
             pairs = max(1, int(np.ceil((ends - begins) / pair - _SAME)))
@@ -483,8 +486,7 @@ def breaks_of(machine: Machine, control: TracedController) -> Array:
     As they say themselves (`breaks`), or its reference.
     """
     outside = [force.breaks() for force in machine.external]
-    command = control.command if isinstance(control, ValveDrive) else control
-    sources: tuple[Any, ...] = command, getattr(command, "reference", None)
+    sources: tuple[Any, ...] = control, getattr(control, "reference", None)
     for one in sources:
         if hasattr(one, "breaks"):
             outside.append(np.asarray(one.breaks(), dtype=np.float64))

@@ -67,7 +67,7 @@ class Drive:
                 )
                 for name in list(self.states)[first:last]
             }
-            self.inputs = {f"voltage_{joint}": "V" for joint in circuit.joints}
+            self.inputs = {f"voltage_{name}": "V" for name in circuit.spools}
             self.seen = dict(control.channels) | {
                 f"{joint}_force": FORCE_UNITS[machine.unit(joint)] for joint in circuit.joints
             }
@@ -84,7 +84,8 @@ class Drive:
         own = [
             self._owner[name] in moving if name in self._owner else shared for name in self.states
         ]
-        mask: Any = np.array([*own, *(joint in moving for joint in joints)])
+        spools = self._control.circuit.hydraulics.spools.values()
+        mask: Any = np.array([*own, *(spool.joint in moving for spool in spools)])
         return mask
 
     def loaded(self, forces: Array) -> Any:
@@ -149,11 +150,15 @@ class Drive:
                         ways[-1][above[valve.supply]] = 1.0
             dead, open_to = valve.dead_band, valve.dead_band + share * (1.0 - valve.dead_band)
             way = np.zeros(len(z))
-            way[k + i] = side * (valve.full - valve.neutral)
-            z[k + i] = valve.neutral + open_to * way[k + i]
-            if f"spool_{joint}" in names:
-                at = names.index(f"spool_{joint}")
-                way[at], z[at] = side, side * open_to
+            for name, spool in valve.spools.items():  # two open alike
+                alike = (1.0 - spool.dead_band) / (1.0 - dead)
+                at = k + self._control.circuit.spools.index(name)
+                way[at] = side * alike * (spool.full - spool.neutral)
+                own = spool.dead_band + share * (1.0 - spool.dead_band)
+                z[at] = spool.neutral + own * side * (spool.full - spool.neutral)
+                if f"spool_{name}" in names:
+                    at = names.index(f"spool_{name}")
+                    way[at], z[at] = side * alike, side * own
             ways.append(way)
             ends.append((dead + _AJAR - open_to, 1.0 - open_to))
         lower, upper = np.array(ends).T

@@ -130,6 +130,13 @@ def gradient(
         directions.value(name)
     track = Track(asked.motion, progress)
     found = directions.by_all(track.time) if by is None else directions.by(by, track.time)
+    for name in [x for x, direction in found.items() if direction.references.any()]:
+        if by is not None:
+            raise InputError(
+                f"'{name}' changes when signals arrive, which a gradient takes as they are: ask "
+                "`sensitivities` for it"
+            )
+        del found[name]
     if not found:
         raise InputError("no number is named that changes anything, give `by`")
     sizes = {name: directions.size(name) for name in found}
@@ -140,7 +147,7 @@ def gradient(
     observed = _observed(track.chart.machine, recording, parts, asked.outputs)
     total, weights = _weighed(of, recording.time, observed)
     gathered = gatherer.run(weights.reshape(-1, *observed.shape))
-    # references are the controller's, which numbers of the machine do not change
+    # references are the controller's, which none of these changes
     slopes = sum(
         (getattr(gathered, part) @ np.array([getattr(x, part) for x in found.values()]).T
          for part in Setup._fields if part != "references"),

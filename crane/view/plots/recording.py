@@ -71,7 +71,7 @@ LEAST_SPAN = {
 HYDRAULIC_ROWS = (
     ("pressure", "Pa", {"A": "pressure_{}_a", "B": "pressure_{}_b", "supply": "pressure_supply"}),
     ("flow", "m3/s", {"A": "flow_{}_a", "B": "flow_{}_b"}),
-    ("signal", "V", {"recording": "voltage_{}"}),
+    ("signal", "V", {"recording": "voltage_{}", "B": "voltage_{}_b"}),
 )
 LINES: Mapping[str, Any] = {
     "recording": {"color": RECORDED},

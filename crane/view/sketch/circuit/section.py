@@ -85,6 +85,8 @@ class Function:
         drop = (margin or _ORIFICE_DROP) ** 0.5
         one, other = litres(valve.c1 * drop), litres(valve.c4 * drop)
         words = [f"{one} l/min"] if one == other else [f"{one} | {other}", "l/min"]
+        if valve.spool_b:
+            words.insert(0, "2 spools: A, B")
         if valve.margin > 0:
             return [*words, f"Δp {bar(valve.margin)}"]
         return [*words, "sharing"] if margin else [*words, f"at {bar(_ORIFICE_DROP)}"]
