@@ -17,6 +17,8 @@ from crane.description.changes import parameters
 from crane.description.sensors import Sensor
 from crane.formats.loading import Variants
 from crane.identification.calibration.dependence import left_over
+from crane.identification.calibration.ends import found_by
+from crane.identification.calibration.problem import noise_of
 from crane.identification.calibration.unknowns import unknowns_of
 from crane.recordings import timeseries
 
@@ -94,6 +96,35 @@ def test_the_rest_of_the_recording_is_predicted_to_its_noise(fitted):
         assert sensor.rms(sensor.after, True) < 1.1 * noise
         assert sensor.rms(sensor.after, False) < 1.2 * noise, sensor.name
         assert sensor.rms(sensor.before, False) > 3 * noise
+
+
+def test_channels_count_by_what_is_left_of_them_in_the_end(tmp_path, monkeypatch):
+    """Smoothed friction, with which the search begins, leaves twice as much where much sticks."""
+    searches, friction = [], "friction.x.coulomb"
+    truth = TRUTH | {friction: 3000.0}
+    machine = simple(tmp_path)
+    path = recorded(machine, tmp_path / "run.csv", 1, truth)
+    monkeypatch.setattr(
+        "crane.identification.calibration.calibrate.found_by",
+        lambda search, count: searches.append(search) or found_by(search, count),
+    )
+    near = crane.load(machine.path, changes=truth | {friction: 2400.0})
+    found = quiet(crane.calibrate, near, path, [friction], train=(0.0, 3.0))
+    for sensor, noise in zip(found.sensors, (2e-4, 2e4, 2e4), strict=True):
+        left = sensor.rms(sensor.after, True)
+        assert left == pytest.approx(noise, rel=0.15), sensor.name  # of 301 samples
+        size = searches[0].sizes[sensor.name]
+        assert size == pytest.approx(max(left, sensor.noise), rel=0.05), sensor.name
+
+
+def test_shocks_are_no_noise():
+    """A channel that jumps by a hundred times its noise twice a second is no noisier."""
+    random, time = np.random.default_rng(0), np.arange(0.0, 20.0, 0.01)
+    x = 2e4 * random.normal(size=2000)
+    assert noise_of(x + 2e6 * (np.floor(2 * time) % 2)) == pytest.approx(2e4, rel=0.15)
+    few = np.zeros(2000)  # a sensor whose readings change by one digit now and then
+    few[::50] = 1.0
+    assert noise_of(few) == pytest.approx(np.std(few), rel=0.05)
 
 
 def test_what_is_fitted_can_be_loaded(fitted):

@@ -33,6 +33,7 @@ _NUDGE = 1e-5  # of an unknown's scale, for differences of the numbers of a simu
 _FEWEST = 20  # instants of a recording
 _SMOOTH = {"rad": 5e-3, "m": 2e-3}  # [rad/s], [m/s] over which friction changes its sign
 _SHARPEST, _FINEST = 1e-2, 2e-3  # [s] of a step of a simulation, and with derivatives, at most
+_NORMAL = 0.6745  # median of the size of what has a normal distribution, in deviations
 _KEPT = 100  # machines with numbers that were asked for last
 # What starts may be off by, one standard deviation, where nothing measures them: rad, m, rates.
 _PLACE, _PACE = {"rad": 5e-3, "m": 5e-3}, {"rad": 0.01, "m": 5e-3}
@@ -144,8 +145,14 @@ def case_of(
 
 
 def noise_of(x: Array) -> float:
-    """Standard deviation of a channel's noise, by its third differences."""
-    return float(np.sqrt(np.mean(np.diff(x, 3) ** 2) / 20.0))
+    """Standard deviation of a channel's noise, by the median of its third differences.
+
+    Which shocks do not change. By their mean square where half of them are zero, the readings
+    having few digits.
+    """
+    jumps = np.diff(x, 3)
+    size = float(np.median(np.abs(jumps))) / _NORMAL or float(np.sqrt(np.mean(jumps**2)))
+    return size / np.sqrt(20.0)
 
 
 class Problem:
@@ -370,7 +377,7 @@ class Problem:
             out[:, k, moving] = sensor.scale * changes(late)[:, k]
         for i in slopes.keys() & set(numbers):
             out[:, :, i] += slopes[i]
-        if smooth > self.smooth and sticking(self.machine):
+        if smooth > self.smooth and sticking(self.variant(z, self.smooth)):
             return self.residuals(case, z, fitted=True), out
         return here - case.measured, out
 

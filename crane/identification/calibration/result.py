@@ -15,7 +15,6 @@ from crane.identification.calibration.together import together
 from crane.machine import Machine
 
 _WORSE = 1.1  # times what was left before
-_NORMAL = 0.6745  # median of the size of what has a normal distribution, in deviations
 HIGHER = (
     "Near these numbers the machine follows better still, where the search did not end: calibrate "
     "again from there, or fit fewer numbers."
@@ -107,12 +106,8 @@ class Channel(Brief):
 
     @property
     def noise(self) -> float:
-        """Standard deviation of its noise, by the median of its third differences.
-
-        By their mean square where half of them are zero, the readings having few digits.
-        """
-        size = float(np.median(np.abs(np.diff(self.measured, 3)))) / _NORMAL / np.sqrt(20.0)
-        return size or noise_of(self.measured)
+        """Standard deviation of its noise, see `noise_of`."""
+        return noise_of(self.measured)
 
     def rms(self, simulated: Array, train: bool) -> float:
         """Root mean square of simulated less measured, over what was fitted or held out."""

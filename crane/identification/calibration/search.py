@@ -15,8 +15,9 @@ from crane.identification.calibration.unknowns import Unknown
 Progress = Callable[[float], None]
 
 _ROUNDS = 3  # of weights
-# shares of the smoothing of friction that is gone on with, and of that of derivatives
-_SHARPER = ((0.3, 0.3), (0.1, 0.1), (0.0, 0.3), (0.0, 0.03))
+_SAME = 0.05  # change of a channel's size, as a share, that ends them
+# shares of the smoothing of friction, and of that of derivatives: first, and in the end
+_SMOOTHER, _AS_IT_IS = ((1.0, 1.0), (0.3, 0.3), (0.1, 0.1), (0.0, 0.3)), (0.0, 0.03)
 _TOLD = 0.1  # of derivatives that tell how well all is known
 _STEPS = 40  # of Gauss-Newton between them
 _SETTLED, _BEGUN = 1e-4, 1e-2  # change of the cost, as a share, that ends them
@@ -56,7 +57,6 @@ class Search:
         """A search of fewer numbers that begins near where this one ended."""
         found = Search(problem, self._progress, self._done)
         found.sizes, found._begins = self.sizes, z
-        problem.smooth = self._problem.smooth
         return found
 
     def run(self) -> Array:
@@ -64,16 +64,11 @@ class Search:
         problem = self._problem
         z = self.begun() if self._begins is None else self._begins
         problem.rough = ROUGH
-        for i in range(_ROUNDS):
+        # what smoothed friction leaves is no measure of what is left in the end: it is taken anew
+        for problem.smooth, problem.slopes in _SMOOTHER if self._sticks else ():
             z = self._minimum(z)
-            fresh = self._fresh(z)
-            moved = max(abs(np.log(fresh[name] / self.sizes[name])) for name in fresh)
-            self.sizes = fresh
-            if moved < 0.05 and (i or not self._sticks):
-                break
-        for problem.smooth, problem.slopes in _SHARPER if self._sticks else ():
-            z = self._minimum(z)
-        return self._ended(z)
+            self.sizes = self._fresh(z)
+        return self.onward(z)
 
     def begun(self) -> Array:
         """About the unknowns, with friction that is smoothed, and linearized there."""
@@ -88,10 +83,18 @@ class Search:
 
     def onward(self, z: Array) -> Array:
         """The unknowns of the minimum that is nearest to others, with its own weights."""
-        self._problem.slopes = _SHARPER[-1][1]
-        z = self._minimum(z)
-        self.sizes = self._fresh(z)
-        return self._ended(self._minimum(z))
+        problem = self._problem
+        problem.smooth, problem.slopes = _AS_IT_IS
+        for _ in range(_ROUNDS):
+            z = self._minimum(z)
+            before, self.sizes = self.sizes, self._fresh(z)
+            if all(abs(np.log(x / before[name])) < _SAME for name, x in self.sizes.items()):
+                break
+        problem.slopes = _TOLD
+        self._linearize(z)
+        if self._progress is not None:
+            self._progress(1.0)
+        return z
 
     def _most(self) -> dict[str, float]:
         """The largest size of each channel, by its variation and its noise."""
@@ -103,14 +106,6 @@ class Search:
         noise, most = self._noise(), self._most()
         left = self._left([self._problem.residuals(case, z) for case in self._trained])
         return {name: min(max(noise[name], left[name]), most[name]) for name in left}
-
-    def _ended(self, z: Array) -> Array:
-        """The same, linearized for how well all is known."""
-        self._problem.slopes = _TOLD
-        self._linearize(z)
-        if self._progress is not None:
-            self._progress(1.0)
-        return z
 
     def _begun(self, z: Array) -> Array:
         """The better one of two minima: from the file's numbers, and from those of short parts.
