@@ -1,5 +1,6 @@
 """Signals of valves: from a controller, a joystick, or a recording."""
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
@@ -272,6 +273,13 @@ class ValvePD(Command):
         return out
 
 
+class _Held(threading.local):
+    """Signals (m,) that the valves keep until they are set again, in every thread its own."""
+
+    def __init__(self, signals: Array):
+        self.signals = signals
+
+
 class Sampled(Command):
     """A program of the user that sets the valves once per period, as a control unit does.
 
@@ -295,17 +303,18 @@ class Sampled(Command):
         self._joints = circuit.joints
         self._active = machine.closure.active
         self.period = as_number(period, "the period", "s", above=0)
-        self._held = np.array([valve.neutral for valve in circuit.valves.values()])
+        neutral = np.array([valve.neutral for valve in circuit.valves.values()])
+        self._held = _Held(neutral)  # by a run, which is one thread's
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """See `Command`."""
         answer = self._function(time, q[self._active].copy(), v_a.copy(), pressures)
         what = f"the signals at t = {time:g} s"
-        self._held = as_sample(answer, len(self._joints), what, self._joints)
+        self._held.signals = as_sample(answer, len(self._joints), what, self._joints)
 
     def references(self, times: Array) -> Array:
         """See `Command`."""
-        return np.tile(self._held, (len(times), 1))
+        return np.tile(self._held.signals, (len(times), 1))
 
     def signals(self, at: At) -> Sequence[Number]:
         """See `Command`."""
