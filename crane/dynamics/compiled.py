@@ -64,20 +64,13 @@ class _Memory(NamedTuple):
     Attributes:
         cursor: Where it has got to.
         q: (nq,) the last posture.
-        target: (n,) q_A of one sample.
-        first: (n,) its v_A.
-        second: (n,) its second argument.
-        out: (size,) its result.
-        once: Evaluates it.
+        single: Of one sample second argument, v_A and q_A (n,) each, the result (size,), and what
+            evaluates it.
     """
 
     cursor: Cursor
     q: Array
-    target: Array
-    first: Array
-    second: Array
-    out: Array
-    once: Bound
+    single: tuple[Array, Array, Array, Array, Bound]
 
 
 class QuantityCode:
@@ -123,7 +116,7 @@ class QuantityCode:
             inputs, out = np.zeros(2 * n), np.zeros(size)
             arrays = (fast.geometry.numbers, numbers, target, inputs, cursor.at, q, out)
             once = program.bound("once", fast.address, *arrays, fast.bounds)
-            return _Memory(cursor, q, target, inputs[:n], inputs[n:], out, once)
+            return _Memory(cursor, q, (inputs[n:], inputs[:n], target, out, once))
 
         self._memory = PerThread(memory)
 
@@ -141,7 +134,7 @@ class QuantityCode:
             x: Likewise.
         """
         shape = self._shape
-        _, _, target, first, second, out, once = self._memory.own
+        second, first, target, out, once = self._memory.own.single
         for buffer, array in ((second, x), (first, v_a), (target, q_a)):
             if array is not None:
                 if (

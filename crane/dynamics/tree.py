@@ -1,7 +1,7 @@
 """Equations of motion by Pinocchio's algorithms on the spanning tree, projected by gamma."""
 
 from collections.abc import Iterator, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -97,8 +97,11 @@ class TreeDynamics:
         self._armature = np.array(self._model.armature)
         self._rotors = np.flatnonzero(self._armature)
         self._closure, self._forces = machine.closure, forces
-        self._coordinates = machine.coordinates
-        self._memory = PerThread(partial(_Memory, self._model, self._together(carriers)))
+        self._coordinates, self._carriers = machine.coordinates, carriers
+
+    @cached_property
+    def _memory(self) -> PerThread[_Memory]:
+        return PerThread(partial(_Memory, self._model, self._together(self._carriers)))
 
     def _together(self, carriers: Sequence[int]) -> list[list[int]]:
         """Bodies that carry each other, a parent before its children."""
