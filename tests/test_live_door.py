@@ -121,7 +121,7 @@ def test_values_that_mean_nothing_move_nothing(live, value, monkeypatch):
     _, _, page, requests = live
     server = page._server
     name, slider = next(iter(page._sliders.items()))
-    before, good = slider.value, 0.4 * slider.min + 0.6 * slider.max
+    before, good = float(slider.value), float(0.4 * slider.min + 0.6 * slider.max)
     monkeypatch.setattr(server.gui, "_resolve_client", lambda _: object())
     hear, loop = (
         server._websock_server._handle_incoming_message,
