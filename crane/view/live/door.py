@@ -122,7 +122,7 @@ def _meant(widget: Any, updates: Any) -> bool:
     if type(value) not in (int, float):
         return False
     # a browser rounds to whole steps; not a number is within nothing
-    return bool(widget.min - widget.step <= value <= widget.max + widget.step)
+    return float(widget.min - widget.step) <= value <= float(widget.max + widget.step)
 
 
 def _loopback(host: str) -> bool:

@@ -41,15 +41,15 @@ def serve(
     """
     requests: Requests = SimpleQueue()
     door = Door(host)
-    if not door.alone:
-        warnings.warn(
-            f"it listens on {host}, not on this computer alone: whoever on the network has the "
-            "address sees the machine and moves it, and it is sent unencrypted",
-            CraneWarning,
-            stacklevel=2,
-        )
     with _until_signal(requests):
         server = start(door, port)
+        if not door.alone:
+            warnings.warn(
+                f"it listens on {host}, not on this computer alone: whoever on the network has the "
+                "address sees the machine and moves it, and it is sent unencrypted",
+                CraneWarning,
+                stacklevel=2,
+            )
         try:
             page = Page(server, session, playback, requests)
             address = door.address(server.get_port())
