@@ -43,14 +43,14 @@ def serve(
     door = Door(host)
     with _until_signal(requests):
         server = start(door, port)
-        if not door.alone:
-            warnings.warn(
-                f"it listens on {host}, not on this computer alone: whoever on the network has the "
-                "address sees the machine and moves it, and it is sent unencrypted",
-                CraneWarning,
-                stacklevel=2,
-            )
         try:
+            if not door.alone:
+                warnings.warn(
+                    f"it listens on {host}, not on this computer alone: whoever on the network has "
+                    "the address sees the machine and moves it, and it is sent unencrypted",
+                    CraneWarning,
+                    stacklevel=2,
+                )
             page = Page(server, session, playback, requests)
             address = door.address(server.get_port())
             print(f"live view at {address} (Ctrl+C ends it)", flush=True)
