@@ -46,7 +46,7 @@ def serve(
         try:
             if not door.alone:
                 warnings.warn(
-                    f"it listens on {host}, not on this computer alone: whoever on the network has "
+                    f"it listens on {host}, not on this computer alone: whoever has "
                     "the address sees the machine and moves it, and it is sent unencrypted",
                     CraneWarning,
                     stacklevel=2,
