@@ -6,7 +6,7 @@ time derivatives of its own columns,
 
     d_j V = J_j' + J_j x V,    d_j A = J_j'' + J_j' x V + J_j x A,
 
-and of the wrench f = I A + V x* I V of a body
+and of the wrench f = I A + V x* I V = I A + B V of a body
 
     d f / d v_j = 2 I J_j' + 2 B J_j,
     d f / d q_j = J_j x* f + I J_j'' + 2 B J_j',
