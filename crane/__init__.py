@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from crane.description.ground import Contact, Ground
     from crane.description.soil import SOILS, Cutting, Soil
     from crane.dynamics import Dynamics
+    from crane.dynamics.buckling import Buckling
     from crane.dynamics.reactions import Reactions
     from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
     from crane.formats.adding import add_cylinder, add_loops
@@ -110,6 +111,7 @@ _HOMES = {
     "crane.description.ground": "Contact Ground",
     "crane.description.soil": "SOILS Cutting Soil",
     "crane.dynamics": "Dynamics",
+    "crane.dynamics.buckling": "Buckling",
     "crane.dynamics.reactions": "Reactions",
     "crane.formats": "load write_machine write_mjcf write_urdf_plus",
     "crane.formats.adding": "add_cylinder add_loops",
@@ -141,12 +143,14 @@ _HOMES = {
 }
 
 __all__ = [
-    "Batch", "Calibration", "Closure", "Command", "Comparison", "ComputedTorque", "Contact",
+    "Batch", "Buckling",
+    "Calibration", "Closure", "Command", "Comparison", "ComputedTorque", "Contact",
     "Controller", "CraneError", "CraneWarning", "Cutting", "Dynamics", "EndStop", "Excitation",
     "ExternalForce", "ForceElement", "Friction", "GasSpring", "Gradient", "Ground",
     "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel", "Machine", "PDGains",
-    "PI", "PIGains", "Payload", "PowerAccount", "Pushing", "Reactions", "Recording", "Rope", "SOILS",
-    "Sampled", "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy",
+    "PI", "PIGains", "Payload", "PowerAccount", "Pushing", "Reactions",
+    "Recording", "Rope", "SOILS", "Sampled",
+    "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy",
     "TipVelocity", "Trajectory", "Turning", "ValveDrive", "ValveFeedforward", "ValvePD",
     "Workspace", "Wrench", "add_cylinder", "add_loops", "calibrate", "casadi_function", "check",
     "cross_validate", "excite", "excite_valves", "fastest", "gradient", "identify",

@@ -348,6 +348,7 @@ def _motor(joint: str, cylinder: dict[str, Any]) -> dict[str, Any]:
     own = {"displacement": cylinder["area_a"], "volume": cylinder["hose_a"]}
     own |= {key: cylinder[name] for key, name in MOTOR.items() if name is not None}
     usual = _all_numbers(Cylinder(joint, *2 * [own["displacement"]], *2 * [own["volume"]]))
+    usual["count"] = 1
     for name in cylinder.keys() - own.keys():
         if cylinder[name] != usual[name]:
             raise InputError(
@@ -359,7 +360,12 @@ def _motor(joint: str, cylinder: dict[str, Any]) -> dict[str, Any]:
 
 def _cylinder(cylinder: Cylinder) -> dict[str, Any]:
     fitted = {key: getattr(cylinder, key) for key in HOLDING if getattr(cylinder, key) is not None}
-    return _all_numbers(cylinder) | {key: _all_numbers(valve) for key, valve in fitted.items()}
+    data = _all_numbers(cylinder) | {key: _all_numbers(valve) for key, valve in fitted.items()}
+    # a cylinder that turns its joint has no diameters
+    given = {"tube": cylinder.tube, "count": cylinder.count}
+    usual = {"tube": 0.0, "count": 1}
+    data.pop("tube")
+    return data | {key: value for key, value in given.items() if value != usual[key]}
 
 
 def _valve(valve: Valve, by_flow: bool = True) -> dict[str, Any]:
