@@ -7,6 +7,7 @@ import pytest
 from hanging import joint, limits, link
 from linkages import postures
 from scipy.linalg import null_space
+from test_digits import four_bar, loaded, written
 
 import crane
 from crane import Dynamics, ForceElement, Reactions, Rope
@@ -372,6 +373,20 @@ def test_without_loops_it_is_rnea():
         turn, force = data.oMi[body].rotation, data.f[body]
         assert np.allclose(found[0, body - 1, :3], turn @ force.linear)
         assert np.allclose(found[0, body - 1, 3:], turn @ force.angular)
+
+
+def test_digits_determine_no_more_than_what_was_meant(tmp_path):
+    """Axes that are 3.7e-6 rad off hold nothing out of the plane."""
+    (tmp_path / "meant").mkdir()
+    meant, _ = loaded(written(tmp_path / "meant", four_bar(repr(-np.pi / 2), repr(np.pi / 2))))
+    machine, _ = loaded(written(tmp_path, four_bar("-1.5708", "1.57079")))
+    one, two = Reactions(meant), Reactions(machine)
+    known = one.determined(meant.home)
+    assert not known.all() and (known == two.determined(machine.home)).all()
+    wanted, found = one.at(meant.home), two.at(machine.home)
+    assert np.allclose(found, wanted, atol=1e-4 * np.abs(wanted).max())
+    q_a = machine.home[machine.closure.active]
+    assert np.allclose(two.drives(machine.home), Dynamics(machine).gravity(q_a), rtol=1e-4)
 
 
 def test_a_dead_centre_determines_nothing(tmp_path):

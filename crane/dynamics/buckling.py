@@ -215,14 +215,12 @@ def _column(machine: Machine, cylinder: Cylinder) -> Column | str:
         return "it is in no loop, so it has no pin at either end"
     joint = int(machine.coordinates.joints[index])
     carrier = int(machine.model.parents[joint])
-    pins = []
     for body in (carrier, joint):
         places, turns = zip(*_held(machine, body, joint), strict=True) if body else ((), ())
         if not places or not all(turns):
             return "one of its ends is no pin"
         if np.ptp(places, axis=0).max() > _SAME * machine.closure.size:
             return "one of its ends has more than one pin"
-        pins.append(places[0])
     slide, limits = machine.tree.joints[cylinder.joint], machine.coordinates
     placed = machine.model.jointPlacements[joint]
     return Column(
@@ -231,7 +229,7 @@ def _column(machine: Machine, cylinder: Cylinder) -> Column | str:
         cylinder.bore,
         cylinder.rod,
         cylinder.tube,
-        placed.act(pins[1]) - pins[0],
+        placed.act(places[0]),  # the carrier's own joint is where its frame is
         placed.rotation @ np.array(slide.axis),
         float(limits.lower[index]),
         float(limits.upper[index]),
