@@ -176,9 +176,17 @@ def test_a_tube_that_cannot_be_is_told(more, line):
 def test_tubes_and_counts_are_written_and_read(tmp_path):
     machine = crane.load("excavator")
     crane.write_machine(machine, tmp_path)
-    again = crane.load(next(tmp_path.glob("*.yaml")))
+    file = next(tmp_path.glob("*.yaml"))
+    again = crane.load(file)
     one, two = machine.hydraulics.cylinders, again.hydraulics.cylinders
     assert {x: (c.tube, c.count) for x, c in one.items()} == {
         "slew": (0.0, 1), "X_boom": (0.145, 2), "X_arm": (0.168, 1), "X_bucket": (0.145, 1),
     }  # fmt: skip
     assert one == two
+    text = file.read_text()
+    start = text.index("slew", text.index("cylinders:"))
+    turning = text[:start] + text[start:].replace("tube: 0.0", "tube: 0.3", 1)
+    assert turning != text
+    file.write_text(turning)
+    with pytest.raises(CraneError, match="cylinder of 'slew' turns its joint"):
+        crane.load(file)

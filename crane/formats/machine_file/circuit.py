@@ -264,7 +264,7 @@ def _areas(item: Section, turning: bool) -> dict[str, Any]:
         raise item.fail("count", f"'count' of {item.title} is {count:g}, give a whole number")
     if turning:
         for key in (*_BORED, "tube"):
-            if key in item:
+            if key in item and (key != "tube" or item.number(key)):
                 raise item.fail(
                     key, f"{item.title} turns its joint, give area_a and area_b [m3/rad]"
                 )

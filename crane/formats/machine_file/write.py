@@ -361,11 +361,7 @@ def _motor(joint: str, cylinder: dict[str, Any]) -> dict[str, Any]:
 def _cylinder(cylinder: Cylinder) -> dict[str, Any]:
     fitted = {key: getattr(cylinder, key) for key in HOLDING if getattr(cylinder, key) is not None}
     data = _all_numbers(cylinder) | {key: _all_numbers(valve) for key, valve in fitted.items()}
-    # a cylinder that turns its joint has no diameters
-    given = {"tube": cylinder.tube, "count": cylinder.count}
-    usual = {"tube": 0.0, "count": 1}
-    data.pop("tube")
-    return data | {key: value for key, value in given.items() if value != usual[key]}
+    return data | ({"count": cylinder.count} if cylinder.count > 1 else {})
 
 
 def _valve(valve: Valve, by_flow: bool = True) -> dict[str, Any]:
