@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         ComputedTorque,
         Controller,
         Law,
+        Phases,
         Sampled,
         Signals,
         TipVelocity,
@@ -31,8 +32,9 @@ if TYPE_CHECKING:
         Rope,
         Sensor,
     )
-    from crane.description.external import ExternalForce, Pushing, Wrench
+    from crane.description.external import ExternalForce, PhasedWrench, Pushing, Wrench
     from crane.description.ground import Contact, Ground
+    from crane.description.phases import Phase
     from crane.description.soil import SOILS, Cutting, Soil
     from crane.dynamics import Dynamics
     from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
@@ -103,10 +105,11 @@ LOADED = time.time()  # before any other file of the package was read
 _HOMES = {
     "crane.closure": "Closure",
     "crane.common.errors": "CraneError CraneWarning",
-    "crane.control": "PI Command ComputedTorque Controller Law Sampled Signals TipVelocity "
+    "crane.control": "PI Command ComputedTorque Controller Law Phases Sampled Signals TipVelocity "
     "ValveDrive ValveFeedforward ValvePD fastest joystick",
     "crane.description": "EndStop ForceElement Friction GasSpring PIGains Rope Sensor",
-    "crane.description.external": "ExternalForce Pushing Wrench",
+    "crane.description.phases": "Phase",
+    "crane.description.external": "ExternalForce PhasedWrench Pushing Wrench",
     "crane.description.ground": "Contact Ground",
     "crane.description.soil": "SOILS Cutting Soil",
     "crane.dynamics": "Dynamics",
@@ -145,10 +148,11 @@ __all__ = [
     "Contact", "Controller", "CraneError", "CraneWarning", "Cutting", "Dynamics", "EndStop",
     "Excitation", "ExternalForce", "ForceElement", "Friction", "GasSpring", "Gradient", "Ground",
     "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel", "Machine", "PDGains",
-    "PI", "PIGains", "Payload", "PowerAccount", "Pushing", "Recording", "Rope", "Rule", "SOILS",
-    "Sampled", "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study", "Sway",
-    "SwayStudy", "TipVelocity", "Trajectory", "Turning", "ValveDrive", "ValveFeedforward",
-    "ValvePD", "Workspace", "Wrench", "add_cylinder", "add_loops", "calibrate", "capacity",
+    "PI", "PIGains", "Payload", "Phase", "PhasedWrench", "Phases", "PowerAccount", "Pushing",
+    "Recording", "Rope", "Rule", "SOILS", "Sampled", "Sensitivities", "Sensor",
+    "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy", "TipVelocity",
+    "Trajectory", "Turning", "ValveDrive", "ValveFeedforward", "ValvePD", "Workspace", "Wrench",
+    "add_cylinder", "add_loops", "calibrate", "capacity",
     "casadi_function", "check", "cross_validate", "excite", "excite_valves", "fastest",
     "gradient", "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
     "identify_valve", "joystick", "linear_models", "linearize", "load", "point_to_point",

@@ -118,7 +118,8 @@ class ValveDrive(Law):
             out += [pump.share, pump.shaft]
         if self.circuit.hydraulics.engine is not None and instant.pumps:
             out.append(instant.speed * self.circuit.hydraulics.engine.speed)
-        return out
+        m = len(self._which)
+        return [*out, *at.reference[m : m + len(self.command.channels)]]
 
     def _at(self, at: At) -> tuple[Instant, Sequence[Number]]:
         """The circuit, and the signals of its valves."""
@@ -155,7 +156,7 @@ class ValveDrive(Law):
             found += [(f"share_{name}", ""), (f"shaft_{name}", "W")]
         if self.circuit.hydraulics.engine is not None and self.circuit.pumps:
             found.append(("engine_speed", "rad/s"))
-        return tuple(found)
+        return (*found, *self.command.channels)
 
     @property
     def _others(self) -> list[str]:
