@@ -90,6 +90,7 @@ if TYPE_CHECKING:
     from crane.simulation.symbolic import casadi_function
     from crane.studies import (
         PowerAccount,
+        PowerComparison,
         Study,
         SwayStudy,
         power_account,
@@ -138,7 +139,7 @@ _HOMES = {
     "crane.simulation": "Batch Comparison Gradient InterruptedRun LinearModel Sensitivities "
     "gradient linear_models linearize replay sensitivities simulate simulate_batch",
     "crane.simulation.symbolic": "casadi_function",
-    "crane.studies": "PowerAccount Study SwayStudy power_account study sway_study",
+    "crane.studies": "PowerAccount PowerComparison Study SwayStudy power_account study sway_study",
     "crane.view.page": "report",
     "crane.view.sketch": "sketch sketch_circuit",
 }
@@ -148,18 +149,18 @@ __all__ = [
     "Contact", "Controller", "CraneError", "CraneWarning", "Cutting", "Dynamics", "EndStop",
     "Excitation", "ExternalForce", "ForceElement", "Friction", "GasSpring", "Gradient", "Ground",
     "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel", "Machine", "PDGains",
-    "PI", "PIGains", "Payload", "Phase", "PhasedWrench", "Phases", "PowerAccount", "Pushing",
-    "Recording", "Rope", "Rule", "SOILS", "Sampled", "Sensitivities", "Sensor",
-    "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy", "TipVelocity",
+    "PI", "PIGains", "Payload", "Phase", "PhasedWrench", "Phases", "PowerAccount",
+    "PowerComparison", "Pushing", "Recording", "Rope", "Rule", "SOILS", "Sampled", "Sensitivities",
+    "Sensor", "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy", "TipVelocity",
     "Trajectory", "Turning", "ValveDrive", "ValveFeedforward", "ValvePD", "Workspace", "Wrench",
-    "add_cylinder", "add_loops", "calibrate", "capacity",
-    "casadi_function", "check", "cross_validate", "excite", "excite_valves", "fastest",
-    "gradient", "identify", "identify_cylinder_friction", "identify_orifices", "identify_payload",
-    "identify_valve", "joystick", "linear_models", "linearize", "load", "point_to_point",
-    "polynomial", "power_account", "read_measured", "read_path", "replay", "report", "retimed",
-    "sensitivities", "simulate", "simulate_batch", "sketch", "sketch_circuit", "study",
-    "sway_study", "task_trajectory", "tip_trajectory", "via_attitudes", "via_points",
-    "without_sway", "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
+    "add_cylinder", "add_loops", "calibrate", "capacity", "casadi_function", "check",
+    "cross_validate", "excite", "excite_valves", "fastest", "gradient", "identify",
+    "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
+    "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
+    "power_account", "read_measured", "read_path", "replay", "report", "retimed", "sensitivities",
+    "simulate", "simulate_batch", "sketch", "sketch_circuit", "study", "sway_study",
+    "task_trajectory", "tip_trajectory", "via_attitudes", "via_points", "without_sway",
+    "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 
