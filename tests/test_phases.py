@@ -282,6 +282,11 @@ def test_phases_in_python(machine):
     assert jump[1] == pytest.approx(0.1 + 0.9 * 0.6) and set(np.round(jump, 9)) <= {0.0, 0.64}
     with pytest.raises(crane.CraneError, match="no valve for 'z', known: x, y"):
         crane.Phases(machine, [crane.Phase("out", {"z": 0.6}, {"z": 0.3}, 5.0)])
+    command, rest = crane.Phases(machine, phases), np.zeros((2, 2))
+    for time in (0.0, 0.01, 0.01):
+        command.update(time, np.array([0.2, 0.2]), np.zeros(2), rest)
+    with pytest.raises(crane.CraneError, match="levers by positions do not go back"):
+        command.update(0.005, np.array([0.2, 0.2]), np.zeros(2), rest)
     with pytest.raises(crane.CraneError, match="there are no phases of levers"):
         crane.Phases(machine, [])
     with pytest.raises(crane.CraneError, match="the ramp of the levers is -1 s, give at least 0"):

@@ -90,12 +90,17 @@ class Phases(Command):
         """See `Command`.
 
         Raises:
-            SimulationError: A phase takes longer than it may.
+            SimulationError: A phase takes longer than it may, or the run goes back in time.
         """
-        if time == self._time and time > 0:
-            return  # asked again, in other coordinates
-        if time <= self._time or not time:
+        if not time:
             self._reset()
+        elif time == self._time:
+            return  # asked again, in other coordinates
+        elif time < self._time:  # where branches of motion cross, a run looks back
+            raise SimulationError(
+                f"at t = {time:.6g} s: the linkage comes to where it could go on in "
+                "several ways, and levers by positions do not go back: give levers over time"
+            )
         now = {joint: float(q[column]) for joint, column in self._columns.items()}
         if self._index < 0:
             self._enter(0, time, now)
