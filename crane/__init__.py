@@ -99,6 +99,7 @@ if TYPE_CHECKING:
         study,
         sway_study,
     )
+    from crane.studies.design import Design, design
     from crane.view.page import report
     from crane.view.sketch import sketch, sketch_circuit
 
@@ -144,13 +145,14 @@ _HOMES = {
     "gradient linear_models linearize replay sensitivities simulate simulate_batch",
     "crane.simulation.symbolic": "casadi_function",
     "crane.studies": "PowerAccount PowerComparison Study SwayStudy power_account study sway_study",
+    "crane.studies.design": "Design design",
     "crane.view.page": "report",
     "crane.view.sketch": "sketch sketch_circuit",
 }
 
 __all__ = [
     "Batch", "Buckling", "Calibration", "Capacity", "Closure", "Command", "Comparison",
-    "ComputedTorque", "Contact", "Controller", "CraneError", "CraneWarning", "Cutting",
+    "ComputedTorque", "Contact", "Controller", "CraneError", "CraneWarning", "Cutting", "Design",
     "Dynamics", "EndStop", "Excitation", "ExternalForce", "ForceElement", "Friction", "GasSpring",
     "Gradient", "Ground", "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel",
     "Machine", "PDGains", "PI", "PIGains", "Payload", "Phase", "PhasedWrench", "Phases",
@@ -158,7 +160,7 @@ __all__ = [
     "SOILS", "Sampled", "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study",
     "Sway", "SwayStudy", "TipVelocity", "Torques", "Trajectory", "Turning", "ValveDrive",
     "ValveFeedforward", "ValvePD", "Workspace", "Wrench", "add_cylinder", "add_loops",
-    "calibrate", "capacity", "casadi_function", "check", "cross_validate", "excite",
+    "calibrate", "capacity", "casadi_function", "check", "cross_validate", "design", "excite",
     "excite_valves", "fastest", "gradient", "identify", "identify_cylinder_friction",
     "identify_orifices", "identify_payload", "identify_valve", "joystick", "linear_models",
     "linearize", "load", "point_to_point", "polynomial", "power_account", "read_measured",

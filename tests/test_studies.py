@@ -194,7 +194,7 @@ def test_hydraulics_change_no_forces_of_a_given_motion(name):
         ("x=1:2:0", None, "'0' is no count"),
         ("x=1:2:1", None, "one value cannot be both ends"),
         ("x=1~2", None, "say how often with --draws"),
-        ("x=1:2:3", 5, "--draws needs a range, give x=low~high"),
+        ("x=1:2:3", 5, "give a range, x=low~high"),
         ("x=2~1", 5, "2 is not below 1"),
         ("x=1~2~3", 5, "a range has two ends"),
     ],

@@ -1,58 +1,77 @@
-"""The command that changes parameters: study."""
+"""The command that finds numbers of a machine: design."""
 
 import os
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from crane.cli.shared import (
+    Change,
     Force,
+    Lock,
     MachineName,
     Out,
     app,
+    load,
     progress_bar,
 )
 
 
 @app.command()
-def study(
+def design(
     machine: MachineName,
     out: Out,
     vary: Annotated[
-        list[str],
-        typer.Option(
-            metavar="NAME=VALUES",
-            help="A parameter and its values start:stop:count, or with --draws low~high.",
-        ),
+        list[str], typer.Option(metavar="NAME=LOW~HIGH", help="A number and its range.")
     ],
+    minimise: Annotated[
+        list[str] | None, typer.Option(metavar="EXPRESSION", help="What shall be the least.")
+    ] = None,
+    maximise: Annotated[
+        list[str] | None, typer.Option(metavar="EXPRESSION", help="What shall be the largest.")
+    ] = None,
+    require: Annotated[
+        list[str] | None, typer.Option(metavar="A>=B", help="What has to hold, or A<=B.")
+    ] = None,
+    measures: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.py", help="Measures of your own: functions of a machine."),
+    ] = None,
+    frame: Annotated[
+        str | None, typer.Option(metavar="LINK", help="Where loads hang; the tip if not given.")
+    ] = None,
+    rule: Annotated[str, typer.Option(help="By which loads are rated.")] = "none",
     task: Annotated[
-        list[str] | None, typer.Option(help="A task to measure with; all if not given.")
+        list[str] | None, typer.Option(help="A task for forces and energy; all if not given.")
     ] = None,
-    measure: Annotated[
-        list[str] | None, typer.Option(help="What to report, such as peak_X2; all if not given.")
-    ] = None,
-    draws: Annotated[int | None, typer.Option(help="Number of random variants.")] = None,
-    seed: Annotated[int, typer.Option(help="Of the random variants.")] = 0,
+    starts: Annotated[int, typer.Option(help="Number of searches.")] = 10,
+    points: Annotated[int, typer.Option(help="Of the front, with several goals.")] = 15,
+    seed: Annotated[int, typer.Option(help="Of the starts.")] = 0,
     processes: Annotated[
         int | None, typer.Option(help="To compute with; one per core if not given.")
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster to compute on.")
     ] = None,
+    change: Change = None,
+    lock: Lock = None,
     force: Force = False,
 ) -> None:
-    """Measure variants of a machine: any parameters over a grid or at random."""
-    from crane.cli.ranges import ranges
-    from crane.cli.runs import check_folder, write_study
-    from crane.studies import study as run
+    """Find the numbers of a machine that are best for loads, forces or measures of your own."""
+    from crane.cli.ranges import drawn
+    from crane.cli.runs import check_folder, write_design
+    from crane.studies.design import design as run
 
     check_folder(out, force)
-    axes = ranges(vary, draws)
-    with progress_bar("computing variants") as progress:
-        result = run(
-            machine, axes, task, measure, draws=draws, seed=seed, scheduler=scheduler,
+    loaded = load(machine, lock, change)
+    with progress_bar("searching") as progress:
+        found = run(
+            loaded, drawn(vary), minimise=minimise or (), maximise=maximise or (),
+            require=require or (), measures=measures, frame=frame, rule=rule, tasks=task,
+            starts=starts, points=points, seed=seed, scheduler=scheduler,
             processes=(os.cpu_count() or 1) if processes is None else processes,
             progress=progress,
         )  # fmt: skip
-    write_study(out, result)
-    print(f"{result.to_text()}\nwritten to {out}")
+    write_design(out, found)
+    print(f"{found.to_markdown()}\nwritten to {out}")

@@ -26,6 +26,7 @@ from crane.cli import (  # noqa: F401  register their commands
     sensitivities,
     simulate,
     stability,
+    study,
     sway,
     workspace,
 )

@@ -27,9 +27,22 @@ def ranges(texts: Sequence[str], draws: int | None = None) -> dict[str, Array]:
         if "~" in values and draws is None:
             raise InputError(f"--vary {text}: a range is drawn from, say how often with --draws")
         if "~" not in values and draws is not None:
-            raise InputError(f"--vary {text}: --draws needs a range, give {name}=low~high")
+            raise InputError(f"--vary {text}: give a range, {name}=low~high")
         out[name] = _drawn(text, values) if draws is not None else _values(text, values)
     return out
+
+
+def drawn(texts: Sequence[str]) -> dict[str, tuple[float, float]]:
+    """Ranges by name, from "NAME=low~high".
+
+    Raises:
+        InputError: Something else is written.
+    """
+    found = {}
+    for name, ends in ranges(texts, draws=1).items():
+        low, high = ends.tolist()
+        found[name] = low, high
+    return found
 
 
 def _numbers(text: str, words: list[str], form: str) -> list[float]:

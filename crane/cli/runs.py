@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from crane.motion.workspaces import Workspace
     from crane.simulation.linear import LinearModel
     from crane.simulation.sensitivity import Sensitivities
+    from crane.studies.design import Design
     from crane.studies.power import PowerAccount
     from crane.studies.power_comparison import PowerComparison
 
@@ -128,6 +129,26 @@ def write_study(folder: Path, study: Study) -> None:
     with staging(folder) as part:
         study.to_csv(part / "study.csv")
         plot_study(study, part / "study.png")
+
+
+def write_design(folder: Path, found: "Design") -> None:
+    """Write report, table, picture and the best machine into a folder, created if there is none.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.formats import write_machine
+    from crane.view.plots.design import plot_design
+
+    with staging(folder) as part:
+        (part / "design.md").write_text(found.to_markdown(), encoding="utf-8")
+        found.to_csv(part / "solutions.csv")
+        plot_design(found, part / "design.png")
+        try:
+            write_machine(found.variant(), part / "machine")
+        except InputError as error:
+            text = f"the machine is not written, take its numbers from design.md: {error}"
+            warnings.warn(text, CraneWarning, stacklevel=2)
 
 
 def write_workspace(folder: Path, space: "Workspace") -> str:

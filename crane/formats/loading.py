@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from weakref import WeakKeyDictionary
 
 import pinocchio as pin
 
@@ -72,10 +73,14 @@ def load(
         return replace(machine, packages=said.packages, arguments=MappingProxyType(said.arguments))
 
 
+# What machines were made of before changes and locks, so that `Variants` need not read it again.
+_UNCHANGED: WeakKeyDictionary[Closure, MachineSpec] = WeakKeyDictionary()
+
+
 class Variants:
     """The machines that differ from one in their numbers alone.
 
-    Its files are read once.
+    Its files are not read again, unless its loops were closed anew since it was loaded.
 
     Args:
         machine: As it was loaded; what was put onto it or replaced since is not in its files.
@@ -88,7 +93,7 @@ class Variants:
     def __init__(self, machine: Machine):
         self._machine = machine
         with few_warnings(), self._giving():
-            unchanged = _described(
+            unchanged = _UNCHANGED.get(machine.closure) or _described(
                 machine.reference,
                 machine.chosen.get("active"),
                 machine.chosen.get("free"),
@@ -158,7 +163,7 @@ def _assembled(
     floating: bool | tuple[str, ...],
     near: Closure | None = None,
 ) -> Machine:
-    said = {"active": active, "free": free}
+    said, unchanged = {"active": active, "free": free}, spec
     if changes:
         spec = changed(spec, changes)
     if lock:
@@ -167,6 +172,7 @@ def _assembled(
     closure = (
         _closed(spec, model) if near is None else near.near(model, spec.loops, spec.couplings)
     )
+    _UNCHANGED[closure] = unchanged
     check_masses(spec, model, closure)
     check_elements(spec, closure)
     coordinates = closure.equations.coordinates

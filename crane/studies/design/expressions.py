@@ -15,7 +15,7 @@ _OPERATORS: dict[type, Callable[[Any, Any], Any]] = {
     ast.Pow: lambda a, b: a**b,
 }
 _LONGEST = 2000  # characters
-_COMPARES = ("<=", ">=")
+_COMPARES = ("<=", ">=", "==")
 
 
 class Expression:
@@ -117,20 +117,20 @@ class Expression:
                 raise refuse(f"'{ast.unparse(node)}'")
 
 
-def requirement(text: str) -> tuple[Expression, str]:
-    """What has to be at least 0, from "LEFT >= RIGHT" or "LEFT <= RIGHT", and how it was written.
+def requirement(text: str) -> tuple[Expression, bool]:
+    """What has to be at least 0, or 0, from "A >= B", "A <= B" or "A == B"; and whether it is 0.
 
     Raises:
         InputError: It is no such comparison.
     """
-    for sign in _COMPARES:
-        left, found, right = text.partition(sign)
-        if found and not any(other in right for other in _COMPARES):
-            one, two = (left, right) if sign == ">=" else (right, left)
-            for side in (left, right):
-                Expression(side)
-            return Expression(f"({one.strip()}) - ({two.strip()})"), text.strip()
-    raise InputError(f"'{text}' requires nothing, write A >= B or A <= B")
+    signs = [sign for sign in _COMPARES if sign in text]
+    sides = text.split(signs[0]) if len(signs) == 1 else []
+    if len(sides) != 2:
+        raise InputError(f"'{text}' requires nothing, write A >= B, A <= B or A == B")
+    one, two = reversed(sides) if signs[0] == "<=" else sides
+    for side in sides:
+        Expression(side)
+    return Expression(f"({one.strip()}) - ({two.strip()})"), signs[0] == "=="
 
 
 def _dotted(node: ast.AST) -> str:

@@ -40,6 +40,7 @@ class Job(NamedTuple):
         high: (k,) their upper ends.
         goals: Expressions, the least of which is sought.
         requires: Expressions that must not be below 0.
+        equal: Which of them have to be 0.
         frame: Of `Terms`.
         rule: Likewise.
         tasks: Likewise.
@@ -58,6 +59,7 @@ class Job(NamedTuple):
     high: Array
     goals: tuple[str, ...]
     requires: tuple[str, ...]
+    equal: tuple[bool, ...]
     frame: str | None
     rule: str
     tasks: tuple[str, ...]
@@ -76,7 +78,7 @@ class Solution(Brief):
         start: (k,) where it began.
         values: (k,) numbers.
         goals: (m,) values of the goals, as they were written.
-        slacks: (r,) what is left of each requirement.
+        slacks: (r,) what is left of each requirement, of "A == B" -|A - B|; below 0 it fails.
         fits: Whether all requirements hold.
         says: How it ended.
     """
@@ -216,7 +218,7 @@ def design(
         vary: By name of a number its range.
         minimise: Goals whose least value is sought.
         maximise: Goals whose largest value is sought.
-        require: "A >= B" or "A <= B".
+        require: "A >= B", "A <= B" or "A == B".
         measures: Functions of a machine by name, or a Python file that defines them.
         frame: Where loads hang; the tip if not given.
         rule: By which they are rated.
@@ -251,7 +253,8 @@ def design(
     name = base.reference if base.reference == str(machine) else str(base.path.resolve())
     blank = Job(
         name, dict(base.changes), dict(base.locks), names, low, high, texts,
-        tuple(x.text for x, _ in needs), frame, told, chosen, path, np.zeros(len(names)),
+        tuple(x.text for x, _ in needs), tuple(equal for _, equal in needs), frame, told, chosen,
+        path, np.zeros(len(names)),
     )  # fmt: skip
     own = np.array([Variants(base).values[x] for x in names])
     before = _judged(Searched(blank), own, own, "as it is")
@@ -284,7 +287,7 @@ def design(
     signs = np.array([1.0 if way == "minimise" else -1.0 for way, _ in goals])
     return Design(
         base, names, low, high, tuple(f"{way} {text}" for way, text in goals),
-        tuple(text for _, text in needs), _signed(before, signs),
+        tuple(x.strip() for x in require), _signed(before, signs),
         tuple(_signed(x, signs) for x in ordered), terms,
     )  # fmt: skip
 
@@ -301,6 +304,7 @@ class Searched:
         self.requires = [Expression(text) for text in job.requires]
         self._terms = Terms(job.frame, job.rule, job.tasks, own_measures(job.own))
         self._places = places_in([*self.goals, *self.requires])
+        self._kept: Point | None = None
         self._last: tuple[bytes, list[Dual] | CraneError] = b"", []
 
     def at(self, values: Array) -> list[Dual]:
@@ -319,6 +323,7 @@ class Searched:
                         self._places,
                     )  # fmt: skip
                     found = [point.dual(x) for x in (*self.goals, *self.requires)]
+                self._kept = point  # and its machine code, for the next variant
                 self._last = values.tobytes(), found
             except CraneError as error:
                 self._last = values.tobytes(), error
@@ -381,6 +386,7 @@ def searched(job: Job) -> Solution:
         return float(found[0][0]), found[1][0]
 
     def left(x: Array) -> Array:
+        """Goals below the last variable, where there are several, then requirements."""
         found = shares(x)
         if found is None:
             return np.full(len(needs) + (count if many else 0), -_WALL)
@@ -402,7 +408,12 @@ def searched(job: Job) -> Solution:
     if many:
         value = np.array([d.value for d in first[:count]])
         x = np.r_[x, (weights * (value - ideal) / sizes).max()]
-    constraints: Any = [{"type": "ineq", "fun": left, "jac": left_slopes}] if many or needs else []
+    equal = np.r_[np.zeros(count if many else 0, dtype=bool), np.array(job.equal, dtype=bool)]
+    constraints: Any = [
+        {"type": kind, "fun": lambda x, k=k: left(x)[k], "jac": lambda x, k=k: left_slopes(x)[k]}
+        for kind, k in (("ineq", np.flatnonzero(~equal)), ("eq", np.flatnonzero(equal)))
+        if len(k)
+    ]
     bounds = [(0.0, 1.0)] * len(span) + ([(None, None)] if many else [])
     ended = minimize(
         cost, x, jac=True, bounds=bounds, constraints=constraints, method="SLSQP",
@@ -424,7 +435,9 @@ def _judged(problem: Searched, start: Array, values: Array, says: str) -> Soluti
     sizes = [
         max(abs(x.value), float(np.abs(x.slopes * span).max(initial=0.0))) for x in found[count:]
     ]
+    equal = np.array(problem.job.equal, dtype=bool)
     slacks = np.array([x.value for x in found[count:]])
+    slacks = np.where(equal, -np.abs(slacks), slacks)
     fits = bool((slacks >= -_SLACK * np.array(sizes)).all())
     return Solution(start, values, np.array([x.value for x in found[:count]]), slacks, fits, says)
 

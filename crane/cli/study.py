@@ -1,0 +1,58 @@
+"""The command that changes parameters: study."""
+
+import os
+from typing import Annotated
+
+import typer
+
+from crane.cli.shared import (
+    Force,
+    MachineName,
+    Out,
+    app,
+    progress_bar,
+)
+
+
+@app.command()
+def study(
+    machine: MachineName,
+    out: Out,
+    vary: Annotated[
+        list[str],
+        typer.Option(
+            metavar="NAME=VALUES",
+            help="A parameter and its values start:stop:count, or with --draws low~high.",
+        ),
+    ],
+    task: Annotated[
+        list[str] | None, typer.Option(help="A task to measure with; all if not given.")
+    ] = None,
+    measure: Annotated[
+        list[str] | None, typer.Option(help="What to report, such as peak_X2; all if not given.")
+    ] = None,
+    draws: Annotated[int | None, typer.Option(help="Number of random variants.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the random variants.")] = 0,
+    processes: Annotated[
+        int | None, typer.Option(help="To compute with; one per core if not given.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster to compute on.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Measure variants of a machine: any parameters over a grid or at random."""
+    from crane.cli.ranges import ranges
+    from crane.cli.runs import check_folder, write_study
+    from crane.studies import study as run
+
+    check_folder(out, force)
+    axes = ranges(vary, draws)
+    with progress_bar("computing variants") as progress:
+        result = run(
+            machine, axes, task, measure, draws=draws, seed=seed, scheduler=scheduler,
+            processes=(os.cpu_count() or 1) if processes is None else processes,
+            progress=progress,
+        )  # fmt: skip
+    write_study(out, result)
+    print(f"{result.to_text()}\nwritten to {out}")

@@ -1,0 +1,218 @@
+"""Designs beside linkage problems whose optimum is known, and slopes beside differences."""
+
+import numpy as np
+import pytest
+
+import crane
+from crane.formats.loading import Variants
+from crane.studies.design.dual import FUNCTIONS, Dual
+from crane.studies.design.expressions import Expression, requirement
+from crane.studies.design.quantities import Point, Terms
+
+FOUR_BAR = """<robot name="four_bar">
+<link name="ground"/>{links}
+{joints}
+</robot>"""
+LINK = """
+<link name="{}"><inertial><mass value="1"/><inertia ixx="0.1" iyy="0.1" izz="0.1"
+  ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+JOINT = """<joint name="{}" type="{}"><origin xyz="{} 0 0"/><parent link="{}"/><child link="{}"/>
+  <axis xyz="0 -1 0"/><limit lower="-7" upper="7" effort="1" velocity="1"/></joint>"""
+FILE = """
+name: four_bar
+source: a test
+chains: [{name: all, urdf: four_bar.urdf}]
+loops: [{name: pin, type: revolute, predecessor: coupler_end, successor: rocker_end}]
+active: [crank]
+home: {crank: 1.2, coupler: -0.2, rocker: 1.6}
+tip: coupler_end
+"""
+MEASURES = '''
+"""Of a crank-rocker: how far its transmission angle is from a right one, its swing and timing."""
+import numpy as np
+
+
+def _lengths(machine):
+    """Of ground, crank, coupler and rocker."""
+    joints = machine.tree.joints
+    x = [joints[name].xyz[0] for name in ("rocker", "coupler", "coupler_end", "rocker_end")]
+    return np.abs(x)
+
+
+def _angle(a, b, c):
+    """Between sides a and b of a triangle, in degrees."""
+    return np.degrees(np.arccos((a * a + b * b - c * c) / (2 * a * b)))
+
+
+def deviation(machine):
+    g, r, c, k = _lengths(machine)
+    return max(abs(_angle(c, k, g - r) - 90), abs(_angle(c, k, g + r) - 90))
+
+
+def swing(machine):
+    g, r, c, k = _lengths(machine)
+    return _angle(g, k, c + r) - _angle(g, k, c - r)
+
+
+def timing(machine):
+    g, r, c, k = _lengths(machine)
+    return 180 + _angle(g, c - r, k) - _angle(g, c + r, k)
+'''
+
+
+@pytest.fixture
+def four_bar(tmp_path):
+    links = "".join(LINK.format(x) for x in ("crank", "coupler", "rocker"))
+    links += '<link name="coupler_end"/><link name="rocker_end"/>'
+    joints = "".join(
+        JOINT.format(*x)
+        for x in (
+            ("crank", "continuous", 0, "ground", "crank"),
+            ("coupler", "continuous", 0.35, "crank", "coupler"),
+            ("rocker", "continuous", 1.0, "ground", "rocker"),
+            ("coupler_end", "fixed", 0.9, "coupler", "coupler_end"),
+            ("rocker_end", "fixed", 0.85, "rocker", "rocker_end"),
+        )
+    )
+    (tmp_path / "four_bar.urdf").write_text(FOUR_BAR.format(links=links, joints=joints))
+    (tmp_path / "four_bar.yaml").write_text(FILE)
+    (tmp_path / "measures.py").write_text(MEASURES)
+    return tmp_path / "four_bar.yaml"
+
+
+def test_the_classical_transmission_angle_problem(four_bar):
+    """Freudenstein and Primrose: 45 degrees of swing, 200 of the crank, from ten starts.
+
+    The optimum is one root of a cubic, t = tan(phi/2), u = tan((phi - psi)/2),
+    Q^3 + 2 Q^2 - t^2 Q - (t^2/u^2)(1 + t^2) = 0, coupler/crank = |t| / sqrt(Q).
+    """
+    found = crane.design(
+        four_bar,
+        {"coupler.x": (0.2, 0.5), "coupler_end.x": (0.6, 1.2), "rocker_end.x": (0.6, 1.3)},
+        minimise=["deviation"],
+        require=["swing == 45", "timing == 200"],
+        measures=four_bar.parent / "measures.py",
+        starts=10,
+    )
+    t, u = np.tan(np.deg2rad(100.0)), np.tan(np.deg2rad(77.5))
+    roots = np.roots([1.0, 2.0, -(t**2), -(t**2) / u**2 * (1 + t**2)])
+    q = max(x.real for x in roots if abs(x.imag) < 1e-9 and x.real > 0)
+    assert sum(x.fits for x in found.solutions) >= 8
+    for x in found.solutions:
+        if x.fits:
+            crank, coupler, rocker = x.values
+            assert coupler / crank == pytest.approx(abs(t) / np.sqrt(q), rel=1e-4)
+            assert x.goals[0] == pytest.approx(48.1868, abs=1e-3)
+            assert (crank, coupler, rocker) == pytest.approx(
+                (0.345671, 0.833634, 0.966648), abs=1e-4
+            )
+
+
+def test_a_front_of_two_goals_is_that_of_a_grid():
+    """Bucket linkage: the more reach of the lip, the less load at it; 15 by 15 variants beside."""
+    vary = {"bucket_lip.x": (1.2, 1.7), "arm_crowd.x": (-0.95, -0.7)}
+    goals = ["load(6.5, 1)", "reach"]
+    found = crane.design("excavator", vary, maximise=goals, starts=1, points=6)
+    front = np.array([x.goals for x in found.solutions])
+    assert len(front) >= 5 and np.ptp(front[:, 0]) > 100 and np.ptp(front[:, 1]) > 0.3
+    variants = Variants(crane.load("excavator"))
+    low, high = np.array(list(vary.values())).T
+    expressions = [Expression(goal) for goal in goals]
+    for a in np.linspace(low[0], high[0], 5):
+        for b in np.linspace(low[1], high[1], 5):
+            point = Point(variants, list(vary), np.array([a, b]), high - low, Terms())
+            here = [point.dual(x).value for x in expressions]
+            # none of the grid is better in both than all of the front
+            assert not (np.array(here) > front * (1 + 1e-6)).all(axis=1).any()
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["load(6, 0)", "reach", "highest", "lowest", "nearest(11, 0, 3)", "mass", "peak_X_boom",
+     "sqrt(mass) * reach / (2 + highest**2) - min(reach, mass)",
+     "arm.mass + number('boom_lift.x')"],
+)  # fmt: skip
+def test_slopes_are_those_of_variants_beside(text):
+    names = ["boom_lift.x", "arm.mass", "bucket_lip.x", "upper_boom.z"]
+    variants = Variants(crane.load("excavator"))
+    here = np.array([variants.values[name] for name in names])
+    ranges = np.array([0.5, 100.0, 0.3, 0.2])
+    terms, expression = Terms(frame=None, tasks=("grade",)), Expression(text)
+
+    def at(values):
+        return Point(variants, names, values, ranges, terms).dual(expression)
+
+    found = at(here)
+    for i, step in enumerate(1e-3 * ranges):
+        more, less = (here + sign * step * np.eye(4)[i] for sign in (1, -1))
+        difference = (at(more).value - at(less).value) / (2 * step)
+        scale = max(abs(difference), abs(found.value) * 1e-2 / ranges[i])
+        assert found.slopes[i] == pytest.approx(difference, abs=2e-4 * scale)
+
+
+def test_dual_numbers_are_exact():
+    """By complex steps."""
+    random, step = np.random.default_rng(0), 1e-30
+    text = "exp(0.1*x)*sqrt(y) - x**3/(1 + y) + log(y)*sin(x)*cos(y) + abs(-x) + 2**y + x**y"
+    text += " + max(x, y)"
+    for x, y in random.uniform(0.3, 2.0, (20, 2)):
+        names = {"x": Dual(x, np.array([1.0, 0.0])), "y": Dual(y, np.array([0.0, 1.0]))}
+        found = Expression(text)(
+            names.__getitem__, lambda f, a: FUNCTIONS[f](*a), lambda c: Dual(c, np.zeros(2))
+        )
+        numpy = {name: getattr(np, name) for name in ("exp", "sqrt", "log", "sin", "cos")}
+        numpy |= {
+            "abs": lambda z: -z if z.real < 0 else z,
+            "max": lambda a, b: max(a, b, key=np.real),
+        }
+        for i, (dx, dy) in enumerate(((step, 0), (0, step))):
+            value = eval(text, numpy, {"x": x + 1j * dx, "y": y + 1j * dy})
+            assert found.slopes[i] == pytest.approx(value.imag / step, rel=1e-12)
+        assert found.value == pytest.approx(value.real, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({}, "nothing is sought"),
+        ({"minimise": ["mass +"]}, "is no expression"),
+        ({"minimise": ["__import__('os')"]}, "function '__import__' is unknown"),
+        ({"minimise": ["mass.real.imag"]}, "measure 'mass.real.imag' is unknown"),
+        ({"minimise": ["[1]"]}, r"has '\[1\]'"),
+        ({"minimise": ["load(1)"]}, "takes 2 or 3 arguments"),
+        ({"minimise": ["mas"]}, "measure 'mas' is unknown, did you mean 'mass'"),
+        ({"minimise": ["mass"], "require": ["mass"]}, "requires nothing"),
+        ({"minimise": ["mass"], "require": ["reach >= 50"]}, "'reach >= 50' lacks 40"),
+        ({"minimise": ["mass"], "tasks": ["walk"]}, "task 'walk' is unknown"),
+        ({"minimise": ["mass"], "rule": "iso"}, "rule 'iso' is unknown"),
+        (
+            {"minimise": ["own"], "measures": {"own": lambda machine: 1 / 0}},
+            "measure 'own': ZeroDiv",
+        ),
+    ],
+)
+def test_what_cannot_be_designed_is_said_in_one_line(given, told):
+    with pytest.raises(crane.CraneError, match=told) as error:
+        crane.design("excavator", {"arm.mass": (700.0, 900.0)}, starts=1, **given)
+    assert "\n" not in str(error.value)
+
+
+def test_requirements_are_differences():
+    for text, value, equal in (("3 >= 2", 1, False), ("3 <= 2", -1, False), ("3 == 2", 1, True)):
+        expression, same = requirement(text)
+        assert (expression(float, None), same) == (value, equal)
+
+
+def test_the_command_writes_machine_table_and_picture(four_bar, tmp_path):
+    out = tmp_path / "out"
+    text = said(
+        "design", str(four_bar), "--vary", "coupler.x=0.3~0.4", "--minimise", "deviation",
+        "--require", "swing >= 40", "--measures", str(four_bar.parent / "measures.py"),
+        "--starts", "2", "--processes", "1", "--out", str(out),
+    )  # fmt: skip
+    assert "minimise deviation" in text
+    best = crane.load(next((out / "machine").glob("*.yaml")))
+    assert 0.3 <= best.tree.joints["coupler"].xyz[0] <= 0.4
+    assert (out / "design.png").stat().st_size > 5000
+    rows = (out / "solutions.csv").read_text().splitlines()
+    assert len([x for x in rows if not x.startswith("#")]) == 3
