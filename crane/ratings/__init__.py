@@ -1,7 +1,12 @@
 """What a machine lifts, how hard it digs, and how far it works."""
 
+from crane.ratings.breakout import Breakout, breakout
 from crane.ratings.lifting import Capacity, capacity
 from crane.ratings.moments import Torques, torques
 from crane.ratings.rules import RULES, Rule
+from crane.ratings.tool import ToolForce, tool_force
 
-__all__ = ["RULES", "Capacity", "Rule", "Torques", "capacity", "torques"]
+__all__ = [
+    "RULES", "Breakout", "Capacity", "Rule", "ToolForce", "Torques", "breakout", "capacity",
+    "tool_force", "torques",
+]  # fmt: skip
