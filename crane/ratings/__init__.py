@@ -5,8 +5,9 @@ from crane.ratings.lifting import Capacity, capacity
 from crane.ratings.moments import Torques, torques
 from crane.ratings.rules import RULES, Rule
 from crane.ratings.tool import ToolForce, tool_force
+from crane.ratings.working_range import WorkingRange, working_range
 
 __all__ = [
-    "RULES", "Breakout", "Capacity", "Rule", "ToolForce", "Torques", "breakout", "capacity",
-    "tool_force", "torques",
+    "RULES", "Breakout", "Capacity", "Rule", "ToolForce", "Torques", "WorkingRange", "breakout",
+    "capacity", "tool_force", "torques", "working_range",
 ]  # fmt: skip

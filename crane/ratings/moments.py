@@ -105,9 +105,7 @@ def torques(
         turns = min(drive.most, -drive.least)
     load, height = _at(machine, statics.frame, radius, rule, friction, places.reach)
     weight = float(np.linalg.norm(machine.model.gravity.linear))
-    return Torques(
-        joint, pin, gross, stroke, radius, load, height, load * weight * radius, turns
-    )
+    return Torques(joint, pin, gross, stroke, radius, load, height, load * weight * radius, turns)
 
 
 def _at(

@@ -13,18 +13,18 @@ _PARALLEL = 1e-6  # rad
 
 
 def pivot(machine: Machine, frame: str, i: int) -> str:
-    """The joint nearest to the ground that carries the frame and that stroke i turns.
+    """The joint that stroke i turns most of those that carry the frame.
 
     Raises:
         InputError: There is none.
     """
     model, moves = machine.model, np.abs(machine.closure.gamma(machine.home)[:, i])
-    least = _TURNS * max(moves.max(), 1.0)
-    for joint in model.supports[model.frames[machine.frame(frame)].parentJoint]:
-        name = model.names[joint]
-        if joint and machine.unit(name) == "rad" and moves[machine.column(name)] > least:
-            return str(name)
-    raise InputError(f"'{machine.active[i]}' turns nothing that carries '{frame}'")
+    supports = list(model.supports[model.frames[machine.frame(frame)].parentJoint])
+    names = [model.names[joint] for joint in supports if joint]
+    rates = {name: moves[machine.column(name)] for name in names if machine.unit(name) == "rad"}
+    if not rates or max(rates.values()) <= _TURNS * max(moves.max(), 1.0):
+        raise InputError(f"'{machine.active[i]}' turns nothing that carries '{frame}'")
+    return max(rates, key=lambda name: rates[name])
 
 
 def turns(machine: Machine, frame: str, q: Array) -> Array:
@@ -57,7 +57,7 @@ def digging(
 ) -> tuple[int, int | None]:
     """The strokes of bucket and arm, among the active joints.
 
-    Of an excavator's front three strokes turn the tip, each about a pivot of its own: the one
+    Of an excavator's front three cylinders turn the tip, each about a pivot of its own: the one
     nearest to the tip is the bucket's, the next one the arm's.
 
     Args:
@@ -69,7 +69,7 @@ def digging(
         The arm's is None where nothing turns the tip but the bucket's.
 
     Raises:
-        InputError: A name that turns nothing, or no bucket: fewer than three strokes.
+        InputError: A name that turns nothing, or no bucket: fewer than three cylinders.
     """
     machine, frame = places.machine, places.statics.frame
     found = turning(places)
@@ -79,14 +79,15 @@ def digging(
             raise InputError(f"'{name}' does not turn '{frame}', {known(names, name)}")
     if bucket is not None and bucket == arm:
         raise InputError(f"'{bucket}' is named as both bucket and arm, name two joints")
-    if bucket is None and len(found) < 3:
-        words = ", ".join(f"{machine.active[i]} about {name}" for i, name in found.items())
+    cylinders = [i for i in found if machine.unit(machine.active[i]) == "m"]
+    if bucket is None and len(cylinders) < 3:
+        words = ", ".join(f"{machine.active[i]} about {found[i]}" for i in cylinders)
         raise InputError(
-            f"'{machine.name}' has no bucket: {len(found)} strokes turn '{frame}' "
-            f"({words or 'none'}), boom, arm and bucket are three; name the one with --bucket"
+            f"'{machine.name}' has no bucket: {len(cylinders)} cylinders turn '{frame}' "
+            f"({words or 'none'}), boom, arm and bucket are three; name its joint with --bucket"
         )
     order = list(found)
-    one = order[-1] if bucket is None else machine.active.index(bucket)
+    one = cylinders[-1] if bucket is None else machine.active.index(bucket)
     if arm is not None:
         return one, machine.active.index(arm)
     before = order[: order.index(one)]

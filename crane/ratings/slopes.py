@@ -27,8 +27,8 @@ _AT_LIMIT = 1e-6  # of a stroke
 def field_slopes(chart: "Field", names: Sequence[str]) -> Array:
     """Derivatives of a field's values by numbers of the machine, places held still.
 
-    With p a number, a posture of the largest value m is stationary under the place x(q_A, p) and under
-    limits of the strokes,
+    With p a number, a posture of the largest value m is stationary under the place x(q_A, p) and
+    under limits of the strokes,
 
         sum mu_k dm_k/dq + lambda^T dx/dq + sum nu_j e_j = 0,    sum mu_k = 1,
 
