@@ -18,6 +18,7 @@ from crane.ratings.seeking import Measured, Seeker, difference
 _BELOW = 1e-6  # [m] that is no depth
 _ALONG = 9  # places of a wall or a bottom at which it is looked whether the lip gets there
 _SAME = 1e-9  # [m]
+_DIGITS = 12  # behind the point: what is below is rounding
 
 
 class Dimension(NamedTuple):
@@ -84,8 +85,7 @@ class Dimensions:
         )  # fmt: skip
         if self._pin is not None:
             found.append(self._dump(self._pin))
-        if slews:
-            found.append(self._front())
+            found.append(self._front() if slews else None)
         yield from (one for one in found if one is not None)
 
     def _far(self, name: str, goal: Goal, axis: int, sign: float, says: str) -> Dimension | None:
@@ -97,8 +97,11 @@ class Dimensions:
         if found is None:
             return None
         value, q = found
-        place = self._lip.rough(q[None])[0]
-        return Dimension(name, value, place, q[self.machine.closure.active].copy(), says)
+        q_a = np.round(q[self.machine.closure.active], _DIGITS) + 0.0
+        return Dimension(name, value, self._place(self._lip, q), q_a, says)
+
+    def _place(self, frame: Measured, q: Array) -> Array:
+        return np.asarray(np.round(frame.rough(q[None])[0], _DIGITS) + 0.0)
 
     def _on_ground(self) -> Dimension | None:
         found = self._seeker.most(
@@ -229,7 +232,7 @@ class Dimensions:
             "smallest front slewing radius", (radius, posture),
             "least radius that holds the lip and all pins of the front",
         )  # fmt: skip
-        return one and one._replace(place=pin.rough(posture[None])[0])
+        return one and one._replace(place=self._place(pin, posture))
 
 
 def _pins(machine: Machine, frame: str) -> list[str]:

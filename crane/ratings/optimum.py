@@ -71,13 +71,14 @@ def strongest(places: Places, causes: Causes, q: Array, strokes: list[int]) -> A
             row[-1] = causes.terms(bound, here)[1][0] * first
         return -rows / size[:, None]
 
-    up = np.zeros(len(strokes) + 1)
-    up[-1] = -1.0
+    def cost(y: Any) -> tuple[float, Any]:
+        return -float(y[-1]), -np.eye(len(y))[-1]
+
     constraints: Any = {"type": "ineq", "fun": left, "jac": slopes}
+    bounds: Any = [*[(0.0, 1.0)] * len(strokes), (0.0, None)]
     found = minimize(
-        lambda y: -y[-1], np.r_[(q[active][strokes] - low) / span, 1.0], jac=lambda _: up,
-        bounds=[*[(0.0, 1.0)] * len(strokes), (0.0, None)], constraints=[constraints],
-        method="SLSQP", options={"ftol": 1e-14, "maxiter": 200},
+        cost, np.r_[(q[active][strokes] - low) / span, 1.0], jac=True, bounds=bounds,
+        constraints=[constraints], method="SLSQP", options={"ftol": 1e-14, "maxiter": 200},
     )  # fmt: skip
     there, here, _ = at(np.asarray(found.x))
     return there if least(here) > first else q

@@ -1,5 +1,6 @@
 """Tool forces: how hard a machine pushes at a frame, all over its reach, and what ends it."""
 
+import dataclasses
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -23,7 +24,13 @@ DIRECTIONS = ("up", "down", "in", "out", "tangent", "-tangent", "normal", "-norm
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ToolForce(Field):
-    """Tool forces over reach and height [N], see `Field`."""
+    """Tool forces over reach and height [N], see `Field`.
+
+    Attributes:
+        direction: In which the tool pushes, in words.
+    """
+
+    direction: str = ""
 
     quantity: ClassVar[tuple[str, str]] = ("force", "N")
 
@@ -31,6 +38,35 @@ class ToolForce(Field):
     def forces(self) -> Array:
         """(s, b, a) the largest forces [N]: its values."""
         return self.values
+
+    def notes(self) -> dict[str, str]:
+        """Its direction."""
+        return {"direction": self.direction}
+
+    def to_markdown(self) -> str:
+        """A summary: the largest force and where, and how often each cause ends it."""
+        counts = "weights and tipping count" if self.weights else "weights left out"
+        working = ", ".join(self.working)
+        lines = [
+            f"# Tool force of {self.machine.name}, {self.direction}\n",
+            f"At `{self.frame}`; working {working}; {counts}, friction left out.\n",
+            "| slew [deg] | largest [kN] | radius [m] | height [m] | ends by |",
+            "| --- | --- | --- | --- | --- |",
+        ]
+        for turn, forces, cause in zip(self.slews, self.forces, self.cause, strict=True):
+            shown = np.where(np.isfinite(forces), forces, -np.inf)
+            b, a = np.unravel_index(int(shown.argmax()), shown.shape)
+            if not np.isfinite(shown[b, a]):
+                continue
+            lines.append(
+                f"| {np.rad2deg(turn):.4g} | {shown[b, a] / 1e3:.2f} | {self.radii[a]:.4g} | "
+                f"{self.heights[b]:.4g} | {self.causes[cause[b, a]]} |"
+            )
+        lines += ["", "| ends by | of the places |", "| --- | --- |"]
+        reached = np.isfinite(self.q_a[..., 0]).sum()
+        for k in self.ends:
+            lines.append(f"| {self.causes[k]} | {100 * (self.cause == k).sum() / reached:.3g} % |")
+        return "\n".join([*lines, ""])
 
     def ways(self) -> Array:
         """(s, b, a, 2) unit vectors of the tool's pushing, in the section; NaN out of reach."""
@@ -88,10 +124,19 @@ def tool_force(
     action, alone = _action(places, direction, joint)
     if working is None:
         working = machine.driven_joints if alone is None else [alone]
-    return charted(
+    found = charted(
         ToolForce, places, action, rule_of("none"), working, weights=weights, slews=slews,
         step=step, radii=radii, heights=heights,
     )  # fmt: skip
+    return dataclasses.replace(found, direction=_words(direction, action, machine))
+
+
+def _words(direction: str | Sequence[float], action: Action, machine: Machine) -> str:
+    if not isinstance(direction, str):
+        return "({:g}, {:g}, {:g})".format(*direction)
+    return direction + (
+        f" of {machine.active[action.stroke]}" if isinstance(action, Along) else ""
+    )
 
 
 def tangent(places: Places, i: int) -> Along:

@@ -29,6 +29,7 @@ class WorkingRange(Brief):
         ground: Height of the ground [m].
         space: What the frame reaches.
         bucket: Joint of the bucket, None where there is none.
+        level: Length of the level bottom [m].
         dimensions: The numbers.
     """
 
@@ -37,6 +38,7 @@ class WorkingRange(Brief):
     ground: float
     space: Workspace
     bucket: str | None
+    level: float
     dimensions: tuple[Dimension, ...]
 
     def __getitem__(self, name: str) -> Dimension:
@@ -91,7 +93,7 @@ def working_range(
 
     Every number is an optimum over all strokes within their limits, with exact slopes, from
     several postures (`crane.motion.workspaces.extremes.farthest`); the slewing joint stays at
-    home. Without a bucket there are reach, depth, height and the slewing radius alone.
+    home. Without a bucket there are reach, depth and height alone.
 
     Args:
         machine: The machine.
@@ -119,7 +121,7 @@ def working_range(
             raise
     ground = _ground(machine)
     dimensions = tuple(Dimensions(space, ground, pin).all(level))
-    return WorkingRange(machine, space.frame, ground, space, joint, dimensions)
+    return WorkingRange(machine, space.frame, ground, space, joint, level, dimensions)
 
 
 def _ground(machine: Machine) -> float:
