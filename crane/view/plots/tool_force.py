@@ -42,7 +42,7 @@ def tool_force_figure(field: ToolForce) -> Figure:
     ways = field.ways()
     top = float(np.nanmax(np.where(np.isfinite(field.forces), field.forces, np.nan))) / 1e3
     with mpl.rc_context(STYLE):
-        height = np.clip(4.2 * tall / max(wide, 1e-9), 2.6, 6.5) * count + 1.2
+        height = np.clip(4.2 * tall / max(wide, 1e-9), 2.6, 6.5) * count + 2.0
         figure = Figure(figsize=(9.6, float(height)), layout="constrained")
         grid = figure.subplots(count, 2, squeeze=False, sharex=True, sharey=True)
         with np.errstate(invalid="ignore"):
