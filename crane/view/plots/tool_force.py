@@ -63,7 +63,10 @@ def tool_force_figure(field: ToolForce) -> Figure:
                                      colors="white", linewidths=0.7)  # fmt: skip
                 left.clabel(lines, fmt="%g", fontsize=7)
             _arrows(left, field, forces, ways[s], top)
-            figure.colorbar(mesh, ax=left, label="force [kN]", pad=0.01).outline.set_visible(False)
+            bar = figure.colorbar(
+                mesh, cax=left.inset_axes((1.03, 0.03, 0.04, 0.94)), label="force [kN]"
+            )
+            bar.outline.set_visible(False)
             which = np.full(forces.shape, np.nan)
             for j, k in enumerate(ends):
                 which[first[s] == k] = j
