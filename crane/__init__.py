@@ -71,7 +71,19 @@ if TYPE_CHECKING:
         without_sway,
     )
     from crane.motion.workspaces import Workspace, workspace
-    from crane.ratings import Capacity, Rule, Torques, capacity, torques
+    from crane.ratings import (
+        Breakout,
+        Capacity,
+        Rule,
+        ToolForce,
+        Torques,
+        WorkingRange,
+        breakout,
+        capacity,
+        tool_force,
+        torques,
+        working_range,
+    )
     from crane.recordings import Recording
     from crane.recordings.measured import read_measured
     from crane.simulation import (
@@ -138,7 +150,8 @@ _HOMES = {
     "crane.motion": "Kinematics Sway Trajectory Turning point_to_point polynomial read_path "
     "retimed task_trajectory tip_trajectory via_attitudes via_points without_sway",
     "crane.motion.workspaces": "Workspace workspace",
-    "crane.ratings": "Capacity Rule Torques capacity torques",
+    "crane.ratings": "Breakout Capacity Rule ToolForce Torques WorkingRange breakout capacity "
+    "tool_force torques working_range",
     "crane.recordings": "Recording",
     "crane.recordings.measured": "read_measured",
     "crane.simulation": "Batch Comparison Gradient InterruptedRun LinearModel Sensitivities "
@@ -151,23 +164,24 @@ _HOMES = {
 }
 
 __all__ = [
-    "Batch", "Buckling", "Calibration", "Capacity", "Closure", "Command", "Comparison",
-    "ComputedTorque", "Contact", "Controller", "CraneError", "CraneWarning", "Cutting", "Design",
-    "Dynamics", "EndStop", "Excitation", "ExternalForce", "ForceElement", "Friction", "GasSpring",
-    "Gradient", "Ground", "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel",
-    "Machine", "PDGains", "PI", "PIGains", "Payload", "Phase", "PhasedWrench", "Phases",
-    "PowerAccount", "PowerComparison", "Pushing", "Reactions", "Recording", "Rope", "Rule",
-    "SOILS", "Sampled", "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study",
-    "Sway", "SwayStudy", "TipVelocity", "Torques", "Trajectory", "Turning", "ValveDrive",
-    "ValveFeedforward", "ValvePD", "Workspace", "Wrench", "add_cylinder", "add_loops",
-    "calibrate", "capacity", "casadi_function", "check", "cross_validate", "design", "excite",
-    "excite_valves", "fastest", "gradient", "identify", "identify_cylinder_friction",
-    "identify_orifices", "identify_payload", "identify_valve", "joystick", "linear_models",
-    "linearize", "load", "point_to_point", "polynomial", "power_account", "read_measured",
-    "read_path", "replay", "report", "retimed", "sensitivities", "simulate", "simulate_batch",
-    "sketch", "sketch_circuit", "study", "sway_study", "task_trajectory", "tip_trajectory",
-    "torques", "via_attitudes", "via_points", "without_sway", "workspace", "write_machine",
-    "write_mjcf", "write_urdf_plus",
+    "Batch", "Breakout", "Buckling", "Calibration", "Capacity", "Closure", "Command",
+    "Comparison", "ComputedTorque", "Contact", "Controller", "CraneError", "CraneWarning",
+    "Cutting", "Design", "Dynamics", "EndStop", "Excitation", "ExternalForce", "ForceElement",
+    "Friction", "GasSpring", "Gradient", "Ground", "Identification", "InterruptedRun",
+    "Kinematics", "Law", "LinearModel", "Machine", "PDGains", "PI", "PIGains", "Payload", "Phase",
+    "PhasedWrench", "Phases", "PowerAccount", "PowerComparison", "Pushing", "Reactions",
+    "Recording", "Rope", "Rule", "SOILS", "Sampled", "Sensitivities", "Sensor",
+    "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy", "TipVelocity",
+    "ToolForce", "Torques", "Trajectory", "Turning", "ValveDrive", "ValveFeedforward", "ValvePD",
+    "WorkingRange", "Workspace", "Wrench", "add_cylinder", "add_loops", "breakout", "calibrate",
+    "capacity", "casadi_function", "check", "cross_validate", "design", "excite", "excite_valves",
+    "fastest", "gradient", "identify", "identify_cylinder_friction", "identify_orifices",
+    "identify_payload", "identify_valve", "joystick", "linear_models", "linearize", "load",
+    "point_to_point", "polynomial", "power_account", "read_measured", "read_path", "replay",
+    "report", "retimed", "sensitivities", "simulate", "simulate_batch", "sketch",
+    "sketch_circuit", "study", "sway_study", "task_trajectory", "tip_trajectory", "tool_force",
+    "torques", "via_attitudes", "via_points", "without_sway", "working_range", "workspace",
+    "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 

@@ -78,6 +78,10 @@ CALLS = {
         "--stroke 0.25 --out {out}.yaml",
     ],
     "add loops": ["slider.yaml --out {out}.yaml"],
+    "breakout": [
+        "patu655 --bucket X_tilt --out {out}",
+        "patu655 --direction up --step 2 --out {out}",
+    ],
     "list": [""],
     "info": ["slider.yaml", "rig.yaml"],
     "check": ["slider.yaml", "rig.yaml"],
@@ -116,6 +120,7 @@ CALLS = {
     ],
     "stability": ["excavator --task dig"],
     "sway": ["patu655_grapple --task swing --payload 200 --damping 0"],
+    "working-range": ["patu655 --out {out}"],
     "workspace": ["slider.yaml --samples 100 --out {out}", "rig.yaml --samples 100 --out {out}"],
 }
 # Calls that once ended in a traceback, in silence or never.

@@ -11,6 +11,7 @@ import typer
 import crane
 from crane.cli import (  # noqa: F401  register their commands
     add,
+    breakout,
     calibrate,
     check,
     circuit,
@@ -28,6 +29,7 @@ from crane.cli import (  # noqa: F401  register their commands
     stability,
     study,
     sway,
+    working_range,
     workspace,
 )
 from crane.cli.shared import INTERRUPTED, app, say

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from crane.identification.calibration.result import Calibration
     from crane.identification.mechanics.result import Identification
     from crane.motion.workspaces import Workspace
+    from crane.ratings import Breakout, ToolForce, WorkingRange
     from crane.simulation.linear import LinearModel
     from crane.simulation.sensitivity import Sensitivities
     from crane.studies.design import Design
@@ -168,6 +169,59 @@ def write_workspace(folder: Path, space: "Workspace") -> str:
         space.curves_to_csv(part / "curves.csv")
         (part / "workspace.md").write_text(text, encoding="utf-8")
         plot_workspace(space, part / "workspace.png")
+    return text
+
+
+def write_breakout(folder: Path, found: "Breakout") -> str:
+    """Write the table of break-out forces into a folder, created where there is none.
+
+    Returns:
+        The table, Markdown.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    text = found.to_markdown()
+    with staging(folder) as part:
+        (part / "breakout.md").write_text(text, encoding="utf-8")
+    return text
+
+
+def write_tool_force(folder: Path, field: "ToolForce") -> str:
+    """Write table, summary and picture of tool forces into a folder, created where there is none.
+
+    Returns:
+        The summary, Markdown.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.plots.tool_force import plot_tool_force
+
+    text = field.to_markdown()
+    with staging(folder) as part:
+        (part / "tool_force.md").write_text(text, encoding="utf-8")
+        field.to_csv(part / "tool_force.csv")
+        plot_tool_force(field, part / "tool_force.png")
+    return text
+
+
+def write_working_range(folder: Path, found: "WorkingRange") -> str:
+    """Write tables and picture of a working range into a folder, created where there is none.
+
+    Returns:
+        The table, Markdown.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.plots.working_range import plot_working_range
+
+    text = found.to_markdown()
+    with staging(folder) as part:
+        (part / "working_range.md").write_text(text, encoding="utf-8")
+        found.to_csv(part / "working_range.csv")
+        plot_working_range(found, part / "working_range.png")
     return text
 
 

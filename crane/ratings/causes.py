@@ -1,16 +1,16 @@
-"""What ends a load: drives, tipping lines, and pins."""
+"""What ends a load or a force: drives, and tipping lines."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
-from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.dynamics.stability import Stability, has_supports
 from crane.dynamics.statics import AtRest, Statics
 from crane.machine import Machine
 from crane.motion.workspaces.section import upwards
+from crane.ratings.actions import Action
 from crane.ratings.cones import largest
 from crane.ratings.rules import Rule
 from crane.ratings.strength import Strength
@@ -53,22 +53,26 @@ class Bound(NamedTuple):
 
 
 class Causes:
-    """The load at a frame that a machine holds, cause by cause, at rest.
+    """The load or force at a frame that a machine holds, cause by cause, at rest.
 
-    Drives have to hold its weight and that of the load m, tipping lines have to keep their moment,
+    With x its magnitude and e what acts on the frame per magnitude (gravity g of a load in kg, a
+    unit vector of a force in N), drives have to hold it and the machine's weight, tipping lines
+    have to keep their moment,
 
-        least <= tau(m) <= most,   tau(m) = -(ds/dq + m dp/dq)^T g - gamma^T f,
-        w . [(s - M p_1) x -g + m (p - p_1) x -g] >= 0,
+        least <= tau(x) <= most,   tau(x) = -(ds/dq)^T g - x (dp/dq)^T e - gamma^T f,
+        w . [(s - M p_1) x -g + x (p - p_1) x -e] >= 0,
 
     with the first moment s and the mass M of the machine, the frame's place p, and w the direction
     of a line through p_1, as in `Stability`. On a slope g leans by its angle to any side: what is
-    least over all sides is a cone in m, see `crane.ratings.cones`.
+    least over all sides is a cone in x, see `crane.ratings.cones`.
 
     Args:
         statics: The machine and the frame.
         strengths: Of its drives.
         rule: What share counts.
+        action: What acts on the frame.
         slope: Of the ground [rad].
+        weights: Whether the machine has its weight; without, nothing tips.
 
     Attributes:
         all: The causes.
@@ -76,15 +80,20 @@ class Causes:
     """
 
     def __init__(
-        self, statics: Statics, strengths: Iterable[Strength], rule: Rule, slope: float = 0.0
+        self,
+        statics: Statics,
+        strengths: Iterable[Strength],
+        rule: Rule,
+        action: Action,
+        slope: float = 0.0,
+        weights: bool = True,
     ):
         machine = self.machine = statics.machine
-        self._up = upwards(machine)
-        weight = float(np.linalg.norm(machine.model.gravity.linear))
-        if not weight:
-            raise InputError(f"'{machine.name}' has no gravity, a load has no weight there")
+        self.action, self._up = action, upwards(machine)
+        weight = weights * float(np.linalg.norm(machine.model.gravity.linear))
+        self._lean = np.tan(slope)
         self._down, self._aside = weight * np.cos(slope), weight * np.sin(slope)
-        drives, lines = list(strengths), list(lines_of(machine))
+        drives, lines = list(strengths), list(lines_of(machine)) if weights else []
         self.all = tuple(
             [Cause(x.joint, x.why, rule.hydraulic) for x in drives]
             + [Cause(x.name, TIPS, rule.tipping) for x in lines]
@@ -94,42 +103,71 @@ class Causes:
         ] + [Bound(k, None, line, -1.0) for k, line in enumerate(lines, start=len(drives))]
         self.shares = np.array([cause.share for cause in self.all])
 
-    def loads(self, at: AtRest) -> Array:
-        """The load (N, K) [kg] of each cause, times its share; infinite where it never ends."""
+    def largest(self, at: AtRest, angles: Array | None = None) -> Array:
+        """The magnitude (N, K) [kg], [N] of each cause, times its share; infinite without end.
+
+        Args:
+            at: The machine at rest.
+            angles: (N,) by which it is slewed from home; 0 if not given.
+        """
         out = np.full((len(at.mass), len(self.all)), np.inf)
         for bound in self.bounds:
-            end = self.end(self.terms(bound, at))
+            end = self.end(self.terms(bound, at, angles))
             out[:, bound.cause] = np.minimum(out[:, bound.cause], end)
         return np.asarray(out * self.shares)
 
     def end(self, terms: tuple[Array, ...]) -> Array:
-        """The load (N,) at which a bound of these terms ends."""
+        """The magnitude (N,) at which a bound of these terms ends."""
         a, b, c, d = terms
         return largest(a, b, c, d) if self._aside else largest(a, b)
 
-    def terms(self, bound: Bound, at: AtRest, still: float = 1.0) -> tuple[Array, ...]:
-        """What a bound's a, b (N,), c and d (N, 3) are; linear in `at` but for what stands still.
+    def terms(self, bound: Bound, at: AtRest, angles: Array | None = None) -> tuple[Array, ...]:
+        """What a bound's a, b (N,), c and d (N, 3) are: a + b x + |c + d x| <= 0."""
+        angles = np.zeros(len(at.mass)) if angles is None else angles
+        weighs, lever, rest = self._levers(bound, at, 1.0)
+        return self._terms(bound, weighs, rest, [(lever, self.action.unit(at, angles))])
 
-        Args:
-            bound: One of `bounds`.
-            at: The machine at rest, or derivatives of it.
-            still: 0 for derivatives: what does not depend on the posture is left out.
+    def changes(
+        self, bound: Bound, at: AtRest, by: AtRest, angles: Array | None = None
+    ) -> tuple[Array, ...]:
+        """Derivatives of `terms`, with those of the machine at rest by one number."""
+        angles = np.zeros(len(at.mass)) if angles is None else angles
+        unit, moved = self.action.unit(at, angles), self.action.change(at, by, angles)
+        weighs, lever, rest = self._levers(bound, by, 0.0)
+        pairs = [(lever, unit), (self._levers(bound, at, 1.0)[1], moved)]
+        return self._terms(bound, weighs, rest, pairs)
+
+    def _terms(
+        self, bound: Bound, weighs: Array, rest: Array, pairs: list[tuple[Array, Array]]
+    ) -> tuple[Array, ...]:
+        """With pairs of levers and units whose products are summed."""
+        rises = weighs @ self._up
+        a, c = self._down * rises, self._aside * (weighs - rises[:, None] * self._up)
+        b, d = np.zeros(len(rises)), np.zeros_like(c)
+        for lever, unit in pairs:
+            if self.action.weight:  # of a load, which leans with the ground
+                down = -(unit @ self._up) / np.hypot(1.0, self._lean)
+                rises = lever @ self._up
+                b = b + down * rises
+                d = d + self._lean * down[:, None] * (lever - rises[:, None] * self._up)
+            else:
+                b = b - (lever * unit).sum(axis=1)
+        return bound.sign * (a + rest), bound.sign * b, c, d
+
+    def _levers(self, bound: Bound, at: AtRest, still: float) -> tuple[Array, Array, Array]:
+        """Of the weight (N, 3), of what acts (N, 3), and the rest (N,).
+
+        Linear in `at` but for what stands still, which is left out of derivatives.
         """
         if bound.drive is not None:
             i = bound.drive.column
-            weighs, lifts, rest = at.slopes[:, :, i], at.ways[:, :, i], -at.passive[:, i]
+            rest = -at.passive[:, i]
             rest = rest - still * (bound.drive.most if bound.sign > 0 else bound.drive.least)
-        else:
-            assert bound.line is not None
-            foot, way = bound.line.foot, bound.line.way
-            weighs = np.cross(way, at.moment - at.mass[:, None] * foot)
-            lifts, rest = np.cross(way, at.tip - still * foot), np.zeros(len(at.mass))
-        out = []
-        for vectors in (weighs, lifts):
-            rises = vectors @ self._up
-            out.append((self._down * rises, self._aside * (vectors - rises[:, None] * self._up)))
-        (a, c), (b, d) = out
-        return bound.sign * (a + rest), bound.sign * b, c, d
+            return at.slopes[:, :, i], at.ways[:, :, i], rest
+        assert bound.line is not None
+        foot, way = bound.line.foot, bound.line.way
+        weighs = np.cross(way, at.moment - at.mass[:, None] * foot)
+        return weighs, np.cross(way, at.tip - still * foot), np.zeros(len(at.mass))
 
 
 class Line(NamedTuple):

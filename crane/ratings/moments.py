@@ -11,6 +11,7 @@ from crane.dynamics.statics import Statics
 from crane.machine import Machine
 from crane.motion.workspaces.section import slewing
 from crane.ratings.lifting import capacity, raiser
+from crane.ratings.pivots import pivot
 from crane.ratings.places import Places
 from crane.ratings.rules import Rule, rule_of
 from crane.ratings.strength import strengths
@@ -77,8 +78,8 @@ def torques(
     if joint not in found:
         raise InputError(f"nothing limits '{joint}', give it a cylinder, or an effort in <limit>")
     i = machine.active.index(joint)
-    pivot = _pivot(machine, statics.frame, i)
-    column = machine.column(pivot)
+    pin = pivot(machine, statics.frame, i)
+    column = machine.column(pin)
     home = machine.home[machine.closure.active]
 
     def torque(stroke: float) -> float:
@@ -104,19 +105,7 @@ def torques(
         turns = min(drive.most, -drive.least)
     load, height = _at(machine, statics.frame, radius, rule, friction, places.reach)
     weight = float(np.linalg.norm(machine.model.gravity.linear))
-    return Torques(
-        joint, pivot, gross, stroke, radius, load, height, load * weight * radius, turns
-    )
-
-
-def _pivot(machine: Machine, frame: str, i: int) -> str:
-    """The joint nearest to the ground that carries the frame and that stroke i turns."""
-    model, moves = machine.model, machine.closure.gamma(machine.home)[:, i]
-    for joint in model.supports[model.frames[machine.frame(frame)].parentJoint]:
-        name = model.names[joint]
-        if joint and machine.unit(name) == "rad" and abs(moves[machine.column(name)]) > 0:
-            return str(name)
-    raise InputError(f"'{machine.active[i]}' turns nothing that carries '{frame}'")
+    return Torques(joint, pin, gross, stroke, radius, load, height, load * weight * radius, turns)
 
 
 def _at(

@@ -1,4 +1,4 @@
-"""How rated loads change with numbers of the machine, exactly."""
+"""How rated loads and forces change with numbers of the machine, exactly."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -12,26 +12,27 @@ from crane.common.samples import Array
 from crane.dynamics.named import Named
 from crane.dynamics.statics import AtRest, Statics
 from crane.machine import Machine
+from crane.ratings.actions import slewed
 from crane.ratings.causes import Causes, lines_of
 from crane.ratings.places import Places
 from crane.ratings.strength import strengths
 
 if TYPE_CHECKING:
-    from crane.ratings.lifting import Capacity
+    from crane.ratings.field import Field
 
 _EQUAL = 1e-6  # of a load: causes that end it together
 _AT_LIMIT = 1e-6  # of a stroke
 
 
-def load_slopes(chart: "Capacity", names: Sequence[str]) -> Array:
-    """Derivatives of a chart's loads by numbers of the machine, places held still.
+def field_slopes(chart: "Field", names: Sequence[str]) -> Array:
+    """Derivatives of a field's values by numbers of the machine, places held still.
 
-    With p a number, a posture of the most load m is stationary under the place x(q_A, p) and under
-    limits of the strokes,
+    With p a number, a posture of the largest value m is stationary under the place x(q_A, p) and
+    under limits of the strokes,
 
         sum mu_k dm_k/dq + lambda^T dx/dq + sum nu_j e_j = 0,    sum mu_k = 1,
 
-    over causes k that end the load together and strokes j at their limits, so that
+    over causes k that end it together and strokes j at their limits, so that
 
         dm/dp = sum mu_k dm_k/dp + lambda^T dx/dp,
 
@@ -39,11 +40,11 @@ def load_slopes(chart: "Capacity", names: Sequence[str]) -> Array:
     the frame, lambda follows from them alone.
 
     Args:
-        chart: See `crane.capacity`.
+        chart: See `crane.capacity`, `crane.tool_force`.
         names: Numbers of the machine, such as "boom_eye.x".
 
     Returns:
-        (s, b, a, k) [kg] per unit of each number; NaN where there is no load, or no end to it.
+        (s, b, a, k) per unit of each number; NaN where there is no value, or no end to it.
 
     Raises:
         InputError: There is no such number, or it moves a support.
@@ -51,29 +52,29 @@ def load_slopes(chart: "Capacity", names: Sequence[str]) -> Array:
     machine, names = chart.machine, list(names)
     statics = Statics(machine, chart.frame)
     places = Places(statics)
-    drives = strengths(machine, chart.raising, chart.friction)
-    causes = Causes(statics, drives, chart.rule, chart.slope)
+    drives = strengths(machine, chart.working, chart.friction)
+    causes = Causes(statics, drives, chart.rule, chart.action, chart.slope, chart.weights)
     named = Named(machine)
     of_drives = named.slopes(names, lambda variant: _drives(variant, chart))
     if np.any(named.slopes(names, _supports)):
         raise InputError("a number that moves the supports cannot be varied here, leave it out")
-    out = np.full((*chart.loads.shape, len(names)), np.nan)
-    here = np.argwhere(np.isfinite(chart.loads) & (chart.loads > 0))
+    out = np.full((*chart.values.shape, len(names)), np.nan)
+    here = np.argwhere(np.isfinite(chart.values) & (chart.values > 0))
     if not len(here) or not names:
         return out
     s, b, a = here.T
     q_a = np.ascontiguousarray(chart.q_a[s, b, a])
     q = machine.closure.solve(q_a)
     at, by_q, by_p = statics.at(q), statics.derivatives(q), statics.by_numbers(q, names)
-    loads = chart.loads[s, b, a]
+    angles = slewed(machine, chart.frame, places.section, chart.slews[s])
+    loads = chart.values[s, b, a]
     each = {}  # by bound: derivatives of its load by q_A (N, n) and by numbers (N, k)
     ends = np.empty((len(here), len(causes.bounds)))
     for j, bound in enumerate(causes.bounds):
-        parts = causes.terms(bound, at)
+        parts = causes.terms(bound, at, angles)
         x = causes.end(parts)
         ends[:, j] = x * causes.shares[bound.cause]
-        per_q = _slopes(causes, j, x, parts, by_q)
-        per_p = _slopes(causes, j, x, parts, by_p)
+        per_q, per_p = (_slopes(causes, j, x, parts, at, by, angles) for by in (by_q, by_p))
         if bound.drive is not None:  # what its strength changes by
             k = 2 * drives.index(bound.drive) + (bound.sign < 0)
             with np.errstate(divide="ignore", invalid="ignore"):
@@ -137,23 +138,31 @@ def _unit(x: Array, c: Array, d: Array) -> Array:
     return whole / np.where(length > 0, length, 1.0)
 
 
-def _slopes(causes: Causes, j: int, x: Array, parts: tuple[Array, ...], by: AtRest) -> Array:
+def _slopes(
+    causes: Causes,
+    j: int,
+    x: Array,
+    parts: tuple[Array, ...],
+    at: AtRest,
+    by: AtRest,
+    angles: Array,
+) -> Array:
     """Derivatives (N, k) of the load at which bound j ends, by k numbers or strokes."""
     unit, rate = _unit(x, *parts[2:]), _rate(x, parts)
     x = np.where(np.isfinite(x), x, 0.0)
     columns = []
     for k in range(by.mass.shape[-1]):
         one = AtRest(*(part[..., k] for part in by))
-        a, b, c, d = causes.terms(causes.bounds[j], one, still=0.0)
+        a, b, c, d = causes.changes(causes.bounds[j], at, one, angles)
         moved = a + b * x + (unit * (c + d * x[:, None])).sum(axis=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
             columns.append(-moved / rate)
     return np.stack(columns, axis=-1)
 
 
-def _drives(machine: Machine, chart: "Capacity") -> Array:
+def _drives(machine: Machine, chart: "Field") -> Array:
     """What its drives push and pull at most."""
-    found = strengths(machine, chart.raising, chart.friction)
+    found = strengths(machine, chart.working, chart.friction)
     return np.array([x for drive in found for x in (drive.most, drive.least)])
 
 

@@ -14,10 +14,12 @@ from crane.motion.workspaces.probe import Probe
 from crane.motion.workspaces.result import Curve, Extreme
 
 Goal = Callable[[Array], tuple[float, Array]]
+Demand = tuple[str, Goal]  # "eq": the goal is 0, "ineq": it is at least 0
 
 # in rad and shares of the machine's size
 _STEP = 1e-6  # of the differences that give the slope of a determinant
 _OPEN = 1e-9  # residual of the loops up to which an extreme is one
+_MISSED = 1e-9  # of a demand that is met
 _WAY, _ITERATIONS = 8, 6  # points of the way to a singular posture, steps of Newton's method
 _BESIDE = 0.3  # of the length of that way, how far it may be from a straight one
 
@@ -59,7 +61,12 @@ def extremes(
 
 
 def farthest(
-    machine: Machine, q: Array, strokes: Sequence[int], ends: tuple[Array, Array], goal: Goal
+    machine: Machine,
+    q: Array,
+    strokes: Sequence[int],
+    ends: tuple[Array, Array],
+    goal: Goal,
+    demands: Sequence[Demand] = (),
 ) -> tuple[float, Array]:
     """The largest value of a goal near a posture, on its assembly branch and within the limits.
 
@@ -77,9 +84,11 @@ def farthest(
         strokes: Indices of the active joints that move; the others are held.
         ends: Lower and upper limits (n,) of the active coordinates.
         goal: (nq,) -> value, and its slope (nv,) by the joints of the tree.
+        demands: What else has to hold, likewise; lengths in shares of the machine's size.
 
     Returns:
-        The value and its posture (nq,); those of the start where nothing better is found.
+        The value and its posture (nq,); those of the start where nothing better is found, with
+        -inf where that does not meet the demands.
     """
     closure = machine.closure
     moving = closure.active[list(strokes)]
@@ -87,6 +96,7 @@ def farthest(
     low, span = ends[0][list(strokes)], (ends[1] - ends[0])[list(strokes)]
     unit = np.concatenate([span, closure.units[closure.passive]])
     first = goal(q)[0]
+    met = _met(demands, q)
     equations, rows = closure.equations, closure.structure.rows
     size = max(abs(first), 1e-3 * closure.size)  # so that the accuracy asked for is a relative one
 
@@ -109,14 +119,22 @@ def farthest(
         "fun": lambda x: _determinants(machine, posture(x)),
         "jac": lambda x: _slopes(machine, posture(x), free) * unit,
     }
+    others: Any = [
+        {
+            "type": kind,
+            "fun": lambda x, demand=demand: demand(posture(x))[0],
+            "jac": lambda x, demand=demand: demand(posture(x))[1][free] * unit,
+        }
+        for kind, demand in demands
+    ]
     bounds = [
         *zip(low / span, (low + span) / span, strict=True),
         *[(None, None)] * len(closure.passive),
     ]
     for constraints in ([closed], [closed, branch]) if len(rows) else ([],):
         result = minimize(
-            cost, q[free] / unit, jac=True, bounds=bounds, constraints=constraints, method="SLSQP",
-            options={"ftol": 1e-13, "maxiter": 200},
+            cost, q[free] / unit, jac=True, bounds=bounds, constraints=[*constraints, *others],
+            method="SLSQP", options={"ftol": 1e-13, "maxiter": 200},
         )  # fmt: skip
         if len(rows) and (_determinants(machine, posture(result.x)) > 0).all():
             break  # few extremes are at the end of a branch, and its slopes are dear
@@ -126,7 +144,15 @@ def farthest(
     if able or not _leads(machine, reached, target, free):
         target = reached  # closed to rounding
     value = goal(target)[0]
-    return (value, target) if value > first else (first, q)
+    if _met(demands, target) and (value > first or not met):
+        return value, target
+    return (first if met else -np.inf), q
+
+
+def _met(demands: Sequence[Demand], q: Array) -> bool:
+    """Whether a posture meets all demands."""
+    found = [(kind, demand(q)[0]) for kind, demand in demands]
+    return all((abs(x) if kind == "eq" else -x) < _MISSED for kind, x in found)
 
 
 def _leads(machine: Machine, q: Array, target: Array, free: Array) -> bool:

@@ -54,7 +54,7 @@ def workspace_figure(space: Workspace) -> Figure:
     """
     with mpl.rc_context(STYLE):
         low, high = space.places.min(axis=0), space.places.max(axis=0)
-        skeleton = _skeleton(space)
+        skeleton = skeleton_of(space)
         low = np.minimum(low, skeleton.reshape(-1, 2).min(axis=0))
         high = np.maximum(high, skeleton.reshape(-1, 2).max(axis=0))
         tall = np.clip((high - low)[1] / max((high - low)[0], 1e-9), 0.45, 1.5)
@@ -140,7 +140,7 @@ def _home(space: Workspace) -> Array:
     return _tip(space, space.machine.home)
 
 
-def _skeleton(space: Workspace) -> Array:
+def skeleton_of(space: Workspace) -> Array:
     """Lines (k, 2, 2) between the joints of the machine at home, in the section."""
     machine, model = space.machine, space.machine.model
     data = model.createData()
