@@ -12,6 +12,7 @@ import crane
 from crane.cli import (  # noqa: F401  register their commands
     add,
     calibrate,
+    capacity,
     check,
     circuit,
     commands,

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from crane.identification.calibration.result import Calibration
     from crane.identification.mechanics.result import Identification
     from crane.motion.workspaces import Workspace
+    from crane.ratings import Capacity
     from crane.simulation.linear import LinearModel
     from crane.simulation.sensitivity import Sensitivities
     from crane.studies.power import PowerAccount
@@ -146,6 +147,29 @@ def write_workspace(folder: Path, space: "Workspace") -> str:
         space.curves_to_csv(part / "curves.csv")
         (part / "workspace.md").write_text(text, encoding="utf-8")
         plot_workspace(space, part / "workspace.png")
+    return text
+
+
+def write_capacity(folder: Path, chart: "Capacity") -> str:
+    """Write tables, pictures and page of rated loads into a folder, created where there is none.
+
+    Returns:
+        The table with what it holds for, Markdown.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.page.capacity import write_capacity_page
+    from crane.view.plots.capacity import plot_capacity
+    from crane.view.plots.capacity_sheet import plot_sheet
+
+    text = chart.to_markdown()
+    with staging(folder) as part:
+        chart.to_csv(part / "capacity.csv")
+        (part / "capacity.md").write_text(text, encoding="utf-8")
+        plot_capacity(chart, part / "capacity.png")
+        plot_sheet(chart, part / "sheet.pdf")
+        write_capacity_page(chart, part / "capacity.html")
     return text
 
 

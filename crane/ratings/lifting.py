@@ -12,11 +12,14 @@ from crane.common.errors import InputError
 from crane.common.samples import Array, Brief, as_number
 from crane.dynamics.statics import AtRest, Statics
 from crane.machine import Machine
+from crane.motion.workspaces.section import Section
 from crane.ratings.causes import Cause, Causes
 from crane.ratings.places import Places
+from crane.ratings.pressures import chamber_pressures
 from crane.ratings.rules import Rule, rule_of
 from crane.ratings.slopes import load_slopes
 from crane.ratings.strength import strengths
+from crane.ratings.words import to_markdown
 from crane.recordings.timeseries import Table, write
 
 _CELLS = 50  # about how many the larger extent is divided into
@@ -32,6 +35,7 @@ class Capacity(Brief):
     Attributes:
         machine: The machine.
         frame: Where the load hangs.
+        section: The plane of the places.
         rule: By which it is rated.
         raising: Joints whose drives raise the load; others hold.
         slope: Of the ground [rad].
@@ -50,6 +54,7 @@ class Capacity(Brief):
 
     machine: Machine
     frame: str
+    section: Section
     rule: Rule
     raising: tuple[str, ...]
     slope: float
@@ -81,6 +86,26 @@ class Capacity(Brief):
             InputError: There is no such number, or it moves a support.
         """
         return load_slopes(self, names)
+
+    def pressures(self) -> dict[str, Array]:
+        """Pressures that hold the rated loads, see `crane.ratings.pressures`.
+
+        Returns:
+            By joint (s, b, a, 2) of its chambers A and B [Pa].
+        """
+        return chamber_pressures(self)
+
+    def at_places(self, radii: Sequence[float], heights: Sequence[float]) -> "Capacity":
+        """The same at other places, see `capacity`."""
+        slews = None if self.section.slew is None else self.slews.tolist()
+        return capacity(
+            self.machine, self.frame, rule=self.rule, raising=self.raising, slews=slews,
+            slope=self.slope, friction=self.friction, radii=radii, heights=heights,
+        )  # fmt: skip
+
+    def to_markdown(self) -> str:
+        """What the loads hold for, their table as manuals print it, and what ends them."""
+        return to_markdown(self)
 
     def to_csv(self, path: str | Path) -> None:
         """Write a row per place: slew, place, load, cause, loads by cause, active coordinates.
@@ -187,9 +212,9 @@ def capacity(
     first = np.where(np.isfinite(least), np.nan_to_num(each, nan=np.inf).argmin(axis=2), -1)
     shape = (len(turns), b, a)
     return Capacity(
-        machine, statics.frame, rule, tuple(raising), slope, friction, *axes, turns, causes.all,
-        least.reshape(shape), first.reshape(shape), each.reshape(*shape, count),
-        q_a.reshape(*shape, n),
+        machine, statics.frame, places.section, rule, tuple(raising), slope, friction, *axes,
+        turns, causes.all, least.reshape(shape), first.reshape(shape),
+        each.reshape(*shape, count), q_a.reshape(*shape, n),
     )  # fmt: skip
 
 
