@@ -73,16 +73,18 @@ def capacity(
     from math import radians
 
     from crane.cli.runs import check_folder, write_capacity
+    from crane.common.samples import as_number
     from crane.ratings import capacity as rate
 
     check_folder(out, force)
     shares = _rule(rule, hydraulic, tipping)
+    lean = radians(as_number(slope, "--slope", "degrees", most=45.0))
     slews = None if slew is None else [radians(x) for x in _angles(slew)]
     loaded = load(machine, lock, change, active, free, False, packages, argument)
     with status("rating"):
         chart = rate(
             loaded, frame, rule=shares, raising=raising or None, slews=slews,
-            slope=radians(slope), friction=friction, step=step,
+            slope=lean, friction=friction, step=step,
         )  # fmt: skip
     with status("drawing"):
         text = write_capacity(out, chart)

@@ -9,7 +9,7 @@ from crane.common.errors import InputError, known
 from crane.hydraulics.components import Cylinder, Hydraulics
 from crane.machine import Machine
 
-RAISES, HOLDS, MOTOR = "working pressure", "holding pressure", "torque"
+RAISES, HOLDS, MOTOR = "working pressure", "holding pressure", "effort"
 
 
 class Strength(NamedTuple):
