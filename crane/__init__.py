@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from crane.description.ground import Contact, Ground
     from crane.description.soil import SOILS, Cutting, Soil
     from crane.dynamics import Dynamics
+    from crane.dynamics.buckling import Buckling
+    from crane.dynamics.reactions import Reactions
     from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
     from crane.formats.adding import add_cylinder, add_loops
     from crane.formats.check import check
@@ -110,6 +112,8 @@ _HOMES = {
     "crane.description.ground": "Contact Ground",
     "crane.description.soil": "SOILS Cutting Soil",
     "crane.dynamics": "Dynamics",
+    "crane.dynamics.buckling": "Buckling",
+    "crane.dynamics.reactions": "Reactions",
     "crane.formats": "load write_machine write_mjcf write_urdf_plus",
     "crane.formats.adding": "add_cylinder add_loops",
     "crane.formats.check": "check",
@@ -141,22 +145,22 @@ _HOMES = {
 }
 
 __all__ = [
-    "Batch", "Calibration", "Capacity", "Closure", "Command", "Comparison", "ComputedTorque",
-    "Contact", "Controller", "CraneError", "CraneWarning", "Cutting", "Dynamics", "EndStop",
-    "Excitation", "ExternalForce", "ForceElement", "Friction", "GasSpring", "Gradient", "Ground",
-    "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel", "Machine", "PDGains",
-    "PI", "PIGains", "Payload", "PowerAccount", "Pushing", "Recording", "Rope", "Rule", "SOILS",
-    "Sampled", "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study", "Sway",
-    "SwayStudy", "TipVelocity", "Torques", "Trajectory", "Turning", "ValveDrive",
-    "ValveFeedforward", "ValvePD", "Workspace", "Wrench", "add_cylinder", "add_loops",
-    "calibrate", "capacity", "casadi_function", "check", "cross_validate", "excite",
-    "excite_valves", "fastest", "gradient", "identify", "identify_cylinder_friction",
-    "identify_orifices", "identify_payload", "identify_valve", "joystick", "linear_models",
-    "linearize", "load", "point_to_point", "polynomial", "power_account", "read_measured",
-    "read_path", "replay", "report", "retimed", "sensitivities", "simulate", "simulate_batch",
-    "sketch", "sketch_circuit", "study", "sway_study", "task_trajectory", "tip_trajectory",
-    "torques", "via_attitudes", "via_points", "without_sway", "workspace", "write_machine",
-    "write_mjcf", "write_urdf_plus",
+    "Batch", "Buckling", "Calibration", "Capacity", "Closure", "Command", "Comparison",
+    "ComputedTorque", "Contact", "Controller", "CraneError", "CraneWarning", "Cutting",
+    "Dynamics", "EndStop", "Excitation", "ExternalForce", "ForceElement", "Friction", "GasSpring",
+    "Gradient", "Ground", "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel",
+    "Machine", "PDGains", "PI", "PIGains", "Payload", "PowerAccount", "Pushing", "Reactions",
+    "Recording", "Rope", "Rule", "SOILS", "Sampled", "Sensitivities", "Sensor",
+    "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy", "TipVelocity", "Torques",
+    "Trajectory", "Turning", "ValveDrive", "ValveFeedforward", "ValvePD", "Workspace", "Wrench",
+    "add_cylinder", "add_loops", "calibrate", "capacity", "casadi_function", "check",
+    "cross_validate", "excite", "excite_valves", "fastest", "gradient", "identify",
+    "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
+    "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
+    "power_account", "read_measured", "read_path", "replay", "report", "retimed", "sensitivities",
+    "simulate", "simulate_batch", "sketch", "sketch_circuit", "study", "sway_study",
+    "task_trajectory", "tip_trajectory", "torques", "via_attitudes", "via_points", "without_sway",
+    "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import pytest
 
 import crane
 from crane.codegen.casadi_graph import expressions
-from crane.codegen.scalar import Tape, apply, maximum, where_positive, with_sign_of
+from crane.codegen.scalar import Tape, apply, dots, maximum, where_positive, with_sign_of
 from crane.common.errors import CraneError
 from crane.control import Signals, ValveDrive
 from crane.simulation.integration.charts import Chart
@@ -209,3 +209,12 @@ def test_what_cannot_be_is_one_line(log_crane, slider_crank, five_bar, monkeypat
     monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(CraneError, match="install it: pip install 'crane-dynamics.casadi.'"):
         crane.casadi_function(log_crane, "gravity")
+
+
+def test_dots_are_sums_of_products():
+    tape = Tape()
+    x = tape.loads(0, 0, 4)
+    found = expressions(
+        dots([x[0], 2.0, x[1]], [x[1:], [x[3], 0.0, x[0]]]), [[1.0, 2.0, 3.0, 4.0]]
+    )
+    assert [float(value) for value in found] == [1 * 2 + 2 * 3 + 2 * 4, 1 * 4 + 2 * 1]

@@ -13,11 +13,14 @@ import pytest
 
 from crane.codegen import Expression, Program, Tape, largest, maximum
 from crane.codegen.factors import Positive
+from crane.codegen.llvm import formulas as llvm_formulas
+from crane.codegen.llvm.text import text_of
 from crane.codegen.scalar import (
     add,
     apply,
     cross,
     dot,
+    dots,
     product,
     scale,
     solve,
@@ -345,6 +348,60 @@ def test_functions_of_functions_are_taken_in_order():
     )
     backwards = run(lambda x: formulas(x, apply)[::-1], x)
     np.testing.assert_allclose(backwards[::-1], wanted, rtol=3e-15, atol=1e-15)
+
+
+# --- dot products of one vector with several --------------------------------------------------
+
+
+def dotted(x, take, do):
+    """Fifteen dots with one vector, numbers among what is multiplied, then dots of these."""
+    first = [x[0], x[1] * x[2], 3.0, 0.0, do("sin", x[3])]
+    others = [[x[(3 * k + i) % 8] * x[k % 8] for i in range(5)] for k in range(12)]
+    some = [[0.0, 0.0, 0.0, x[5], 0.0], [0.0, x[1], 2.0, x[0], 1.0], [1.0, 2.0, -1.0, 5.0, 0.5]]
+    row = take(first, [*others, *some])
+    again = take(row[:3], [row[3:6], row[6:9], [do("cos", value) for value in row[9:12]]])
+    return [*row, x[4], *again, 1.5, *row[2:7], again[0] * row[1], *take([x[6]], [[x[7]], [x[6]]])]
+
+
+@pytest.mark.parametrize("length", [None, 9])
+def test_dots_are_sums_of_products(length, monkeypatch):
+    """In one piece and in several; side by side in the outputs, and not."""
+    if length is not None:
+        monkeypatch.setattr(llvm_formulas, "WHOLE", length)
+        monkeypatch.setattr(llvm_formulas, "PIECE", length)
+    for x in np.random.default_rng(11).uniform(-2, 2, (20, 8)):
+        wanted = dotted(
+            x,
+            lambda first, others: [np.dot(first, other) for other in others],
+            lambda name, value: getattr(np, name)(value),
+        )
+        found = run(lambda x: dotted(x, dots, apply), x)
+        np.testing.assert_allclose(found, wanted, rtol=1e-13, atol=1e-13)
+
+
+def test_dots_of_what_is_known_are_folded():
+    x = Tape().load(0, 0)
+    assert dots([1.0, 2.0], [[3.0, 4.0]]) == [11.0]
+    assert dots([x, 0.0], [[0.0, x], [0.0, 3.0]]) == [0.0, 0.0]
+    assert dots([], [[], []]) == [0.0, 0.0] and dots([x], []) == []
+
+
+def test_a_product_of_matrices_takes_an_instruction_for_eight_of_its_products():
+    tape = Tape()
+    rows = [tape.loads(0, 6 * r, 6) for r in range(6)]
+    columns = [tape.loads(0, 36 + 6 * c, 6) for c in range(12)]
+    values = [value for row in rows for value in dots(row, columns)]
+    program = Program()
+    program.add("f", 1, values)
+    text = text_of(program.functions.values())
+    assert text.count(" fmul ") == 6 * 6 * 2  # 432 one by one
+    assert text.count(" fadd ") == 5 * 6 * 2
+    assert text.count(" store ") == 6 * 2
+    program.compile()
+    x, out = np.random.default_rng(2).normal(size=108), np.empty(72)
+    program.call("f", x, out)
+    wanted = x[:36].reshape(6, 6) @ x[36:].reshape(12, 6).T
+    np.testing.assert_allclose(out.reshape(6, 12), wanted, rtol=1e-13, atol=1e-14)
 
 
 # --- what is not finite ----------------------------------------------------------------------

@@ -6,7 +6,14 @@ import pytest
 from crane.codegen import Program, Tape
 from crane.codegen.derivative import against, derivatives
 from crane.codegen.factors import eliminated, loaded, stored, substituted
-from crane.codegen.scalar import apply, maximum, minimum, where_positive, with_sign_of
+from crane.codegen.scalar import (
+    apply,
+    dots,
+    maximum,
+    minimum,
+    where_positive,
+    with_sign_of,
+)
 
 
 def compiled(arrays, outputs):
@@ -31,6 +38,7 @@ def formulas(x, y, z):
         maximum(x * z, y) + minimum(z, 0.3 * y) * x,
         where_positive(x - y, x * x, y * z) + with_sign_of(x * y, z - 0.1),
         -(z / x) + 3.0 * x - 2.0 / y,
+        *dots([x, 2.0, z * y], [[y, x, 1.5], [0.0, apply("sin", z), x * x]]),
     ]
 
 
@@ -50,7 +58,7 @@ def test_derivatives_are_central_differences():
         if min(abs(kink) for kink in kinks) < 0.05:
             continue
         rows = [(value(point + h * e) - value(point - h * e)) / (2 * h) for e in np.eye(3)]
-        found = slope(point).reshape(6, 3)
+        found = slope(point).reshape(8, 3)
         np.testing.assert_allclose(found, np.column_stack(rows), rtol=2e-7, atol=2e-8)
         checked += 1
     assert checked > 100
@@ -59,15 +67,15 @@ def test_derivatives_are_central_differences():
 def test_one_pass_back_is_the_transpose():
     """Of the same derivatives, to rounding, at kinks too, where one of two sides counts."""
     tape = Tape()
-    variables, weights = tape.loads(0, 0, 3), tape.loads(1, 0, 6)
+    variables, weights = tape.loads(0, 0, 3), tape.loads(1, 0, 8)
     outputs = formulas(*variables)
     jacobian = derivatives(outputs, variables)
     slope = compiled(1, [entry for row in jacobian for entry in row])
     gradient = compiled(2, against(outputs, weights, variables))
     rng = np.random.default_rng(6)
     for point in [*rng.uniform(-2, 2, (100, 3)), np.array([0.5, 0.2, 0.4]), np.full(3, 0.1)]:
-        w = rng.normal(size=6)
-        rows = slope(point).reshape(6, 3)
+        w = rng.normal(size=8)
+        rows = slope(point).reshape(8, 3)
         size = np.abs(w) @ np.abs(rows)
         assert (np.abs(gradient(point, w) - w @ rows) <= 1e-13 * size).all()
 

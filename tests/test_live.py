@@ -215,12 +215,13 @@ def group_is_empty(group):
 def test_the_machine_is_in_view_and_above_the_panel_of_a_phone(patu, aspect):
     """Projected corners of all shapes: within the window, and of one upright in its upper part."""
     pytest.importorskip("viser")
+    from crane.view.live.door import Door
     from crane.view.live.serve import start, stop
     from crane.view.live.stage import Stage, _corners
     from crane.view.page.visuals import read_visuals
 
     session = Session(patu)
-    server = start("127.0.0.1", 0)
+    server = start(Door("127.0.0.1"), 0)
     try:
         look_at, position = Stage(server, session).view(aspect)
     finally:
@@ -242,7 +243,9 @@ def test_the_machine_is_in_view_and_above_the_panel_of_a_phone(patu, aspect):
 def test_both_signals_end_it_and_leave_nothing(number, connected):
     viser_client = pytest.importorskip("viser") and pytest.importorskip("websockets.sync.client")
     process, line = begin(DATA / "slider_crank.yaml", "--port", "0")
-    address = re.fullmatch(r"live view at http://(127\.0\.0\.1:\d+) \(Ctrl\+C ends it\)\n", line)
+    address = re.fullmatch(
+        r"live view at http://(127\.0\.0\.1:\d+/\S+/) \(Ctrl\+C ends it\)\n", line
+    )
     assert address, line + process.stderr.read()
     client = viser_client.connect(f"ws://{address[1]}", subprotocols=[protocol()], max_size=None)
     if not connected:
@@ -259,11 +262,12 @@ def test_a_slider_moves_the_picture_with_little_work(patu):
     pytest.importorskip("viser")
     from queue import SimpleQueue
 
+    from crane.view.live.door import Door
     from crane.view.live.page import Page
     from crane.view.live.serve import start, stop
 
     session = Session(patu)
-    server = start("127.0.0.1", 0)
+    server = start(Door("127.0.0.1"), 0)
     try:
         page, rng = Page(server, session, None, SimpleQueue()), np.random.default_rng(0)
         for i in range(300):
@@ -312,7 +316,8 @@ def test_a_port_that_is_taken_is_told():
         process, line = begin("tx40", "--port", port)
         _, err = process.communicate(timeout=300)
     assert (process.returncode, line) == (2, "")
-    assert f"127.0.0.1: port {port} can" in err and err.endswith("choose another port\n")
+    assert f"127.0.0.1: port {port} cannot be listened on (Address already in use)" in err
+    assert err.endswith("choose another port\n")
 
 
 def test_without_viser_it_says_how_to_get_it():

@@ -346,3 +346,13 @@ def test_a_payload_counts_from_what_it_is():
 
     wanted = difference(value, 0.0, 1.0, 10.0)
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize(("name", "most"), [("tx40", 2.65), ("patu655", 2.65), ("kr300", 2.6)])
+def test_all_derivatives_of_forward_dynamics_take_few_operations(name, most):
+    """Beside forward dynamics; a row of a product of matrices counts as its entries."""
+    counts = {}
+    dynamics = crane.Dynamics(machine_of(name))
+    for quantity in ("forward", SLOPES + "forward"):
+        counts[quantity] = dynamics._formula(quantity)._program.longest
+    assert counts[SLOPES + "forward"] <= most * counts["forward"]

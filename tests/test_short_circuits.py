@@ -80,6 +80,7 @@ def test_what_an_item_says_itself_stands(crane_of):
         ("bore: 0.1, area_a: 0.1", r":7: 'area_a' stands beside 'bore'"),
         ("rod: 0.1, area_a: 0.1", r":7: 'rod' .* goes with 'bore'"),
         ("bore: 0.1, count: 1.5", r":7: 'count' .* a whole number"),
+        ("bore: 0.1, tube: 0.1", r":7: tube of .* is 0.1 m, it must be more than the bore"),
         ("bor: 0.1", r":7: unknown key 'bor' .*did you mean"),
     ],
 )  # fmt: skip

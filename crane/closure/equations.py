@@ -37,9 +37,9 @@ def _columns(jacobian: Array) -> Array:
 def _cross(a: Array, b: Array) -> Array:
     """Row-wise cross product; numpy's own costs several times more on a few rows."""
     out = np.empty_like(a)
-    out[:, 0] = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
-    out[:, 1] = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
-    out[:, 2] = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
     return out
 
 
@@ -147,19 +147,36 @@ class LoopEquations:
         placements = [bodies[joint] * local for joint, local in self.frames]
         turns = np.array([placement.rotation for placement in placements])
         origins = np.array([placement.translation for placement in placements])
-        one = 2 * self._loop
+        return self._placed(turns, origins)
+
+    def _placed(self, turns: Array, origins: Array) -> tuple[Array, Array, Array, Array]:
+        """The same (..., m, 3) of frames with turns (..., 2 l, 3, 3), origins (..., 2 l, 3)."""
+        axes, one = np.swapaxes(turns, -1, -2), 2 * self._loop
         return (
-            turns[one, :, self.axis1],
-            turns[one + 1, :, self.axis2],
-            origins[one],
-            origins[one + 1],
+            axes[..., one, self.axis1, :],
+            axes[..., one + 1, self.axis2, :],
+            origins[..., one, :],
+            origins[..., one + 1, :],
         )
 
+    def wrenches(self, turns: Array, origins: Array) -> Array:
+        """The loops' rows w as wrenches, by which frame 2 is held, at the world's origin.
+
+        Args:
+            turns: (..., 2 l, 3, 3) of `frames`, in the world.
+            origins: (..., 2 l, 3) likewise [m].
+
+        Returns:
+            (..., m, 6) without the couplings' rows.
+        """
+        a, b, _, p2 = self._placed(turns, origins)
+        return self._wrenches(a, b, p2)
+
     def _wrenches(self, a: Array, b: Array, p2: Array) -> Array:
-        wrenches = np.zeros((len(a), 6))
+        wrenches = np.zeros((*a.shape[:-1], 6))
         moved = self._moves
-        wrenches[moved, :3] = a[moved]
-        wrenches[:, 3:] = _cross(np.where(moved[:, None], p2, b), a)
+        wrenches[..., moved, :3] = a[..., moved, :]
+        wrenches[..., 3:] = _cross(np.where(moved[:, None], p2, b), a)
         return wrenches
 
     def evaluate(self, q: Array) -> tuple[Array, Array]:

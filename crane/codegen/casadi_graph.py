@@ -65,4 +65,8 @@ def _operation(ca: Any, kind: str) -> Callable[..., Any]:
         return lambda x: -x
     if kind == "positive":
         return lambda x, yes, no: ca.if_else(x > 0, yes, no)
+    if kind == "dot":
+        return lambda *x: sum(
+            a * b for a, b in zip(x[: len(x) // 2], x[len(x) // 2 :], strict=True)
+        )
     return getattr(ca, _NAMES[kind])

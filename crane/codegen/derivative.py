@@ -2,7 +2,15 @@
 
 from collections.abc import Callable, Mapping, Sequence
 
-from crane.codegen.scalar import Expression, Number, Tape, apply, where_positive, with_sign_of
+from crane.codegen.scalar import (
+    Expression,
+    Number,
+    Tape,
+    apply,
+    dot,
+    where_positive,
+    with_sign_of,
+)  # fmt: skip
 
 # Of functions of one number: f'(x) by x and y = f(x).
 _ONE: dict[str, Callable[[Expression, Expression], Number]] = {
@@ -123,6 +131,9 @@ def _change(tape: Tape, index: int, kind: str, operands: list, slope: dict[int, 
     if kind in _ONE:
         assert isinstance(a, Expression)
         return da * _ONE[kind](a, Expression(tape, index))
+    if kind == "dot":
+        half = len(value) // 2
+        return dot(moved[:half], value[half:]) + dot(value[:half], moved[half:])
     b, db = value[1], moved[1]
     if kind == "add":
         return da + db
@@ -156,6 +167,9 @@ def _returned(
     if kind in _ONE:
         assert isinstance(a, Expression)
         return (weight * _ONE[kind](a, Expression(tape, index)),)
+    if kind == "dot":
+        half = len(value) // 2
+        return tuple(weight * x for x in (*value[half:], *value[:half]))
     b = value[1]
     if kind == "add":
         return weight, weight

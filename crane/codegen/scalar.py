@@ -214,6 +214,25 @@ def product(a: Sequence[Sequence[Number]], b: Sequence[Sequence[Number]]) -> lis
     return [[dot(row, column) for column in columns] for row in a]
 
 
+def dots(vector: Sequence[Number], others: Sequence[Sequence[Number]]) -> list[Number]:
+    """Dot products of one vector with several, which machine code takes at once.
+
+    Each is one operation, ("dot", *vector, *other). What is not a formula is not worth one.
+    """
+    kept = [i for i, x in enumerate(vector) if isinstance(x, Expression) or x != 0]
+    first = [vector[i] for i in kept]
+    out: list[Number] = []
+    for other in others:
+        second = [other[i] for i in kept]
+        found = [x for x in (*first, *second) if isinstance(x, Expression)]
+        if not found or all(not isinstance(x, Expression) and x == 0 for x in second):
+            out.append(dot(first, second))
+            continue
+        words = (x.index if isinstance(x, Expression) else float(x) for x in (*first, *second))
+        out.append(found[0].tape.add("dot", *words))
+    return out
+
+
 def solve(
     matrix: Sequence[Sequence[Number]], right: Sequence[Sequence[Number]]
 ) -> tuple[list[list[Number]], Number]:

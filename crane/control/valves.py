@@ -1,5 +1,6 @@
 """Signals of valves: from a controller, a joystick, or a recording."""
 
+import threading
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol, runtime_checkable
@@ -296,6 +297,18 @@ class ValvePD(Command):
         return out
 
 
+class _Held(threading.local):
+    """Signals (s,) that the valves keep until they are set again, in every thread its own.
+
+    Attributes:
+        signals: All of them.
+        since: When each of them was set [s].
+    """
+
+    def __init__(self, signals: Array):
+        self.signals, self.since = [signals], [0.0]
+
+
 class Sampled(Command):
     """A program of the user that sets the valves once per period, as a control unit does.
 
@@ -322,21 +335,22 @@ class Sampled(Command):
         self._spools = tuple(circuit.spools)
         self._active = machine.closure.active
         self.period = as_number(period, "the period", "s", above=0)
-        self._held = [np.array([spool.neutral for spool in circuit.spools.values()])]
-        self._since = [0.0]  # when each of them was set [s]
+        neutral = np.array([spool.neutral for spool in circuit.spools.values()])
+        self._held = _Held(neutral)  # by a run, which is one thread's
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """See `Command`."""
         answer = self._function(time, q[self._active].copy(), v_a.copy(), pressures)
         what = f"the signals at t = {time:g} s"
-        kept = bisect_left(self._since, time - _SAME * self.period)  # what is later is of before
-        self._since[kept:] = [time]
-        self._held[kept:] = [as_sample(answer, len(self._spools), what, self._spools)]
+        held = self._held
+        kept = bisect_left(held.since, time - _SAME * self.period)  # what is later is of before
+        held.since[kept:] = [time]
+        held.signals[kept:] = [as_sample(answer, len(self._spools), what, self._spools)]
 
     def references(self, times: Array) -> Array:
         """See `Command`; between two jumps, at which steps end, it holds one signal."""
         middle = 0.5 * (times[0] + times[-1]) + _SAME * self.period
-        held = self._held[max(bisect_right(self._since, middle) - 1, 0)]
+        held = self._held.signals[max(bisect_right(self._held.since, middle) - 1, 0)]
         return np.tile(held, (len(times), 1))
 
     def signals(self, at: At) -> Sequence[Number]:

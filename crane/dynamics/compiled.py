@@ -1,16 +1,18 @@
 """Equations of motion and their derivatives in machine code made for one machine."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from crane.closure.bending import Bending
-from crane.closure.compiled import FastClosure
+from crane.closure.compiled import Cursor, FastClosure
 from crane.closure.traced import Constants, folded
 from crane.codegen import Expression, Number, Program, Tape, largest
 from crane.codegen.derivative import along
+from crane.codegen.program import Bound
 from crane.common.samples import Array
+from crane.common.threads import PerThread
 from crane.dynamics.inertia import Matrix
 from crane.dynamics.sensitivity import Sensitivity
 from crane.dynamics.traced import Form, Moved, Sweep
@@ -57,6 +59,21 @@ SLOPES = "slopes of "  # before a quantity: its derivatives by q_A, v_A and the 
 _FLOAT = np.dtype(np.float64)
 
 
+class _Memory(NamedTuple):
+    """What evaluating a quantity writes.
+
+    Attributes:
+        cursor: Where it has got to.
+        q: (nq,) the last posture.
+        single: Of one sample second argument, v_A and q_A (n,) each, the result (size,), and what
+            evaluates it.
+    """
+
+    cursor: Cursor
+    q: Array
+    single: tuple[Array, Array, Array, Array, Bound]
+
+
 class QuantityCode:
     """One quantity as machine code.
 
@@ -69,7 +86,6 @@ class QuantityCode:
 
     Attributes:
         size: Length of the result of one sample.
-        cursor: Where it has got to.
 
     Raises:
         TooLongError: It would take too long to compile.
@@ -92,14 +108,23 @@ class QuantityCode:
                 ("quantity", *key),
                 lambda program: _build(program, quantity, fast, pattern, n, form),
             )
-        self._program = program = fast.programs[key]
-        self.size = program.outputs("formula").size
-        self.cursor = fast.cursor()
-        self._q, self._out = np.zeros(nq), np.zeros(self.size)
-        self._target, self._input = np.zeros(n), np.zeros(2 * n)
-        self._first, self._second = self._input[:n], self._input[n:]
+        program = self._program = fast.programs[key]
+        size = self.size = program.outputs("formula").size
         self._shape = (n,)
-        self._once = program.bound("once", *self._arguments(self._target, self._input, self._out))
+
+        def memory() -> _Memory:
+            cursor, q, target = fast.cursor(), np.zeros(nq), np.zeros(n)
+            inputs, out = np.zeros(2 * n), np.zeros(size)
+            arrays = (fast.geometry.numbers, numbers, target, inputs, cursor.at, q, out)
+            once = program.bound("once", fast.address, *arrays, fast.bounds)
+            return _Memory(cursor, q, (inputs[n:], inputs[:n], target, out, once))
+
+        self._memory = PerThread(memory)
+
+    @property
+    def cursor(self) -> Cursor:
+        """Where this thread has got to."""
+        return self._memory.own.cursor
 
     def one(self, q_a: Any, v_a: Any, x: Any) -> Array | None:
         """The quantity of one sample without delay, or None where arguments need a closer look.
@@ -110,7 +135,8 @@ class QuantityCode:
             x: Likewise.
         """
         shape = self._shape
-        for buffer, array in ((self._second, x), (self._first, v_a), (self._target, q_a)):
+        second, first, target, out, once = self._memory.own.single
+        for buffer, array in ((second, x), (first, v_a), (target, q_a)):
             if array is not None:
                 if (
                     array.__class__ is not np.ndarray
@@ -119,7 +145,7 @@ class QuantityCode:
                 ):
                     return None
                 buffer[:] = array
-        return self._out.copy() if self._once() == 1 else None
+        return out.copy() if once() == 1 else None
 
     def at(self, q: Array, inputs: Array) -> Array:
         """The quantity at one closed posture (nq,), inputs [v_A, x] (2 n,)."""
@@ -134,18 +160,16 @@ class QuantityCode:
         Returns:
             How many were done.
         """
-        arguments = self._arguments(targets, inputs, out)
-        return self._program.call("each", len(targets), *arguments)
+        fast, memory = self._fast, self._memory.own
+        arrays = (fast.geometry.numbers, self._numbers, targets, inputs, memory.cursor.at)
+        return self._program.call(
+            "each", len(targets), fast.address, *arrays, memory.q, out, fast.bounds
+        )
 
     def along(self, q: Array, inputs: Array, out: Array) -> None:
         """The quantity at closed postures (N, nq) with inputs (N, 2 n) into out (N, size)."""
         geometry = self._fast.geometry.numbers
         self._program.call("along", len(q), geometry, self._numbers, q, inputs, out)
-
-    def _arguments(self, targets: Array, inputs: Array, out: Array) -> tuple[int | Array, ...]:
-        fast = self._fast
-        arrays = (fast.geometry.numbers, self._numbers, targets, inputs)
-        return (fast.address, *arrays, self.cursor.at, self._q, out, fast.bounds)
 
 
 def _build(

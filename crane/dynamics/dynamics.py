@@ -550,14 +550,16 @@ class Dynamics:
     def _formula(self, quantity: str) -> QuantityCode | None:
         """Machine code of a quantity, or None on the Pinocchio backend."""
         if quantity not in self._formulas:
+            made = None
             try:
-                self._formulas[quantity] = (
-                    QuantityCode(quantity, self.machine, self.numbers, self.pattern, self.form)
-                    if self.backend == "compiled"
-                    else None
-                )
+                if self.backend == "compiled":
+                    made = QuantityCode(
+                        quantity, self.machine, self.numbers, self.pattern, self.form
+                    )
             except TooLongError:
-                self._formulas[quantity] = None
+                pass
+            # of two threads' that made it at once one counts, in which both follow the branch
+            self._formulas.setdefault(quantity, made)
         return self._formulas[quantity]
 
     def _evaluate(

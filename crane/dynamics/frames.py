@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from crane.common.samples import Array
+from crane.common.threads import PerThread
 from crane.machine import Machine
 
 
@@ -18,10 +19,14 @@ class FrameJacobians:
 
     def __init__(self, machine: Machine):
         self._machine, self._model = machine, pin.Model(machine.model)
-        self._data = self._model.createData()
+        self._memory = PerThread(self._model.createData)
+
+    @property
+    def _data(self) -> pin.Data:
+        return self._memory.own
 
     def place(self, q: Array) -> None:
-        """Take up a posture (nq,)."""
+        """Take up a posture (nq,), in this thread."""
         configuration = self._machine.coordinates.configuration(q)
         pin.computeJointJacobians(self._model, self._data, configuration)
 

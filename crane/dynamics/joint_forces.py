@@ -171,16 +171,16 @@ class JointForces:
         """Friction of joints at rest that sticks and is to give way, against their acceleration.
 
         Args:
-            v: (nv,) [m/s], [rad/s].
-            a: (nv,) [m/s^2], [rad/s^2].
+            v: (nv,) or (N, nv) [m/s], [rad/s].
+            a: (nv,) or (N, nv) [m/s^2], [rad/s^2].
 
         Returns:
-            (nv,) beside `friction`, (F_C + F_S) sign(a) where v = 0 [N], [N m].
+            (nv,) or (N, nv) beside `friction`, (F_C + F_S) sign(a) where v = 0 [N], [N m].
         """
         here = list(self.sticking)
         out = np.zeros_like(v)
-        starts = (v[here] == 0) & (np.abs(a[here]) > STILL)
-        out[here] = np.where(starts, np.sign(a[here]) * self._own_breakaway, 0.0)
+        starts = (v[..., here] == 0) & (np.abs(a[..., here]) > STILL)
+        out[..., here] = np.where(starts, np.sign(a[..., here]) * self._own_breakaway, 0.0)
         return out
 
     def passive(self, q: Array, v: Array) -> Array:
@@ -197,6 +197,19 @@ class JointForces:
         Returns:
             (nv,) or (N, nv) [N], [N m].
         """
+        return self._on_joints(*self.along(q, v))
+
+    def along(self, q: Array, v: Array) -> tuple[Array, Array]:
+        """`passive` by what it acts along.
+
+        Args:
+            q: (nq,) or (N, nq) [m], [rad].
+            v: (nv,) or (N, nv) [m/s], [rad/s].
+
+        Returns:
+            Forces along joints, then distances (nv + m,) or (N, nv + m) [N], [N m], and dl/dv of
+            the distances.
+        """
         lengths, slopes = self.lengths.at(q)
         rates = np.einsum("...ki,...i->...k", slopes, v)
         q, v = np.concatenate([q, lengths], axis=-1), np.concatenate([v, rates], axis=-1)
@@ -205,7 +218,7 @@ class JointForces:
             0.0, 1 + self._stop_damping * v
         )
         springs = self._constant - self._stiffness * q - self._damping * v
-        return self._on_joints(springs + self._stop * stopping + self._gas_law(q), slopes)
+        return springs + self._stop * stopping + self._gas_law(q), slopes
 
     def gas(self, q: Array) -> Array:
         """Force of the gas springs on every joint.

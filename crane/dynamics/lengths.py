@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 
 from crane.common.samples import Array
+from crane.common.threads import PerThread
 from crane.dynamics.frames import point_jacobian
 from crane.machine import Machine
 
@@ -45,7 +46,7 @@ class Lengths:
         ]
         if self.pairs:
             self._model = pin.Model(machine.model)
-            self._data = self._model.createData()
+            self._memory = PerThread(self._model.createData)
 
     def at(self, q: Array) -> tuple[Array, Array]:
         """Lengths and their slopes.
@@ -63,7 +64,7 @@ class Lengths:
             return lengths, slopes
         for i in np.ndindex(q.shape[:-1]):
             configuration = self._coordinates.configuration(q[i])
-            pin.computeJointJacobians(self._model, self._data, configuration)
+            pin.computeJointJacobians(self._model, self._memory.own, configuration)
             for k, (one, two) in enumerate(self.ends):
                 (p1, j1), (p2, j2) = self._point(*one), self._point(*two)
                 way = p2 - p1
@@ -75,5 +76,6 @@ class Lengths:
         """A point of a body in the world (3,), and its velocities by the joints' (3, nv)."""
         if not joint:
             return place, np.zeros((3, self._model.nv))
-        point: Array = self._data.oMi[joint].act(place)
-        return point, point_jacobian(self._model, self._data, joint, place)[:3]
+        data = self._memory.own
+        point: Array = data.oMi[joint].act(place)
+        return point, point_jacobian(self._model, data, joint, place)[:3]

@@ -6,7 +6,7 @@ time derivatives of its own columns,
 
     d_j V = J_j' + J_j x V,    d_j A = J_j'' + J_j' x V + J_j x A,
 
-and of the wrench f = I A + V x* I V of a body
+and of the wrench f = I A + V x* I V = I A + B V of a body
 
     d f / d v_j = 2 I J_j' + 2 B J_j,
     d f / d q_j = J_j x* f + I J_j'' + 2 B J_j',
@@ -33,7 +33,7 @@ from crane.codegen.scalar import (
     add,
     cross,
     dot,
-    product,
+    dots,
     scale,
     subtract,
     times,
@@ -53,8 +53,8 @@ class Matter:
         mass: sum m.
         first: sum m r (3,).
         tensor: sum m (r^2 - r r^T) (3, 3).
-        momentum: 2 sum m r' (3,).
-        mixed: 2 (tr(K) - K) (3, 3), K = sum m r' r^T.
+        momentum: sum m r' (3,).
+        mixed: tr(K) - K (3, 3), K = sum m r' r^T.
     """
 
     mass: Number
@@ -79,10 +79,10 @@ class Matter:
             lambda r, c: tensor[r][c] - first[r] * centre[c] + (square if r == c else 0.0)
         )
         v, w = motion
-        momentum = scale(2.0, scale(mass, add(v, cross(w, centre))))
+        momentum = scale(mass, add(v, cross(w, centre)))
         # second moments about the centre, tr(I) / 2 - I
-        trace = tensor[0][0] + tensor[1][1] + tensor[2][2]
-        spread = _symmetric(lambda r, c: (trace if r == c else 0.0) - 2.0 * tensor[r][c])
+        half = 0.5 * (tensor[0][0] + tensor[1][1] + tensor[2][2])
+        spread = _symmetric(lambda r, c: (half if r == c else 0.0) - tensor[r][c])
         spun = transposed([cross(w, column) for column in spread])
         k = [
             [p * x + more for x, more in zip(centre, row, strict=True)]
@@ -108,11 +108,11 @@ class Matter:
         return force, add(cross(self.first, a), times(self.tensor, e))
 
     def turned(self, angular: Vector) -> Pair:
-        """2 B of a motion, whose linear part does not matter."""
+        """B of a motion, whose linear part does not matter."""
         return cross(angular, self.momentum), times(self.mixed, angular)
 
     def turning(self, motion: Pair) -> Vector:
-        """What 2 B^T of a motion has for the angular part of another."""
+        """What B^T of a motion has for the angular part of another."""
         v, w = motion
         return add(cross(self.momentum, v), times(transposed(self.mixed), w))
 
@@ -124,11 +124,11 @@ class _Column:
     Attributes:
         by_q: Forces along the cluster's joints, by joint, per unit of the coordinate, but for
             what turns with the joints.
-        by_v: Per unit of its velocity.
+        by_v: Half of those per unit of its velocity.
         shifts: By joint, wrenches that turn with it.
         beyond_q: Wrench on the body that carries the cluster, per unit of the coordinate.
-        beyond_v: Per unit of its velocity.
-        turned: 2 B^T J_j of all bodies.
+        beyond_v: Half of that per unit of its velocity.
+        turned: B^T J_j of all bodies.
     """
 
     by_q: Rates
@@ -157,14 +157,20 @@ class Sensitivity:
         self._home = {i: c for c, x in enumerate(bending.clusters) for i in x.joints}
 
     @cached_property
+    def _velocity(self) -> list[Pair]:
+        """Of every body."""
+        return self._sweep.motions([0.0] * len(self._parents))[0]
+
+    @cached_property
+    def _matters(self) -> dict[int, Matter]:
+        """Every body."""
+        bodies = enumerate(self._sweep.bodies, start=1)
+        return {i: Matter.rigid(*body, self._velocity[i]) for i, body in bodies}
+
+    @cached_property
     def _lumped(self) -> dict[int, Matter]:
         """What every joint moves, but for what hangs on other joints of its cluster."""
-        velocity, _ = self._sweep.motions([0.0] * len(self._parents))
-        own = {
-            i: Matter.rigid(*body, velocity[i])
-            for i, body in enumerate(self._sweep.bodies, start=1)
-        }
-        whole = dict(own)
+        own, whole = dict(self._matters), dict(self._matters)
         for i in range(len(own), 0, -1):
             if parent := self._parents[i]:
                 whole[parent] = whole[parent] + whole[i]
@@ -226,9 +232,8 @@ class Sensitivity:
         second = bending.second(sweep.rates, rates)
         motions = tuple(dict(enumerate(x)) for x in sweep.motions(rates))
         whole, forces = self._whole(rates), sweep.forces(self._friction)
-        left: Vector = [0.0] * size  # what the drives of all joints would have to do
-        for i in range(1, size):
-            left[i] = paired(self._columns[i], whole[i]) + sweep.rotors[i] * rates[i] - forces[i]
+        # what the drives of all joints would have to do
+        left = subtract(self._along(whole, rates), forces)
         by_q: Matrix = [[0.0] * self._n for _ in range(self._n)]
         by_v: Matrix = [[0.0] * self._n for _ in range(self._n)]
         moved: dict[int, tuple[Motions, Motions]] = {}
@@ -248,15 +253,22 @@ class Sensitivity:
 
     def _whole(self, rates: Sequence[Number]) -> dict[int, Pair]:
         """By joint, the wrench that all that hangs on it takes to accelerate so."""
-        wrenches = self._sweep.wrenches(rates)
+        _, accelerations = self._sweep.motions(rates)
         whole: dict[int, Pair] = {}
-        for i in range(len(wrenches), 0, -1):
-            (force, moment), (_, centre, _) = wrenches[i - 1], self._sweep.bodies[i - 1]
-            wrench = force, add(moment, cross(centre, force))
+        for i in range(len(accelerations) - 1, 0, -1):
+            matter = self._matters[i]
+            wrench = plus(matter.asked(accelerations[i]), matter.turned(self._velocity[i][1]))
             whole[i] = plus(whole[i], wrench) if i in whole else wrench
             if parent := self._parents[i]:
                 whole[parent] = plus(whole[parent], whole[i]) if parent in whole else whole[i]
         return whole
+
+    def _along(self, whole: Mapping[int, Pair], rates: Sequence[Number]) -> Vector:
+        """Forces along the joints (nb + 1,) that bodies and rotors take to accelerate so."""
+        out: Vector = [0.0] * len(rates)
+        for i, wrench in whole.items():
+            out[i] = paired(self._columns[i], wrench) + self._sweep.rotors[i] * rates[i]
+        return out
 
     def _column(
         self,
@@ -274,8 +286,8 @@ class Sensitivity:
         turned: Vector = [0.0] * 3
         for i in cluster.joints:
             matter, twist = self._lumped[i], self._bending.twists[j][i]
-            by_q[i] = plus(matter.asked(twice[i]), matter.turned(rate[i][1]))
-            by_v[i] = plus(matter.asked(by(2.0, rate[i])), matter.turned(twist[1]))
+            by_q[i] = plus(matter.asked(twice[i]), matter.turned(scale(2.0, rate[i][1])))
+            by_v[i] = plus(matter.asked(rate[i]), matter.turned(twist[1]))
             shifts[i] = by(sweep.gamma[i][j], crossed_wrench(self._columns[i], whole[i]))
             turned = add(turned, matter.turning(twist))
         by_q, by_v = self._gathered(c, by_q), self._gathered(c, by_v)
@@ -286,7 +298,7 @@ class Sensitivity:
                 for i in cluster.joints
             },
             {
-                i: paired(self._columns[i], by_v[i]) + 2.0 * sweep.rotors[i] * first[i]
+                i: paired(self._columns[i], by_v[i]) + sweep.rotors[i] * first[i]
                 for i in cluster.joints
             },
             shifts,
@@ -308,7 +320,7 @@ class Sensitivity:
             by_q[k][j] = by_q[k][j] + dot([left[i] for i in bent], list(bent.values()))
             for i in joints:
                 by_q[k][j] = by_q[k][j] + paired(bending.twists[k][i], found.shifts[i])
-            by_v[k][j] = dot(row, [found.by_v[i] for i in joints])
+            by_v[k][j] = 2.0 * dot(row, [found.by_v[i] for i in joints])
 
     def _add_carried(
         self,
@@ -325,9 +337,10 @@ class Sensitivity:
             twist = self._bending.twists[k][body]
             rate, twice = (motions[body] for motions in moved[k])
             by_q[k][j] = by_q[k][j] + paired(twist, found.beyond_q)
-            by_v[k][j] = by_v[k][j] + paired(twist, found.beyond_v)
-            by_q[j][k] = by_q[j][k] + paired(twice, asked) + dot(found.turned, rate[1])
-            by_v[j][k] = by_v[j][k] + 2.0 * paired(rate, asked) + dot(found.turned, twist[1])
+            by_v[k][j] = by_v[k][j] + 2.0 * paired(twist, found.beyond_v)
+            by_q[j][k] = by_q[j][k] + paired(twice, asked) + 2.0 * dot(found.turned, rate[1])
+            back = paired(rate, asked) + dot(found.turned, twist[1])
+            by_v[j][k] = by_v[j][k] + 2.0 * back
 
     def forward(self, tau: Sequence[Number]) -> tuple[Matrix, Matrix, Matrix]:
         """Derivatives (n, n) of a_A by q_A, v_A and tau_A.
@@ -337,10 +350,13 @@ class Sensitivity:
         sweep = self._sweep
         mass = Positive(self.mass)
         right = add(tau, sweep.projected(sweep.forces(self._friction)))
-        by_q, by_v = self.inverse(mass.solve(subtract(right, sweep.inertial_bias)))
+        bias = sweep.projected(self._along(self._whole(sweep.drift), sweep.drift))
+        by_q, by_v = self.inverse(mass.solve(subtract(right, bias)))
         inverse = mass.inverted
         back = [scale(-1.0, row) for row in inverse]
-        return product(back, by_q), product(back, by_v), inverse
+        columns = transposed([[*q, *v] for q, v in zip(by_q, by_v, strict=True)])
+        rows = [dots(row, columns) for row in back]
+        return [row[: self._n] for row in rows], [row[self._n :] for row in rows], inverse
 
     def _slopes(self, c: int, j: int, forces: Vector) -> tuple[Vector, Vector]:
         """What forces along the joints change by with q_j and with v_j (nb + 1,)."""

@@ -11,6 +11,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_samples
+from crane.common.threads import PerThread
 from crane.description.external import PARTS
 from crane.description.ground import Contact
 from crane.dynamics.frames import FrameJacobians
@@ -95,7 +96,7 @@ class Stability:
         self.edges = list(zip(around, around[1:] + around[:1], strict=True))
         self.lines = [(self.names[i], self.names[j]) for i, j in self.edges]
         self._model = pin.Model(machine.model)
-        self._data = self._model.createData()
+        self._memory = PerThread(self._model.createData)
         self.mass = float(sum(inertia.mass for inertia in self._model.inertias))
         self._gravity = self._model.gravity.linear.copy()
 
@@ -155,18 +156,19 @@ class Stability:
                 none act if not given. Those of contacts that are supports are left out.
         """
         rates, centres = np.zeros((len(q), 6)), np.empty((len(q), 3))
+        data = self._memory.own
         still = np.zeros(self._model.nv)
         moves = v is not None or a is not None
         for i, posture in enumerate(q):
             at = self.machine.coordinates.configuration(posture)
             if moves:
                 rates[i] = pin.computeCentroidalMomentumTimeVariation(
-                    self._model, self._data, at,
+                    self._model, data, at,
                     still if v is None else v[i], still if a is None else a[i],
                 ).vector  # fmt: skip
             else:
-                pin.centerOfMass(self._model, self._data, at, False)
-            centres[i] = self._data.com[0]
+                pin.centerOfMass(self._model, data, at, False)
+            centres[i] = data.com[0]
         own = self._model.inertias[0]  # what stands has no momentum
         out = rates - self.mass * np.append(self._gravity, np.zeros(3))
         # the momentum's rate counts about the centre of what moves

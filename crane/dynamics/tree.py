@@ -1,7 +1,7 @@
 """Equations of motion by Pinocchio's algorithms on the spanning tree, projected by gamma."""
 
 from collections.abc import Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +9,7 @@ import pinocchio as pin
 
 from crane.common.errors import MechanismError
 from crane.common.samples import Array, solve
+from crane.common.threads import PerThread
 from crane.dynamics.frames import point_jacobian
 from crane.dynamics.joint_forces import AT_REST, JointForces
 from crane.machine import Machine
@@ -42,7 +43,7 @@ class _Part:
         columns: Of their joints in v.
         places: Of their joints in Pinocchio's q.
         base: The body of the tree that they stand on.
-        model: Of them alone.
+        model: Of them alone; its gravity is written as the base turns.
         data: Its data.
     """
 
@@ -62,6 +63,23 @@ class _Part:
             )
             self.model.appendBodyToJoint(place[body], whole.inertias[body], pin.SE3.Identity())
         self.data = self.model.createData()
+
+
+class _Memory:
+    """What evaluating a quantity writes.
+
+    Args:
+        model: The tree.
+        parts: Bodies that carry each other, together.
+
+    Attributes:
+        data: Of the tree.
+        parts: Models of the bodies and their data.
+    """
+
+    def __init__(self, model: pin.Model, parts: Sequence[Sequence[int]]):
+        self.data = model.createData()
+        self.parts = [_Part(model, bodies) for bodies in parts]
 
 
 class TreeDynamics:
@@ -87,20 +105,19 @@ class TreeDynamics:
             self._tip = int(frame.parentJoint), np.array(frame.placement.translation)
 
     @cached_property
-    def _data(self) -> pin.Data:
-        return self._model.createData()
+    def _memory(self) -> PerThread[_Memory]:
+        return PerThread(partial(_Memory, self._model, self._together(self._carriers)))
 
-    @cached_property
-    def _parts(self) -> list[_Part]:
-        """Bodies that carry each other, together; made when they are first asked."""
+    def _together(self, carriers: Sequence[int]) -> list[list[int]]:
+        """Bodies that carry each other, a parent before its children."""
         joints = [0, *self._coordinates.joints.tolist()]
         roots: dict[int, list[int]] = {}
         root_of = {0: 0}
         for body in range(1, self._model.njoints):
-            carrier = joints[self._carriers[self._model.joints[body].idx_v + 1]]
+            carrier = joints[carriers[self._model.joints[body].idx_v + 1]]
             root_of[body] = root_of[carrier] or body
             roots.setdefault(root_of[body], []).append(body)
-        return [_Part(self._model, bodies) for bodies in roots.values()]
+        return list(roots.values())
 
     @property
     def parameters(self) -> Array:
@@ -167,7 +184,7 @@ class TreeDynamics:
 
     def _statics(self, q: Array, gamma: Array) -> Array:
         """See `Sweep.statics`."""
-        model, data = self._model, self._data
+        model, data = self._model, self._memory.own.data
         jacobian = pin.jacobianCenterOfMass(model, data, self._coordinates.configuration(q), False)
         still, moving = model.inertias[0], data.mass[0]
         moment = moving * data.com[0] + still.mass * still.lever
@@ -218,11 +235,11 @@ class TreeDynamics:
     def _energy(self, motion: ClosedState) -> Array:
         """Kinetic and potential."""
         configuration = self._coordinates.configuration(motion.q)
-        kinetic = 0.5 * float(self._armature @ motion.v**2)
-        for part in self._parts:
+        kinetic, memory = 0.5 * float(self._armature @ motion.v**2), self._memory.own
+        for part in memory.parts:
             at, v = configuration[part.places], motion.v[part.columns]
             kinetic += pin.computeKineticEnergy(part.model, part.data, at, v)
-        weight = pin.computePotentialEnergy(self._model, self._data, configuration)
+        weight = pin.computePotentialEnergy(self._model, memory.data, configuration)
         return np.array([kinetic, weight + self._forces.potential(motion.q)])
 
     def _dissipation(self, motion: ClosedState) -> float:
@@ -241,7 +258,7 @@ class TreeDynamics:
     def _mass(self, motion: ClosedState) -> Array:
         configuration = self._coordinates.configuration(motion.q)
         total = motion.gamma.T @ (self._armature[:, None] * motion.gamma)
-        for part in self._parts:
+        for part in self._memory.own.parts:
             upper = np.triu(pin.crba(part.model, part.data, configuration[part.places]))
             gamma = motion.gamma[part.columns]
             total += gamma.T @ (upper + np.triu(upper, 1).T) @ gamma
@@ -268,9 +285,9 @@ class TreeDynamics:
 
     def _turned(self, q: Array) -> Iterator[tuple[_Part, Array]]:
         """The parts and their configurations, gravity turned into their bases' directions."""
-        configuration = self._coordinates.configuration(q)
-        pin.forwardKinematics(self._model, self._data, configuration)
-        for part in self._parts:
-            base = self._data.oMi[part.base].rotation
+        configuration, memory = self._coordinates.configuration(q), self._memory.own
+        pin.forwardKinematics(self._model, memory.data, configuration)
+        for part in memory.parts:
+            base = memory.data.oMi[part.base].rotation
             part.model.gravity.linear = base.T @ self._model.gravity.linear
             yield part, configuration[part.places]

@@ -70,7 +70,7 @@ class Cylinder:
 
     Attributes:
         joint: The active joint.
-        area_a: Of chamber A [m2], or volume per angle [m3/rad].
+        area_a: Of chamber A [m2], or volume per angle [m3/rad]; of all cylinders side by side.
         area_b: Of chamber B.
         hose_a: Volume of hoses and fittings at chamber A, V_hA [m3].
         hose_b: At chamber B, V_hB [m3].
@@ -102,6 +102,8 @@ class Cylinder:
         rupture_b: Of chamber B.
         motor: Whether it is a motor: its volumes do not change with the angle, and the joint needs
             no limits.
+        tube: Outer diameter of the tube [m]; 0 where it is not known. It counts for buckling.
+        count: How many cylinders side by side the areas are of.
     """
 
     joint: str
@@ -130,9 +132,30 @@ class Cylinder:
     rupture_a: float = 0.0
     rupture_b: float = 0.0
     motor: bool = False
+    tube: float = 0.0
+    count: int = 1
 
     def __post_init__(self) -> None:
-        check_numbers(self, f"the cylinder of '{self.joint}'")
+        what = f"the cylinder of '{self.joint}'"
+        check_numbers(self, what)
+        if not isinstance(self.count, int) or self.count < 1:
+            raise PartError("count", f"count of {what} is {self.count}, give a whole number")
+        if self.tube and not self.tube > self.bore:
+            raise PartError(
+                "tube",
+                f"tube of {what} is {self.tube:g} m, it must be more than the bore of "
+                f"{self.bore:.4g} m",
+            )
+
+    @property
+    def bore(self) -> float:
+        """Diameter of the piston of one of them, along a slide [m]."""
+        return math.sqrt(4 / math.pi * max(self.area_a, self.area_b) / self.count)
+
+    @property
+    def rod(self) -> float:
+        """Diameter of the rod of one of them; 0 where the areas are the same [m]."""
+        return math.sqrt(4 / math.pi * abs(self.area_a - self.area_b) / self.count)
 
     @property
     def grips(self) -> bool:

@@ -13,6 +13,7 @@ from crane.codegen import Number, Program, Tape, TooLongError
 from crane.codegen.scalar import add, cross, dot, scale, subtract, times
 from crane.common.errors import ClosureError, InputError, UnreachableTipError, known
 from crane.common.samples import Array, as_sample, as_samples, per_sample
+from crane.common.threads import PerThread
 from crane.machine import Machine
 from crane.motion.attitude import INCLINATION, Attitude, Inclination, Rotation, roll_pitch_yaw
 
@@ -67,6 +68,7 @@ class Kinematics:
         self._scale = np.where(np.isfinite(span), span, units) * machine.driven
         self._size = machine.closure.size
         self._turned: dict[str, Attitude] = {}
+        self._memory = PerThread(self._model.createData)
 
     def __repr__(self) -> str:
         """What moves, of what."""
@@ -293,9 +295,9 @@ class Kinematics:
             self._turned[name] = found
         return self._turned[name]
 
-    @cached_property
+    @property
     def _data(self) -> pin.Data:
-        return self._model.createData()
+        return self._memory.own
 
     @cached_property
     def _fast(self) -> "_FastFrame | None":

@@ -4,6 +4,7 @@ import itertools
 import math
 import multiprocessing
 import os
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -269,11 +270,24 @@ def _computed(
         yield from _by_processes(jobs, min(processes, len(jobs)))
 
 
+def _end_with_parent() -> None:
+    """Let this process end when the one that started it has, however that was."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def wait() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
 def _by_processes(
     jobs: list[Job], processes: int
 ) -> Iterator[tuple[int, tuple[dict[str, float], str]]]:
     # threads would wait for each other: most of a variant is computed in Python
-    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(processes, context, initializer=_end_with_parent)
     try:
         futures = {pool.submit(variant, job): index for index, job in enumerate(jobs)}
         for future in as_completed(futures):

@@ -7,19 +7,22 @@ functions, one called after the other, that hand each other numbers in memory.
 from collections.abc import Sequence
 from typing import Any
 
+from crane.codegen.llvm.dots import FAST, common, dots_text, operand_word, stored_dots
 from crane.codegen.llvm.functions import VECTOR, WIDEST, real
 from crane.codegen.representation import Formula
 from crane.codegen.scalar import Expression, Number, needed
 
 WHOLE = 6500  # operations of a formula that stays one function, which runs faster
 PIECE = 1000  # of one of several
-# Products may be fused with sums. Reordering sums would gain nothing and let NaN cancel.
-_FAST = "nsz arcp contract"
 _ARITHMETIC = {"add": "fadd", "subtract": "fsub", "multiply": "fmul", "divide": "fdiv"}
 _CALLS = {
     "sqrt": "@llvm.sqrt.f64", "abs": "@llvm.fabs.f64", "maximum": "@larger",
     "copysign": "@llvm.copysign.f64", "positive": "@chosen",
 }  # fmt: skip
+# Numbers that registers have no room for are reached with a byte less through the frame pointer.
+# A processor keeps some 32 kB of instructions at hand, and waits for those of longer formulas.
+_SHORT = '"frame-pointer"="all" "no-realign-stack"'
+_AT_ONCE = VECTOR | {"dot"}
 _END = "  ret void\n}"
 
 
@@ -43,13 +46,14 @@ def formula_text(formula: Formula, functions: set[tuple[str, int]]) -> str:
         texts = [[line for text in texts for line in text]]
     inputs = [f"ptr noalias readonly %in{i}" for i in range(formula.arrays)]
     arguments = ", ".join([*inputs, "ptr noalias %out"])
-    head = f"define void @{formula.name}({arguments}) {{"
+    head = f"define void @{formula.name}({arguments}) "
     if len(texts) <= 1:
+        head += f"{_SHORT} {{"
         return "\n".join([head, *(line for text in texts for line in text), _END])
     shared = f"{arguments}, ptr noalias %between"
     out, lines = (
         [],
-        [head, f"  %between = alloca [{1 + max(places.values(), default=0)} x double]"],
+        [f"{head}{{", f"  %between = alloca [{1 + max(places.values(), default=0)} x double]"],
     )
     for number, text in enumerate(texts):
         name = f"@{formula.name}.{number}"
@@ -60,13 +64,18 @@ def formula_text(formula: Formula, functions: set[tuple[str, int]]) -> str:
 
 
 def _steps(operations: Sequence[tuple], formula: Formula) -> list[list[int]]:
-    """Operations in an order that can be computed, those of `VECTOR` several at once."""
+    """Operations in an order that can be computed, those of `_AT_ONCE` several at once."""
     steps: list[list[int]] = []
     for level in _levels(operations, needed(formula.outputs)):
-        for name in sorted(VECTOR & {operations[i][0] for i in level}):
-            same = [i for i in level if operations[i][0] == name]
-            steps += [same[start : start + WIDEST] for start in range(0, len(same), WIDEST)]
-        steps += [[i] for i in level if operations[i][0] not in VECTOR | {"load"}]
+        same: dict[tuple, list[int]] = {}
+        for i in level:
+            if operations[i][0] in _AT_ONCE:
+                name = operations[i][:1]
+                alike = common(operations[i]) if name == ("dot",) else name
+                same.setdefault(alike, []).append(i)
+        for _, indices in sorted(same.items(), key=lambda item: item[0][0]):
+            steps += [indices[start : start + WIDEST] for start in range(0, len(indices), WIDEST)]
+        steps += [[i] for i in level if operations[i][0] not in _AT_ONCE | {"load"}]
     return steps
 
 
@@ -113,17 +122,24 @@ class _Piece:
             functions: Takes what it calls of `definitions`.
         """
         lines, known = [], set(self.made)
+        vectors: set[str] = set()
         for step in self._steps:
             for x in sorted({x for index in step for x in _operands(self._operations[index])}):
                 if x not in known:
                     known.add(x)
                     lines += self._read(x, places)
-            lines += self._step(step, functions)
+            if self._operations[step[0]][0] == "dot":
+                lines += dots_text(step, [self._operations[i][1:] for i in step], vectors)
+                lanes = ((at, k) for k, i in enumerate(step) for at in targets.get(i, ()))
+                lines += stored_dots(step, lanes)
+            else:
+                lines += self._step(step, functions)
+                for index in step:
+                    for at in targets.get(index, ()):
+                        lines += _stored(f"q{at}", "out", at, f"%v{index}")
             for index in step:
                 if index in places:
                     lines += _stored(f"b{index}", "between", places[index], f"%v{index}")
-                for at in targets.get(index, ()):
-                    lines += _stored(f"q{at}", "out", at, f"%v{index}")
         return lines
 
     def _step(self, step: list[int], functions: set[tuple[str, int]]) -> list[str]:
@@ -185,13 +201,13 @@ def _places(pieces: Sequence[_Piece]) -> dict[int, int]:
 
 
 def _levels(operations: Sequence[tuple], indices: Sequence[int]) -> list[list[int]]:
-    """Operations by how many of `VECTOR` come after each other on the way to them."""
+    """Operations by how many of `_AT_ONCE` come after each other on the way to them."""
     level: dict[int, int] = {}
     out: list[list[int]] = []
     for index in indices:
         operation = operations[index]
         before = max((level[x] for x in _operands(operation)), default=0)
-        level[index] = before + (operation[0] in VECTOR)
+        level[index] = before + (operation[0] in _AT_ONCE)
         while len(out) <= level[index]:
             out.append([])
         out[level[index]].append(index)
@@ -204,7 +220,7 @@ def _call_at_once(name: str, width: int, calls: list[tuple[int, Any]]) -> list[s
     kind, vector = f"<{width} x double>", "poison"
     for lane in range(width):  # the first once more where there are too few
         _, operand = calls[lane] if lane < len(calls) else calls[0]
-        word, made = _operand(operand), f"%{name}{calls[0][0]}_{lane}"
+        word, made = operand_word(operand), f"%{name}{calls[0][0]}_{lane}"
         lines.append(f"  {made} = insertelement {kind} {vector}, double {word}, i32 {lane}")
         vector = made
     result = f"%{name}{calls[0][0]}"
@@ -218,16 +234,10 @@ def _call_at_once(name: str, width: int, calls: list[tuple[int, Any]]) -> list[s
 
 def _single(index: int, kind: str, *operands: Any) -> str:
     """One operation of one number."""
-    words = [_operand(operand) for operand in operands]
+    words = [operand_word(operand) for operand in operands]
     if kind == "negate":
         return f"  %v{index} = fneg double {words[0]}"
     if kind in _CALLS:
         typed = ", ".join(f"double {word}" for word in words)
         return f"  %v{index} = call double {_CALLS[kind]}({typed})"
-    return f"  %v{index} = {_ARITHMETIC[kind]} {_FAST} double {words[0]}, {words[1]}"
-
-
-def _operand(operand: float | int) -> str:
-    if isinstance(operand, int):
-        return f"%v{operand}"
-    return real(operand)
+    return f"  %v{index} = {_ARITHMETIC[kind]} {FAST} double {words[0]}, {words[1]}"

@@ -258,18 +258,22 @@ def _cylinder(joint: str, item: Section, tree: TreeBuilder) -> Cylinder:
     return part_of(item, Cylinder, turning, joint=joint, **_areas(item, turning), **_holding(item))
 
 
-def _areas(item: Section, turning: bool) -> dict[str, float]:
-    """Areas of a cylinder whose bore and rod are given, of so many side by side."""
+def _areas(item: Section, turning: bool) -> dict[str, Any]:
+    """How many cylinders there are side by side, and their areas if bore and rod are given."""
     count = item.number("count", 1.0)
     if count != int(count) or count < 1:
         raise item.fail("count", f"'count' of {item.title} is {count:g}, give a whole number")
-    if "bore" not in item:
-        for key in ("rod", "count"):
-            if key in item:
-                raise item.fail(key, f"'{key}' of {item.title} goes with 'bore', give it")
-        return {}
     if turning:
-        raise item.fail("bore", f"{item.title} turns its joint, give area_a and area_b [m3/rad]")
+        for key in (*_BORED, "tube"):
+            if key in item and (key != "tube" or item.number(key)):
+                raise item.fail(
+                    key, f"{item.title} turns its joint, give area_a and area_b [m3/rad]"
+                )
+    given = {"count": int(count)}
+    if "bore" not in item:
+        if "rod" in item:
+            raise item.fail("rod", f"'rod' of {item.title} goes with 'bore', give it")
+        return given
     bore, rod = item.number("bore"), item.number("rod", 0.0, minimum=0.0)
     if not bore > rod:
         raise item.fail("bore", f"'bore' of {item.title} is {bore:g} m, give more than the rod")
@@ -279,7 +283,7 @@ def _areas(item: Section, turning: bool) -> dict[str, float]:
     for key, value in (("bore", bore), ("rod", rod)):
         warn_of_unit(item, key, value)
     area = count * math.pi / 4.0
-    return {"area_a": area * bore**2, "area_b": area * (bore**2 - rod**2)}
+    return given | {"area_a": area * bore**2, "area_b": area * (bore**2 - rod**2)}
 
 
 def _holding(item: Section) -> dict[str, Counterbalance]:

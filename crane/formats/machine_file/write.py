@@ -349,6 +349,7 @@ def _motor(joint: str, cylinder: dict[str, Any]) -> dict[str, Any]:
     own = {"displacement": cylinder["area_a"], "volume": cylinder["hose_a"]}
     own |= {key: cylinder[name] for key, name in MOTOR.items() if name is not None}
     usual = _all_numbers(Cylinder(joint, *2 * [own["displacement"]], *2 * [own["volume"]]))
+    usual["count"] = 1
     for name in cylinder.keys() - own.keys():
         if cylinder[name] != usual[name]:
             raise InputError(
@@ -360,7 +361,8 @@ def _motor(joint: str, cylinder: dict[str, Any]) -> dict[str, Any]:
 
 def _cylinder(cylinder: Cylinder) -> dict[str, Any]:
     fitted = {key: getattr(cylinder, key) for key in HOLDING if getattr(cylinder, key) is not None}
-    return _all_numbers(cylinder) | {key: _all_numbers(valve) for key, valve in fitted.items()}
+    data = _all_numbers(cylinder) | {key: _all_numbers(valve) for key, valve in fitted.items()}
+    return data | ({"count": cylinder.count} if cylinder.count > 1 else {})
 
 
 def _valve(valve: Valve, by_flow: bool = True) -> dict[str, Any]:

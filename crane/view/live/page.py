@@ -90,10 +90,10 @@ class Page:
         for key, value in dict(notes).items():
             try:
                 posture = self._do(key, value)
-            except CraneError as error:
-                self._warning.content = warning(str(error))
-                continue
-            self._show(posture)
+                self._show(posture)
+            except Exception as error:  # one window's mistake does not end it for the others
+                said = str(error) if isinstance(error, CraneError) else f"not done: {error!r}"
+                self._warning.content = warning(said)
 
     def advance(self) -> None:
         """Go on in the recording by the time since the last call."""
@@ -107,6 +107,9 @@ class Page:
 
     def _do(self, key: str, value: float) -> Readout:
         session = self._session
+        if key in self._sliders:
+            slider = self._sliders[key]
+            value = float(np.clip(value, slider.min, slider.max))
         if key == _LOAD:
             posture = session.load(value)
             self._stage.show_load()

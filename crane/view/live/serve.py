@@ -3,12 +3,14 @@
 import io
 import signal
 import socket
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from crane.common.errors import InputError, OutputError
+from crane.common.errors import CraneWarning, InputError, OutputError
+from crane.view.live.door import Door, hear_values_alone
 from crane.view.live.page import Page
 from crane.view.live.playback import Playback
 from crane.view.live.session import Session
@@ -38,12 +40,20 @@ def serve(
         OutputError: The port is taken.
     """
     requests: Requests = SimpleQueue()
+    door = Door(host)
     with _until_signal(requests):
-        server = start(host, port)
+        server = start(door, port)
         try:
+            if not door.alone:
+                warnings.warn(
+                    f"it listens on {host}, not on this computer alone: whoever has "
+                    "the address sees the machine and moves it, and it is sent unencrypted",
+                    CraneWarning,
+                    stacklevel=2,
+                )
             page = Page(server, session, playback, requests)
-            shown = f"[{host}]" if ":" in host else host
-            print(f"live view at http://{shown}:{server.get_port()} (Ctrl+C ends it)", flush=True)
+            address = door.address(server.get_port())
+            print(f"live view at {address} (Ctrl+C ends it)", flush=True)
             _work(page, requests)
         finally:
             stop(server)
@@ -57,17 +67,18 @@ def _work(page: Page, requests: Requests) -> None:
             page.advance()
 
 
-def start(host: str, port: int | None) -> Any:
-    """A viser server that says nothing and offers no address on other computers."""
+def start(door: Door, port: int | None) -> Any:
+    """A viser server behind a door, that says nothing and offers no address elsewhere."""
     try:
         import viser
     except ImportError:
         raise InputError(
             "a live view needs viser, install it: pip install 'crane-dynamics[live]'"
         ) from None
-    port = _free_port(host, port)
-    with redirect_stdout(io.StringIO()):
-        server: Any = viser.ViserServer(host=host, port=port, verbose=False)
+    port = _free_port(door.host, port)
+    with redirect_stdout(io.StringIO()), door.kept():
+        server: Any = viser.ViserServer(host=door.host, port=port, verbose=False)
+    hear_values_alone(server)
     # a page can ask for a public address on somebody else's server: not with ours
     server.request_share_url = lambda *_, **__: None
     return server
@@ -124,5 +135,5 @@ def _free_port(host: str, port: int | None) -> int:
                 problem = error.strerror or str(error)
             else:
                 return int(probe.getsockname()[1])
-    which = f"port {candidates[0]}" if port is not None else f"no port from {_FIRST} on"
-    raise OutputError(f"{host}: {which} can be listened on ({problem}), choose another port")
+    which = f"port {candidates[0]} cannot" if port is not None else f"no port from {_FIRST} on can"
+    raise OutputError(f"{host}: {which} be listened on ({problem}), choose another port")

@@ -1,0 +1,357 @@
+"""Forces in the joints: what the bodies of a machine do to each other, at rest and in motion."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from crane.closure.equations import turned
+from crane.common.errors import InputError
+from crane.common.samples import Array, as_samples
+from crane.description.external import PARTS
+from crane.dynamics.joint_forces import JointForces
+from crane.dynamics.lengths import LEAST
+from crane.machine import Machine
+
+_EDGE = 1e-10  # share of the largest pivot under which the closure is asked whether it ends there
+_NOTHING = 10.0  # times what loops may be open by: a share of a stress that is none
+
+
+class _Placed(NamedTuple):
+    """N postures.
+
+    Attributes:
+        turns: (N, nj + 1, 3, 3) of all bodies in the world, that of the world first.
+        origins: (N, nj + 1, 3) likewise [m].
+        columns: (N, 6, nv) of the joints, at the world's origin.
+        ends: (N, 2 l, 3, 3) and (N, 2 l, 3), the loops' frames.
+        rows: (N, r, 6) the loops' equations as wrenches at the world's origin.
+        slopes: (N, m, nv) of all equations, in shares of the machine's size.
+    """
+
+    turns: Array
+    origins: Array
+    columns: Array
+    ends: tuple[Array, Array]
+    rows: Array
+    slopes: Array
+
+
+class Reactions:
+    """Wrenches in the joints of a machine with closed loops.
+
+    With tau the forces along the tree's joints that its motion asks for (rnea) less those of
+    wrenches from outside and of springs and ropes between frames, f what acts along single joints
+    passively, tau_F friction, I_r rotor inertias, and the loops' Jacobian Phi, the multipliers
+    lambda of the loops follow from the passive rows P of the balance along the joints, and the
+    drives' forces u from the active rows A:
+
+        Phi_P^T lambda = (tau - f + tau_F + I_r a)_P,
+        u = (tau - f + tau_F + I_r a)_A - Phi_A^T lambda.
+
+    A loop holds its successor with the wrench sum lambda_r w_r, its predecessor with the opposite;
+    what remains for a joint of the tree is the balance of all bodies that it carries.
+
+    A joint's wrench is all that goes across it, along its axis also the drive, friction, springs
+    and stops on the joint, and what a coupling does (a gear: its teeth act on each joint alike).
+    What acts between frames beside the joints is none of it.
+
+    **What is not determined.** A loop may have more equations than its bodies need to be held:
+    those of a planar linkage in space also hold it in its plane, once for every loop too many.
+    Forces along pins and moments across them then depend on how stiff the bodies are and how well
+    they fit, which no file says; so do all components of a part that stresses itself. Taken is the
+    least-norm solution, forces counted times the machine's size, as the smallest that bodies have
+    which fit; `determined` tells which components do not depend on that. Drive forces do not, and
+    equal `Dynamics.inverse`, to the digits that the loops are closed by.
+
+    Args:
+        machine: The machine; its payload and parameters are those at this moment.
+
+    Attributes:
+        names: (k,) of the tree's joints in Pinocchio's order, then of the loops.
+
+    Source: Featherstone 2008, Rigid Body Dynamics Algorithms, 8.2, 8.5 (loop-closure forces).
+    """
+
+    def __init__(self, machine: Machine):
+        if not isinstance(machine, Machine):
+            raise InputError(f"{machine!r} is not a machine, load it with crane.load")
+        self.machine, self._forces = machine, JointForces(machine)
+        self._model = model = pin.Model(machine.model)
+        self._data = model.createData()
+        self._equations = equations = machine.closure.equations
+        self.names = (*list(model.names)[1:], *(loop.name for loop in equations.loops))
+        self._moved = machine.coordinates.joints - 1  # by column, the joint in the wrenches' order
+        # whether a joint (column) carries a body (row), and a loop's successor but not predecessor
+        self._carries = np.zeros((model.njoints, model.njoints - 1))
+        for body in range(1, model.njoints):
+            self._carries[body, [joint - 1 for joint in model.supports[body] if joint]] = 1.0
+        self._bodies = [joint for joint, _ in equations.frames]
+        ends = self._carries[self._bodies]
+        self._around = ends[1::2] - ends[::2]
+        self._signs = equations.sign[equations.loop_of_row[: len(equations.axis1)]]
+        self._owners = np.eye(len(equations.loops))[:, equations.loop_of_row[: len(self._signs)]]
+        # z along the axis, as the loops' frames have it
+        of = machine.tree.joints
+        self._axes = np.array(
+            [turned(of[x].axis) if x in of else np.eye(3) for x in list(model.names)[1:]]
+        ).reshape(-1, 3, 3)
+
+    def at(
+        self,
+        q: ArrayLike,
+        v: ArrayLike | None = None,
+        a: ArrayLike | None = None,
+        wrenches: Mapping[str, ArrayLike] | None = None,
+        friction: bool = False,
+    ) -> Array:
+        """The wrenches by which what carries a joint acts on what the joint moves.
+
+        Of a loop: by which its predecessor acts on its successor.
+
+        Args:
+            q: (nq,) or (N, nq) closed postures [m], [rad].
+            v: The same shape, velocities gamma v_A; at rest if not given [m/s], [rad/s].
+            a: The same shape, accelerations gamma a_A + drift; those at a_A = 0 if not given
+                [m/s2], [rad/s2].
+            wrenches: From outside by link (6,) or (N, 6), force [N] and moment about the origin of
+                its frame [N m], in the world's axes.
+            friction: Whether there is friction; see `Dynamics.inverse` for what it is at rest.
+
+        Returns:
+            (k, 6) or (N, k, 6) in the order of `names`: force [N] and moment about the joint's
+            origin, of a loop that of its successor's frame [N m], in the world's axes.
+
+        Raises:
+            InputError: Unknown link, or shapes that do not go together.
+            BranchEdgeError: The passive joints are not determined there.
+        """
+        return self._solved(q, v, a, wrenches, friction)[0]
+
+    def drives(
+        self,
+        q: ArrayLike,
+        v: ArrayLike | None = None,
+        a: ArrayLike | None = None,
+        wrenches: Mapping[str, ArrayLike] | None = None,
+        friction: bool = False,
+    ) -> Array:
+        """Forces u of the active joints that go with `at`, (n,) or (N, n) [N], [N m].
+
+        Args:
+            q: See `at`.
+            v: See `at`.
+            a: See `at`.
+            wrenches: See `at`.
+            friction: See `at`.
+        """
+        return self._solved(q, v, a, wrenches, friction)[1]
+
+    def unit(self, q: ArrayLike, link: str) -> Array:
+        """What a force at a link's origin adds to the wrenches, per force.
+
+        Args:
+            q: (nq,) or (N, nq) closed postures [m], [rad].
+            link: Where it acts.
+
+        Returns:
+            (k, 6, 3) or (N, k, 6, 3): `at` of a unit force in the world's x, y, z, less that
+            without.
+        """
+        body, place = self._end(link)
+        rows, stacked = self._stack(q, "q")
+        placed = self._place(rows)
+        point = self._points(placed, body, place)
+        push = np.broadcast_to(np.eye(3), (len(rows), 3, 3))
+        load = np.concatenate([push, np.cross(point[:, :, None], push, axis=1)], axis=1)
+        held = -self._carries[body][None, :, None, None] * load[:, None]
+        none = np.zeros((len(rows), self._model.nv, 3))
+        out = self._held(placed, rows, held, none)[0]
+        return out if stacked else out[0]
+
+    def axes(self, q: ArrayLike) -> Array:
+        """The joints' own axes in the world, (k, 3, 3) or (N, k, 3, 3) with x, y, z as columns.
+
+        z is the axis that the joint turns about or slides along, of a loop that which it leaves
+        free; x and y lie across it in what the joint moves. With them a force (3,) is
+        axes^T force: across the pin x, y, along it z.
+
+        Args:
+            q: (nq,) or (N, nq) closed postures [m], [rad].
+        """
+        rows, stacked = self._stack(q, "q")
+        out = self._own(self._place(rows))
+        return out if stacked else out[0]
+
+    def determined(self, q: ArrayLike) -> NDArray[np.bool_]:
+        """Which components of the wrenches statics determines, in the joints' own `axes`.
+
+        Those that no stress of the bodies in themselves has, that is no lambda with
+        Phi_P^T lambda = 0.
+
+        Args:
+            q: (nq,) or (N, nq) closed postures [m], [rad].
+
+        Returns:
+            (k, 6) or (N, k, 6), three forces and three moments.
+        """
+        rows, stacked = self._stack(q, "q")
+        placed = self._place(rows)
+        passive = self.machine.closure.passive
+        basis = np.linalg.qr(placed.slopes[:, :, passive], mode="complete")[0]
+        stress = basis[:, :, len(passive) :]
+        none = np.zeros((len(rows), len(self._axes), 6, stress.shape[2]))
+        wrenches = self._gathered(placed, none, stress / self._equations.row_units[:, None])
+        halves = wrenches.reshape(*wrenches.shape[:2], 2, 3, -1)
+        own = np.einsum("nkab,nkhac->nkhbc", self._own(placed), halves)
+        own[:, :, 0] *= self._equations.size
+        least = _NOTHING * self.machine.closure.structure.surplus.allowed
+        out = np.abs(own).max(axis=-1, initial=0.0).reshape(len(rows), -1, 6) < least
+        return out if stacked else out[0]
+
+    def _solved(
+        self,
+        q: ArrayLike,
+        v: ArrayLike | None,
+        a: ArrayLike | None,
+        wrenches: Mapping[str, ArrayLike] | None,
+        friction: bool,
+    ) -> tuple[Array, Array]:
+        """Wrenches and drives."""
+        rows, stacked = self._stack(q, "q")
+        moves = np.zeros_like(rows) if v is None else self._like(v, rows, "v")
+        if a is not None:
+            gains = self._like(a, rows, "a")
+        else:
+            gains = np.zeros_like(rows) if v is None else self.machine.closure.drift(rows, moves)
+        nv, forces = self._model.nv, self._forces
+        held = np.empty((len(rows), len(self._axes), 6))
+        placed = self._place(rows, held, moves, gains)
+        along, _ = forces.along(rows, moves)
+        for ends, force in zip(forces.lengths.ends, along[:, nv:].T, strict=True):
+            one, two = (self._points(placed, *end) for end in ends)
+            way = two - one
+            push = force[:, None] * way / np.maximum(np.linalg.norm(way, axis=1), LEAST)[:, None]
+            for end, sign in zip(ends, (-1.0, 1.0), strict=True):
+                self._load(placed, held, end, sign * np.hstack([push, 0 * push]))
+        for link, given in (wrenches or {}).items():
+            wrench = as_samples(given, 6, f"the wrench on '{link}'", PARTS)
+            if wrench.ndim == 2 and (not stacked or len(wrench) != len(rows)):
+                raise InputError(
+                    f"the wrench on '{link}' has {len(wrench)} samples and q "
+                    f"{len(rows) if stacked else 'is one'}, give as many"
+                )
+            self._load(placed, held, self._end(link), wrench)
+        own = along[:, :nv] - self._model.armature * gains
+        if friction:
+            own -= forces.friction(moves) + forces.starting(moves, gains)
+        found, drives = self._held(placed, rows, held[..., None], own[..., None])
+        wrench, drive = found[..., 0], drives[..., 0]
+        return (wrench, drive) if stacked else (wrench[0], drive[0])
+
+    def _end(self, link: str) -> tuple[int, Array]:
+        """The body that carries a link, and where its origin is in that body's frame."""
+        frame = self._model.frames[self.machine.frame(link)]
+        return int(frame.parentJoint), frame.placement.translation
+
+    def _load(self, placed: _Placed, held: Array, end: tuple[int, Array], wrench: Array) -> None:
+        """Take a wrench (6,) or (N, 6) about a point of a body off what joints hold."""
+        about = np.array(np.broadcast_to(wrench, (len(held), 6)))
+        about[:, 3:] += np.cross(self._points(placed, *end), about[:, :3])
+        held -= self._carries[end[0]][:, None] * about[:, None]
+
+    def _held(self, placed: _Placed, q: Array, held: Array, own: Array) -> tuple[Array, Array]:
+        """Wrenches about the joints' origins and drives, of c cases at once.
+
+        Args:
+            placed: The postures.
+            q: (N, nq) the same.
+            held: (N, nj, 6, c) what each joint carries, as if there were no loops, at the world's
+                origin.
+            own: (N, nv, c) what acts along the joints beside the drives.
+
+        Returns:
+            (N, k, 6, c) and (N, n, c).
+        """
+        closure, equations = self.machine.closure, self._equations
+        asked = np.einsum("nsi,nisc->nic", placed.columns, held[:, self._moved]) - own
+        slopes = placed.slopes[:, :, closure.passive]
+        turn, pivots = np.linalg.qr(slopes)
+        size = np.abs(np.diagonal(pivots, axis1=1, axis2=2))
+        if (edge := size.min(axis=1, initial=1.0) < _EDGE * size.max(axis=1, initial=0.0)).any():
+            closure.gamma(q[edge])
+        right = equations.units[closure.passive, None] * asked[:, closure.passive]
+        # least squares of numbers that are the same whatever the machine's size
+        shares = turn @ np.linalg.solve(np.swapaxes(pivots, 1, 2), right)
+        lambdas = shares / equations.row_units[:, None]
+        pull = np.einsum("nmi,nmc->nic", placed.slopes[:, :, closure.active], shares)
+        drives = asked[:, closure.active] - pull / equations.units[closure.active, None]
+        return self._gathered(placed, held, lambdas), drives
+
+    def _gathered(self, placed: _Placed, held: Array, lambdas: Array) -> Array:
+        """Wrenches (N, k, 6, c) about the joints' origins, under multipliers (N, m, c)."""
+        loaded = placed.rows[..., None] * lambdas[:, : placed.rows.shape[1], None, :]
+        loops = np.einsum("lr,nrsc->nlsc", self._owners, loaded)
+        joints = held - np.einsum("lj,nlsc->njsc", self._around, loops)
+        out = np.concatenate([joints, loops], axis=1)
+        at = np.concatenate([placed.origins[:, 1:], placed.ends[1][:, 1::2]], axis=1)
+        out[:, :, 3:] -= np.cross(at[..., None], out[:, :, :3], axis=2)
+        return out
+
+    def _place(
+        self,
+        q: Array,
+        held: Array | None = None,
+        v: Array | None = None,
+        a: Array | None = None,
+    ) -> _Placed:
+        """Postures (N, nq), and into `held` what joints carry (N, nj, 6) at the world's origin."""
+        model, data, equations = self._model, self._data, self._equations
+        configurations = self.machine.coordinates.configuration(q)
+        columns = np.empty((len(q), 6, model.nv))
+        bodies = np.empty((len(q), model.njoints, 4, 4))
+        placements, carried = list(data.oMi), list(data.f)[1:]  # seen as they change
+        for i, at in enumerate(configurations):
+            columns[i] = pin.computeJointJacobians(model, data, at).reshape(6, -1)
+            bodies[i] = [placement.homogeneous for placement in placements]
+            if held is not None and v is not None and a is not None:
+                pin.rnea(model, data, at, v[i], a[i])
+                held[i] = [force.vector for force in carried]
+        turns, origins = bodies[..., :3, :3], bodies[..., :3, 3]
+        if held is not None:
+            held[..., :3] = (turns[:, 1:] @ held[..., :3, None])[..., 0]
+            held[..., 3:] = (turns[:, 1:] @ held[..., 3:, None])[..., 0]
+            held[..., 3:] += np.cross(origins[:, 1:], held[..., :3])
+        local = [placement for _, placement in equations.frames]
+        rotated = np.array([x.rotation for x in local]).reshape(-1, 3, 3)
+        moved = np.array([x.translation for x in local]).reshape(-1, 3)
+        of = turns[:, self._bodies]
+        ends = of @ rotated, (of @ moved[..., None])[..., 0] + origins[:, self._bodies]
+        rows = equations.wrenches(*ends)
+        slopes = np.empty((len(q), len(equations.row_units), model.nv))
+        slopes[:, : rows.shape[1]] = self._signs * (rows @ columns)
+        slopes[:, rows.shape[1] :] = equations.factors
+        slopes *= equations.units / equations.row_units[:, None]
+        return _Placed(turns, origins, columns, ends, rows, slopes)
+
+    def _own(self, placed: _Placed) -> Array:
+        return np.concatenate([placed.turns[:, 1:] @ self._axes, placed.ends[0][:, 1::2]], axis=1)
+
+    def _points(self, placed: _Placed, body: int, place: Array) -> Array:
+        """(N, 3) of a point of a body in the world."""
+        out: Array = placed.origins[:, body] + placed.turns[:, body] @ place
+        return out
+
+    def _stack(self, value: ArrayLike, what: str) -> tuple[Array, bool]:
+        given = as_samples(value, self._model.nv, what, self.machine.joints)
+        if not given.size:
+            raise InputError(f"{what} is an empty stack, give at least one sample")
+        return np.atleast_2d(given), given.ndim == 2
+
+    def _like(self, value: ArrayLike, q: Array, what: str) -> Array:
+        given = self._stack(value, what)[0]
+        if given.shape != q.shape:
+            raise InputError(f"{what} has {len(given)} samples and q {len(q)}, give as many")
+        return given
