@@ -1,5 +1,6 @@
 """Rated loads as they are shown: pressures, table, pictures, page and command."""
 
+import csv
 import json
 import math
 import re
@@ -174,6 +175,12 @@ def test_the_command_writes_tables_pictures_and_page(tmp_path):
     assert "50 % of the tipping load" in out and "written to chart" in out
     files = {path.name for path in (tmp_path / "chart").iterdir()}
     assert files == {"capacity.md", "capacity.csv", "capacity.png", "sheet.pdf", "capacity.html"}
+    lines = (tmp_path / "chart" / "capacity.csv").read_text(encoding="utf-8").splitlines()
+    rows = list(csv.DictReader(line for line in lines if line[0] != "#"))
+    # a level load slews nothing
+    level = [row for row in rows if row["load_holding_pressure_slew [kg]"] == ""]
+    assert len(rows) > 50 and len(level) == len(rows)
+    assert all(float(row["load [kg]"]) >= 0 for row in rows)
     assert (tmp_path / "chart" / "sheet.pdf").read_bytes()[:5] == b"%PDF-"
     assert (tmp_path / "chart" / "capacity.md").read_text(encoding="utf-8") in out
     assert typed(*words, cwd=tmp_path).returncode == 2  # not over what is there
@@ -186,6 +193,7 @@ def test_the_command_writes_tables_pictures_and_page(tmp_path):
         (["--tipping", "1.5"], "--tipping is 1.5, give a number from"),
         (["--hydraulic", "0"], "--hydraulic is 0.0, give a number above 0"),
         (["--slew", "front"], "--slew is 'front', write degrees, as 0,45,90"),
+        (["--slew", "0,1,2,3,4,5,6,7,8"], "--slew has 9 angles, a page has room for 8"),
         (["--slew", "0,nan"], "slews must be angles"),
         (["--slope", "60"], "--slope is 60.0 degrees, give a number from -45 to 45"),
         (["--step", "0"], "the step is 0.0 m"),

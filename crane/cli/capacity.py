@@ -25,6 +25,8 @@ from crane.common.errors import InputError
 if TYPE_CHECKING:
     from crane.ratings import Rule
 
+_MOST = 8  # slew angles that a page shows
+
 
 @app.command()
 def capacity(
@@ -118,6 +120,9 @@ def _angles(text: str) -> list[float]:
         InputError: Something else is written.
     """
     try:
-        return [float(word) for word in text.split(",")]
+        angles = [float(word) for word in text.split(",")]
     except ValueError:
         raise InputError(f"--slew is '{text}', write degrees, as 0,45,90") from None
+    if len(angles) > _MOST:
+        raise InputError(f"--slew has {len(angles)} angles, a page has room for {_MOST}")
+    return angles

@@ -6,7 +6,7 @@ import numpy as np
 
 from crane.common.samples import Array
 from crane.dynamics.statics import Statics
-from crane.ratings.causes import Causes
+from crane.motion.workspaces.section import upwards
 from crane.ratings.strength import strengths
 
 if TYPE_CHECKING:
@@ -30,24 +30,28 @@ def chamber_pressures(chart: "Capacity") -> dict[str, Array]:
         By joint (s, b, a, 2) of chambers A and B [Pa]; NaN where there is no load, or no end to
         it.
     """
-    machine = chart.machine
-    statics = Statics(machine, chart.frame)
-    causes = Causes(
-        statics, strengths(machine, chart.raising, chart.friction), chart.rule, chart.slope
-    )
+    machine, up = chart.machine, upwards(chart.machine)
+    if machine.hydraulics is None:
+        return {}
     here = np.isfinite(chart.loads)
-    load = chart.loads[here]
-    out: dict[str, Array] = {}
-    at = statics.at(machine.closure.solve(np.ascontiguousarray(chart.q_a[here])))
-    for bound in causes.bounds:
-        drive = bound.drive
-        if drive is None or not drive.pressures or machine.hydraulics is None:
+    load, tank = chart.loads[here], machine.hydraulics.supply.tank
+    q = machine.closure.solve(np.ascontiguousarray(chart.q_a[here]))
+    at = Statics(machine, chart.frame).at(q)
+    weight = float(np.linalg.norm(machine.model.gravity.linear))
+    out = {}
+    for drive in strengths(machine, chart.raising, chart.friction):
+        if not drive.pressures:
             continue
-        a, b, c, d = causes.terms(bound, at)
-        beyond = a + b * load + np.linalg.norm(c + d * load[:, None], axis=1)  # F above the end
-        side = 0 if bound.sign > 0 else 1
-        pressure = drive.pressures[side] + beyond / drive.areas[side]
-        shape = (*chart.loads.shape, 2)
-        both = out.setdefault(drive.joint, np.full(shape, np.nan))
-        both[here, side] = np.maximum(pressure, machine.hydraulics.supply.tank)
+        i = drive.column
+        moved = at.slopes[:, :, i] + load[:, None] * at.ways[:, :, i]
+        rises = moved @ up
+        level = weight * np.cos(chart.slope) * rises - at.passive[:, i]
+        aside = np.linalg.norm(moved - rises[:, None] * up, axis=1)
+        leans = weight * np.sin(chart.slope) * aside
+        beyond = level + leans - drive.most, drive.least - level + leans
+        both = np.full((*chart.loads.shape, 2), np.nan)
+        for side in (0, 1):
+            pressure = drive.pressures[side] + beyond[side] / drive.areas[side]
+            both[here, side] = np.maximum(pressure, tank)
+        out[drive.joint] = both
     return out

@@ -78,7 +78,7 @@ def column(table: Table, name: str, unit: str | None = None) -> Array:
 
 
 def write(path: str | Path, table: Table) -> None:
-    """Write a table, whole or not at all.
+    """Write a table, whole or not at all; what is NaN is an empty cell.
 
     Raises:
         OutputError: It cannot be written there.
@@ -100,7 +100,8 @@ def write_columns(
         file.write("\n".join(head) + "\n")
         for start in range(0, len(columns[0]), _ROWS_AT_ONCE):
             rows = np.column_stack([x[start : start + _ROWS_AT_ONCE] for x in columns])
-            file.write("".join([",".join(map(repr, row)) + "\n" for row in rows.tolist()]))
+            text = "".join([",".join(map(repr, row)) + "\n" for row in rows.tolist()])
+            file.write(text.replace("nan", "") if np.isnan(rows).any() else text)
 
 
 def read(path: str | Path) -> Table:
