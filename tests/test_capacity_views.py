@@ -1,6 +1,7 @@
 """Rated loads as they are shown: pressures, table, pictures, page and command."""
 
 import csv
+import dataclasses
 import json
 import math
 import re
@@ -141,6 +142,18 @@ def test_pictures_name_all_causes(chart):
     for text in sheet.texts:  # nothing runs off the page
         box = text.get_window_extent()
         assert page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1
+
+
+def test_names_are_drawn_as_they_are(chart, tmp_path):
+    """No mathematics, no HTML."""
+    odd = dataclasses.replace(chart.machine, name=r"$\bad$ <b>_crane", supports=())
+    bare = dataclasses.replace(chart, machine=odd)
+    sheet = sheet_figure(bare)
+    sheet.canvas.draw()
+    assert any(r"\$\bad\$ <b>_crane" in text.get_text() for text in sheet.texts)
+    capacity_figure(bare).canvas.draw()
+    text = write_capacity_page(bare, tmp_path / "odd.html").read_text(encoding="utf-8")
+    assert "<b>" not in text and "&lt;b&gt;" in text
 
 
 def test_the_page_holds_the_chart(chart, tmp_path):

@@ -13,6 +13,7 @@ from crane.ratings.tables import LoadTable, load_table
 from crane.ratings.words import facts, note, shares, sides
 from crane.view.plots.capacity import colours, draw_panel, extent, heading
 from crane.view.plots.recording import FAINT, INK, STYLE, write_figure
+from crane.view.plots.text import literal, plain
 
 _WIDE, _TALL, _EDGE = 11.69, 8.27, 0.45  # A4 on its side, and what printers leave white [inch]
 _LINE = 0.152  # between lines [inch]
@@ -40,13 +41,13 @@ def sheet_figure(chart: Capacity) -> Figure:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(_WIDE, _TALL))
         top = _TALL - _EDGE
-        figure.text(_EDGE / _WIDE, top / _TALL, heading(chart), va="top", fontsize=13,
+        figure.text(_EDGE / _WIDE, top / _TALL, plain(heading(chart)), va="top", fontsize=13,
                     fontweight="bold")  # fmt: skip
         _write(figure, _EDGE, _EDGE, note(chart, table), colour="#555555")
         foot = _EDGE + 1.6 * _LINE
         head = _draw_table(figure, chart, table, foot)
-        _draw_charts(figure, chart, head + 0.2, top - _HEAD)
-        _draw_facts(figure, chart, top - _HEAD)
+        beside = _draw_charts(figure, chart, head + 0.2, top - _HEAD)
+        _draw_facts(figure, chart, beside, top - _HEAD)
     return figure
 
 
@@ -60,12 +61,16 @@ def _write(
     **options: object,
 ) -> None:
     """A line of text at a place [inch]."""
-    words = text.replace("$", r"\$")
+    words = literal(text)
     figure.text(x / _WIDE, y / _TALL, words, fontsize=size, color=colour, **options)  # type: ignore[arg-type]
 
 
-def _draw_charts(figure: Figure, chart: Capacity, bottom: float, top: float) -> None:
-    """One panel per slew angle, beside what they hold for."""
+def _draw_charts(figure: Figure, chart: Capacity, bottom: float, top: float) -> float:
+    """One panel per slew angle.
+
+    Returns:
+        Where they end on the right [inch].
+    """
     low, high = extent(chart)
     many, room = len(chart.slews), _WIDE - 2 * _EDGE - _FACTS
     shape = (high - low)[1] / (high - low)[0]
@@ -84,11 +89,12 @@ def _draw_charts(figure: Figure, chart: Capacity, bottom: float, top: float) -> 
         draw_panel(axes, chart, k)
         if column:
             axes.set_ylabel("")
+    return _EDGE + columns * (wide + 0.55)
 
 
-def _draw_facts(figure: Figure, chart: Capacity, top: float) -> None:
+def _draw_facts(figure: Figure, chart: Capacity, left: float, top: float) -> None:
     """What the loads hold for, and what ends them, in the colours of the charts."""
-    left, y = _WIDE - _EDGE - _FACTS + 0.2, top - 0.1
+    left, y = left + 0.2, top - 0.1
     letters = int((_FACTS - 0.2) * 72 / (0.56 * _WORDS))
     for name, text in facts(chart):
         for i, line in enumerate(textwrap.wrap(f"{name}: {text}", letters)):
