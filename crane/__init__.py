@@ -13,6 +13,7 @@ if TYPE_CHECKING:
         ComputedTorque,
         Controller,
         Law,
+        Phases,
         Sampled,
         Signals,
         TipVelocity,
@@ -31,8 +32,9 @@ if TYPE_CHECKING:
         Rope,
         Sensor,
     )
-    from crane.description.external import ExternalForce, Pushing, Wrench
+    from crane.description.external import ExternalForce, PhasedWrench, Pushing, Wrench
     from crane.description.ground import Contact, Ground
+    from crane.description.phases import Phase
     from crane.description.soil import SOILS, Cutting, Soil
     from crane.dynamics import Dynamics
     from crane.dynamics.buckling import Buckling
@@ -90,6 +92,7 @@ if TYPE_CHECKING:
     from crane.simulation.symbolic import casadi_function
     from crane.studies import (
         PowerAccount,
+        PowerComparison,
         Study,
         SwayStudy,
         power_account,
@@ -105,10 +108,11 @@ LOADED = time.time()  # before any other file of the package was read
 _HOMES = {
     "crane.closure": "Closure",
     "crane.common.errors": "CraneError CraneWarning",
-    "crane.control": "PI Command ComputedTorque Controller Law Sampled Signals TipVelocity "
+    "crane.control": "PI Command ComputedTorque Controller Law Phases Sampled Signals TipVelocity "
     "ValveDrive ValveFeedforward ValvePD fastest joystick",
     "crane.description": "EndStop ForceElement Friction GasSpring PIGains Rope Sensor",
-    "crane.description.external": "ExternalForce Pushing Wrench",
+    "crane.description.phases": "Phase",
+    "crane.description.external": "ExternalForce PhasedWrench Pushing Wrench",
     "crane.description.ground": "Contact Ground",
     "crane.description.soil": "SOILS Cutting Soil",
     "crane.dynamics": "Dynamics",
@@ -139,7 +143,7 @@ _HOMES = {
     "crane.simulation": "Batch Comparison Gradient InterruptedRun LinearModel Sensitivities "
     "gradient linear_models linearize replay sensitivities simulate simulate_batch",
     "crane.simulation.symbolic": "casadi_function",
-    "crane.studies": "PowerAccount Study SwayStudy power_account study sway_study",
+    "crane.studies": "PowerAccount PowerComparison Study SwayStudy power_account study sway_study",
     "crane.view.page": "report",
     "crane.view.sketch": "sketch sketch_circuit",
 }
@@ -149,18 +153,19 @@ __all__ = [
     "ComputedTorque", "Contact", "Controller", "CraneError", "CraneWarning", "Cutting",
     "Dynamics", "EndStop", "Excitation", "ExternalForce", "ForceElement", "Friction", "GasSpring",
     "Gradient", "Ground", "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel",
-    "Machine", "PDGains", "PI", "PIGains", "Payload", "PowerAccount", "Pushing", "Reactions",
-    "Recording", "Rope", "Rule", "SOILS", "Sampled", "Sensitivities", "Sensor",
-    "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy", "TipVelocity", "Torques",
-    "Trajectory", "Turning", "ValveDrive", "ValveFeedforward", "ValvePD", "Workspace", "Wrench",
-    "add_cylinder", "add_loops", "calibrate", "capacity", "casadi_function", "check",
-    "cross_validate", "excite", "excite_valves", "fastest", "gradient", "identify",
-    "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
-    "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
-    "power_account", "read_measured", "read_path", "replay", "report", "retimed", "sensitivities",
-    "simulate", "simulate_batch", "sketch", "sketch_circuit", "study", "sway_study",
-    "task_trajectory", "tip_trajectory", "torques", "via_attitudes", "via_points", "without_sway",
-    "workspace", "write_machine", "write_mjcf", "write_urdf_plus",
+    "Machine", "PDGains", "PI", "PIGains", "Payload", "Phase", "PhasedWrench", "Phases",
+    "PowerAccount", "PowerComparison", "Pushing", "Reactions", "Recording", "Rope", "Rule",
+    "SOILS", "Sampled", "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study",
+    "Sway", "SwayStudy", "TipVelocity", "Torques", "Trajectory", "Turning", "ValveDrive",
+    "ValveFeedforward", "ValvePD", "Workspace", "Wrench", "add_cylinder", "add_loops",
+    "calibrate", "capacity", "casadi_function", "check", "cross_validate", "excite",
+    "excite_valves", "fastest", "gradient", "identify", "identify_cylinder_friction",
+    "identify_orifices", "identify_payload", "identify_valve", "joystick", "linear_models",
+    "linearize", "load", "point_to_point", "polynomial", "power_account", "read_measured",
+    "read_path", "replay", "report", "retimed", "sensitivities", "simulate", "simulate_batch",
+    "sketch", "sketch_circuit", "study", "sway_study", "task_trajectory", "tip_trajectory",
+    "torques", "via_attitudes", "via_points", "without_sway", "workspace", "write_machine",
+    "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 

@@ -165,6 +165,57 @@ def test_pumps_stay_below_their_hyperbola(cycles):
         assert used.max() > 0.9 * sum(pump.power for pump in sources.values())
 
 
+@pytest.fixture(scope="module")
+def trucks():
+    """Trucks loaded by hand and eye: every lever is held until its joint is there."""
+    found = {}
+    for name, changes in (
+        ("excavator", {"supply.droop": 2e5}), ("excavator_ls", {}), ("excavator_two_pumps", {}),
+    ):  # fmt: skip
+        machine = crane.load(name, changes=changes)
+        under = machine.under(*machine.tasks["load_truck"].loads)
+        levers = crane.joystick(under, "load_truck")
+        found[name] = machine, crane.simulate(under, levers, step=1e-2)
+    return found
+
+
+@pytest.mark.slow
+def test_trucks_are_loaded_by_positions(trucks):
+    """Each phase ends at the sample at which the last of its joints passes; the cycle closes."""
+    for machine, run in trucks.values():
+        first, clock = 0, run.channels["phase"]
+        for k, phase in enumerate(machine.tasks["load_truck"].phases):
+            passed = []
+            for joint, end in phase.until.items():
+                q = run.q[first:, machine.active.index(joint)]
+                passed.append(first + int((phase.levers[joint] * (q - end) >= 0).argmax()))
+            # the clock is a look late
+            assert clock[max(passed)] < k + 1 and clock[max(passed) + 1] >= k + 1, phase.name
+            first = max(passed)
+        assert np.abs(run.q[-1] - run.q[0]).max() < 0.1
+        assert run.channels["depth_teeth"].max() > 0.3 and run.channels["stability"].min() > 0
+        assert np.ptp(run.q[:, 0]) == pytest.approx(np.pi / 2, abs=0.15)
+
+
+@pytest.mark.slow
+def test_trucks_take_time_or_power(trucks):
+    """A pump without a limit is the fastest one, by far more work; the account holds in all."""
+    times, works = [], []
+    for machine, run in trucks.values():
+        account = crane.power_account(machine, run)
+        largest = max(np.abs(power).max() for power in account.powers.values())
+        assert np.abs(account.residual).max() <= 1e-9 * largest
+        seen = run.channels
+        outside = sum(seen[name] for name in seen if name.startswith("work_"))
+        stored = seen["kinetic"] + seen["potential"]
+        gap = seen["work"] + outside - (stored - stored[0]) - seen["dissipated"]
+        assert np.abs(gap).max() < 1e-6 * np.ptp(stored)
+        times.append(run.time[-1])
+        works.append(account.totals["shaft"])
+    assert times[0] < min(times[1:]) - 0.3 and max(times) < 16.5
+    assert works[0] > 1.5 * max(works[1:]) and works[1] > works[2]
+
+
 SAVING = """extends: {base}
 name: saving
 hydraulics:

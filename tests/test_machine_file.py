@@ -280,13 +280,14 @@ KEYS = [
     ),
     case(
         "task without motion",
-        "four_bar.yaml:37: task 'reach' has none of 'tip', 'active', 'via', 'joystick', give one",
+        "four_bar.yaml:37: task 'reach' has none of 'tip', 'active', 'via', 'joystick', 'phases', "
+        "give one",
         swap("    tip: {x: [0.4], y: [0.3, 0.01], z: [0]}\n", ""),
     ),
     case(
         "task with two motions",
         "four_bar.yaml:37: task 'reach' has more than one of 'tip', 'active', "
-        "'via', 'joystick', give one",
+        "'via', 'joystick', 'phases', give one",
         swap(
             "    tip: {x: [0.4], y: [0.3, 0.01], z: [0]}\n",
             "    tip: {x: [0.4], y: [0.3, 0.01], z: [0]}\n    active: {crank: [1]}\n",

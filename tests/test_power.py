@@ -12,7 +12,9 @@ from work import at_most
 
 import crane
 from crane.recordings import Recording
+from crane.studies.power_comparison import PowerComparison
 from crane.view.plots.power import power_figure
+from crane.view.plots.power_comparison import power_comparison_figure
 from crane.view.plots.sankey import sankey_figure
 
 G, SUPPLY, TANK, SPEED = 9.81, 9.25e6, 1e5, 0.05
@@ -375,3 +377,74 @@ def test_pictures_have_words_that_do_not_overlap(request, which):
             assert box.y0 >= 0, text
     shaft = account.energies["supply.shaft"] / 1e3
     assert any(f"{shaft:.3g} kJ" in x.get_text() for x in sankey_figure(account).axes[0].texts)
+
+
+def compared(patu, **more):
+    account = crane.power_account(*patu)
+    half = crane.power_account(patu[0], patu[1].between(0.0, 3.0))
+    return PowerComparison({"whole run": account, "half": half}, **more)
+
+
+def test_runs_beside_each_other(patu):
+    """Each one's classes sum to its shafts; time, peak, work per mass as by hand."""
+    found = compared(patu, moved=500.0)
+    for run, account in found.accounts.items():
+        assert sum(found.classes(run).values()) == pytest.approx(account.totals["shaft"], rel=1e-9)
+    whole = found.accounts["whole run"]
+    assert found.classes("whole run")["load"] == pytest.approx(whole.totals["load"], rel=1e-12)
+    rows = {
+        cells[0]: cells[1:]
+        for line in found.to_markdown().splitlines()
+        if len(cells := [cell.strip() for cell in line.strip("|").split("|")]) == 3
+    }
+    assert rows["time [s]"] == ["6.00", "3.00"]
+    peaks = [f"{x.shaft.max() / 1e3:.1f}" for x in found.accounts.values()]
+    assert rows["peak of them [kW]"] == peaks
+    work = np.trapezoid(whole.shaft, whole.time)
+    assert rows["work per kg of 500 [J/kg]"][0] == f"{work / 500:.0f}"
+    assert "fuel [g]" not in rows
+
+
+def test_a_picture_of_runs_beside_each_other(patu, mixed):
+    """Its words do not overlap, and stay within."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    four = {name: crane.power_account(*mixed) for name in "abcd"}
+    for comparison in (compared(patu), PowerComparison(four)):
+        figure = power_comparison_figure(comparison)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        bars = figure.axes[1]
+        words = [*bars.texts, *bars.get_yticklabels(), *figure.legends[0].get_texts()]
+        boxes = [x.get_window_extent(canvas.get_renderer()) for x in words]
+        for one, other in itertools.combinations(boxes, 2):
+            assert not one.overlaps(other)
+        for box in boxes:
+            assert box.x0 >= 0 and box.y0 >= 0
+            assert box.x1 <= figure.bbox.x1 and box.y1 <= figure.bbox.y1
+    assert f"| fuel [g] | {1e3 * four['a'].fuel:.1f} |" in PowerComparison(four).to_markdown()
+
+
+def test_the_command_compares(patu, tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        patu[1].to_csv(tmp_path / name / "recording.csv")
+    paths = tmp_path / "one", "--beside", tmp_path / "two"
+    done = typed("power", "patu655", *paths, "--moved", "211", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert sorted(x.name for x in (tmp_path / "out").iterdir()) == [
+        "comparison.md", "comparison.png",
+    ]  # fmt: skip
+    assert "| one | two |" in done.stdout
+    for options, line in (
+        (("--moved", "211"), "--moved is for a comparison, name the other runs with --beside"),
+        (("--beside", tmp_path / "one"), "is given twice, leave one out"),
+        (("--beside", tmp_path / "no"), "no"),
+        (
+            ("--beside", tmp_path / "two", "--moved", "0"),
+            "the mass that is moved is 0.0 kg, give a number above 0",
+        ),
+    ):
+        done = typed("power", "patu655", tmp_path / "one", *options, "--out", tmp_path / "bad")
+        assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+        assert line in done.stderr and not (tmp_path / "bad").exists()

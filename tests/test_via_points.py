@@ -539,7 +539,7 @@ TIP = "x: 8, y: 0, z: 0.3"
         ([f"time: 0, {TIP}", f"time: 2, {TIP}"], "    duration: 3\n", 2,
          "task 'go' ends at its last point, leave 'duration' out"),
         ([f"time: 0, {TIP}", f"time: 2, {TIP}"], "    active: {slew: [0]}\n", 2,
-         "task 'go' has more than one of 'tip', 'active', 'via', 'joystick', give one"),
+         "task 'go' has more than one of 'tip', 'active', 'via', 'joystick', 'phases', give one"),
         ([f"time: 0, {TIP}", f"time: 2, {TIP}"], "    start: {slew: 0}\n", 2,
          "task 'go' starts at its first, leave 'start' out"),
     ],

@@ -270,7 +270,8 @@ def _describe(machine: "Machine") -> Iterator[str]:
         where = [f"{sensor.column} [{sensor.unit}]" if sensor.unit else sensor.column]
         yield f"  sensor      {name}: {', '.join([x for x in where if x] + known) or 'ideal'}"
     for task in machine.tasks.values():
-        yield f"  task        {task.name}, {task.duration:g} s: {task.description}"
+        most = "at most " * bool(task.phases)
+        yield f"  task        {task.name}, {most}{task.duration:g} s: {task.description}"
 
 
 def _limits(lower: float, upper: float, unit: str) -> str:

@@ -36,10 +36,7 @@ def run_demo(folder: Path, progress: Progress) -> str:
                 progress((done + _SIMULATED * share) / len(runs))
 
             control = control_of(machine, task, None)
-            duration = machine.tasks[task].duration
-            recording = simulate(
-                under_task(machine, task), control, duration=duration, label=task, progress=report
-            )
+            recording = simulate(under_task(machine, task), control, label=task, progress=report)
             texts.append(write_run(part / task, recording))
             write_views(part / task, machine, recording)
         text = "\n".join(texts)

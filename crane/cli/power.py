@@ -1,5 +1,6 @@
 """The command on where a hydraulic run's power goes: power."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -24,6 +25,7 @@ from crane.cli.shared import (
     span_of,
     status,
 )
+from crane.common.errors import InputError
 
 
 @app.command()
@@ -47,19 +49,66 @@ def power(
     columns: Columns = None,
     since: From = None,
     until: Until = None,
+    beside: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="RECORDING",
+            help="Another run to compare with, of the machine that it names: one table, one "
+            "picture. May be repeated.",
+        ),
+    ] = None,
+    moved: Annotated[
+        float | None,
+        typer.Option(metavar="KG", help="Mass that each run moves, for the work per kg."),
+    ] = None,
     force: Force = False,
 ) -> None:
     """Tell where the power of a run's pumps goes: losses by part, loads, what is stored, fuel."""
-    from crane.cli.runs import check_folder, read_run, write_power
+    from crane.cli.runs import (
+        check_folder,
+        machine_of,
+        read_run,
+        write_power,
+        write_power_comparison,
+    )
     from crane.control.valves import circuit_of
     from crane.studies.power import power_account
+    from crane.studies.power_comparison import PowerComparison
 
     check_folder(out, force)
+    if moved is not None and not beside:
+        raise InputError("--moved is for a comparison, name the other runs with --beside")
+    names = _names([recording, *(beside or ())])
     span = span_of(since, until)
     loaded = load(machine, lock, change, active, free, floating, packages, argument)
     circuit_of(loaded)  # before anything is read
     run = read_run(recording, loaded, columns, span)
     with status("adding up"):
         account = power_account(loaded, run)
-    print(write_power(out, account), end="")
+    if not beside:
+        print(write_power(out, account), end="")
+        print(f"\nwritten to {out}")
+        return
+    accounts = {names[0]: account}
+    for name, path in zip(names[1:], beside, strict=True):
+        other = read_run(path, None, columns, span)
+        machine_ = machine_of(path, other.machine)
+        circuit_of(machine_)
+        with status("adding up"):
+            accounts[name] = power_account(machine_, other)
+    print(write_power_comparison(out, PowerComparison(accounts, moved)), end="")
     print(f"\nwritten to {out}")
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """What runs are called: by their folders or files, whole paths where two are alike.
+
+    Raises:
+        InputError: A run is given twice.
+    """
+    short = [path.stem if path.suffix else path.name for path in paths]
+    found = short if len(set(short)) == len(paths) else [str(path) for path in paths]
+    for name in found:
+        if found.count(name) > 1:
+            raise InputError(f"the run '{name}' is given twice, leave one out")
+    return found

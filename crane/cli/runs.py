@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from crane.simulation.linear import LinearModel
     from crane.simulation.sensitivity import Sensitivities
     from crane.studies.power import PowerAccount
+    from crane.studies.power_comparison import PowerComparison
 
 RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
 COMPARISON = "comparison.md"
@@ -230,6 +231,24 @@ def write_power(folder: Path, account: "PowerAccount") -> str:
         account.to_csv(part / "power.csv")
         plot_power(account, part / "power.png")
         plot_sankey(account, part / "sankey.png")
+    return text
+
+
+def write_power_comparison(folder: Path, comparison: "PowerComparison") -> str:
+    """Write table and picture into a folder, created where there is none.
+
+    Returns:
+        The table, Markdown.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.plots.power_comparison import plot_power_comparison
+
+    text = f"# power of {', '.join(comparison.accounts)}\n\n{comparison.to_markdown()}"
+    with staging(folder) as part:
+        (part / "comparison.md").write_text(text, encoding="utf-8")
+        plot_power_comparison(comparison, part / "comparison.png")
     return text
 
 

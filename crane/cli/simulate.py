@@ -202,8 +202,8 @@ def under_task(machine: "Machine", task: str | None) -> "Machine":
     return machine.under(*machine.tasks[task].loads)
 
 
-def duration_of(machine: "Machine", task: str | None, duration: float | None) -> float:
-    """How long a simulation takes [s].
+def duration_of(machine: "Machine", task: str | None, duration: float | None) -> float | None:
+    """How long a simulation takes [s], None of what ends by itself.
 
     Raises:
         InputError: Nothing tells.
@@ -213,7 +213,7 @@ def duration_of(machine: "Machine", task: str | None, duration: float | None) ->
     if task is None:
         tasks = ", ".join(machine.tasks) or "none"
         raise InputError(f"no task: name a --task ({tasks}), or a --duration to let it go")
-    return machine.tasks[task].duration
+    return None if machine.tasks[task].phases else machine.tasks[task].duration
 
 
 def _replay(

@@ -142,7 +142,7 @@ class ValveDrive(Law):
         if not self.period:
             return self._source.references(times)[:, : len(self.delays)]
         every = [self._source.references(times[i : i + 1]) for i in range(len(times))]
-        return np.vstack(every)
+        return np.vstack(every)[:, : len(self.delays)]
 
     def breaks(self) -> Array:
         """Times (k,) [s] at which signals turn, as they are commanded and as they arrive."""
@@ -197,7 +197,8 @@ class ValveDrive(Law):
             out += [pump.share, pump.shaft]
         if self.circuit.hydraulics.engine is not None and instant.pumps:
             out.append(instant.speed * self.circuit.hydraulics.engine.speed)
-        return out
+        m = len(self.delays)
+        return [*out, *at.reference[m : m + len(self.command.channels)]]
 
     def _at(self, at: At) -> tuple[Instant, Sequence[Number]]:
         """The circuit, and the signals of its valves."""
@@ -236,7 +237,7 @@ class ValveDrive(Law):
             found += [(f"share_{name}", ""), (f"shaft_{name}", "W")]
         if self.circuit.hydraulics.engine is not None and self.circuit.pumps:
             found.append(("engine_speed", "rad/s"))
-        return tuple(found)
+        return (*found, *self.command.channels)
 
     @property
     def _others(self) -> list[str]:

@@ -14,12 +14,12 @@ from crane.common.errors import InputError, known
 from crane.common.magnitudes import meant
 from crane.common.samples import Array, as_number, as_sample
 from crane.control.base import At
-from crane.hydraulics import Hydraulics, PDGains
+from crane.hydraulics import Hydraulics, PDGains, Valve
+from crane.hydraulics.components import Spool
 from crane.machine import Machine
 from crane.motion.curves import Trajectory
 from crane.motion.trajectories import with_free
 
-_LONGEST = 4000.0  # of levers [s], what a simulation can have of milliseconds
 _LOGGED = 0.02  # [s] between samples of a log, at most
 _STRAIGHT = 1e-12  # of a signal, that slopes differ by over its shortest step where it goes on
 _SAME = 1e-9  # of a period, between instants that are one
@@ -41,6 +41,10 @@ class Command(Protocol):
         period: Time between calls of `update` [s]; 0 if it wants none.
         given: Whether the first m references are the signals, whatever the machine does, and those
             of instants that have passed are remembered.
+        duration: How long it takes, at most [s]; 0 where it does not know.
+        ended: Whether it has no more to do: a run that was given no duration ends then.
+        channels: Names and units of what its references have behind the signals, to be recorded.
+        clock: Tells its phase (N,) at times (N,) [s]; None where it has none.
     """
 
     reference: Trajectory | None = None
@@ -49,6 +53,10 @@ class Command(Protocol):
     settings: Array = np.zeros(0)
     period: float = 0.0
     given: bool = False
+    duration: float = 0.0
+    ended: bool = False
+    channels: tuple[tuple[str, str], ...] = ()
+    clock: Callable[[Array], Array] | None = None
 
     def update(self, time: float, q: Array, v_a: Array, pressures: Array) -> None:
         """Think about the next period, given (nq,), (n,), (m, 2) [Pa]."""
@@ -77,6 +85,15 @@ def circuit_of(machine: Machine) -> Hydraulics:
     return machine.hydraulics
 
 
+def signal_of(spool: Valve | Spool, lever: Array) -> Array:
+    """Signals of a spool (.,) [V] for a lever (.,) from -1 to 1, a share of its valve's flow.
+
+    Beyond zero it jumps over the dead band, as the electronics of such machines do.
+    """
+    u = lever * (1.0 - spool.dead_band) + spool.dead_band * np.sign(lever)
+    return np.asarray(spool.neutral + (spool.full - spool.neutral) * u)
+
+
 class Signals(Command):
     """Signals given in time, straight between the instants and constant beyond them.
 
@@ -90,6 +107,7 @@ class Signals(Command):
 
     Attributes:
         title: What they come from, in words; recordings name their controller by it.
+        duration: From zero to the last instant [s].
 
     Raises:
         InputError: Unknown joints, wrong lengths, or times that do not increase.
@@ -145,14 +163,10 @@ class Signals(Command):
                 )
         self._values = np.asfortranarray(np.column_stack(columns))  # read column by column
         self._count = len(circuit.spools)
+        self.duration = float(self._time[-1])
 
     def _column(self, values: ArrayLike, what: str) -> Array:
         return as_sample(values, len(self._time), what)
-
-    @property
-    def duration(self) -> float:
-        """From zero to the last instant [s]."""
-        return float(self._time[-1])
 
     def breaks(self) -> Array:
         """Times (k,) [s] at which signals turn; none of a log, whose samples are close."""
@@ -177,67 +191,6 @@ class Signals(Command):
     def signals(self, at: At) -> Sequence[Number]:
         """See `Command`."""
         return at.reference[: self._count]
-
-
-def joystick(
-    machine: Machine, points: Mapping[str, Sequence[tuple[float, float]]] | str
-) -> Signals:
-    """Signals of levers: per joint a polygon of (time [s], lever from -1 to 1), or a task's name.
-
-    A lever moves both spools of a valve that has two; JOINT_b names a lever of the second alone. A
-    task begins at its own `start`. The lever asks for a share of the valve's flow: beyond zero
-    it jumps over the dead band, as the electronics of such machines do.
-
-    Raises:
-        InputError: Unknown joints or task, levers beyond -1 to 1, or times that do not increase.
-    """
-    circuit = circuit_of(machine)
-    last, start = 0.0, None
-    if isinstance(points, str):
-        task = machine.tasks.get(points)
-        if task is None or task.space != "joystick":
-            names = [name for name, task in machine.tasks.items() if task.space == "joystick"]
-            raise InputError(f"'{points}' is no task of levers, {known(names, points)}")
-        if task.start:
-            start = machine.check_limits(
-                [
-                    task.start.get(joint, machine.home[machine.column(joint)])
-                    for joint in machine.active
-                ],
-                f"the start of task '{points}'",
-            )
-        points, last = task.levers, task.duration
-    corners: dict[str, tuple[Array, Array]] = {}
-    for joint, polygon in points.items():
-        if joint not in circuit.spools:
-            raise InputError(f"no valve for '{joint}', {known(circuit.spools, joint)}")
-        try:
-            table = np.array(polygon, dtype=np.float64)
-        except (TypeError, ValueError):
-            table = np.zeros(0)
-        if table.shape[1:] != (2,) or not len(table):
-            raise InputError(f"lever of '{joint}': give pairs of time and position")
-        if not (np.diff(table[:, 0]) > 0).all() or not (np.abs(table[:, 1]) <= 1).all():
-            raise InputError(
-                f"lever of '{joint}': give increasing times and positions from -1 to 1"
-            )
-        corners[joint] = table[:, 0], table[:, 1]
-    # between corners the dead band is jumped where a lever passes zero: fine steps, not corners
-    last = max([last, *(times[-1] for times, _ in corners.values())])
-    if not 0 < last <= _LONGEST:
-        raise InputError(f"the levers end at {last:g} s, give times up to {_LONGEST:g} s")
-    fine = np.linspace(0.0, last, max(2, round(last / 1e-3) + 1))
-    signals = {}
-    for name, spool in circuit.spools.items():
-        by = name if name in corners else spool.joint
-        if by not in corners:
-            continue
-        lever = np.interp(fine, *corners[by])
-        u = lever * (1.0 - spool.dead_band) + spool.dead_band * np.sign(lever)
-        signals[name] = spool.neutral + (spool.full - spool.neutral) * u
-    found = Signals(machine, fine, signals)
-    found.title, found.start = "joystick", start
-    return found
 
 
 class ValvePD(Command):

@@ -372,6 +372,7 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
                     for x, lever in task.levers.items()
                     if x not in lock and (x not in spools or spools[x].joint not in lock)
                 },
+                phases=tuple(x for phase in task.phases if (x := phase.without(lock)).levers),
                 start={x: value for x, value in task.start.items() if x not in lock},
                 loads=tuple(filter(moves, task.loads)),
             )

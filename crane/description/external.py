@@ -1,6 +1,7 @@
 """Forces from outside: wrenches at frames of a machine, by time, place and velocity."""
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -152,6 +153,49 @@ class Wrench(ExternalForce):
         if self.axes == "frame":
             return times(here.turn, force), times(here.turn, moment)
         return force, moment
+
+
+class PhasedWrench(Wrench):
+    """A wrench over the phases of a task of levers in place of time, straight in between.
+
+    Args:
+        frame: See `ExternalForce`.
+        force: See `Wrench`.
+        moment: See `Wrench`.
+        phases: (N,) rising: 0 as the first phase begins, 1.5 when the second is half done.
+        axes: See `Wrench`.
+        name: See `ExternalForce`.
+
+    Attributes:
+        clock: Tells the phase (N,) at times (N,) [s]; None until a run has one, see `ticking`.
+    """
+
+    clock: Callable[[Array], Array] | None = None
+
+    def __init__(
+        self,
+        frame: str,
+        force: ArrayLike = (0.0, 0.0, 0.0),
+        moment: ArrayLike = (0.0, 0.0, 0.0),
+        phases: ArrayLike | None = None,
+        axes: str = "world",
+        name: str = "",
+    ):
+        super().__init__(frame, force, moment, phases, axes, name)
+
+    def ticking(self, clock: Callable[[Array], Array]) -> "PhasedWrench":
+        """The same by the clock of a run."""
+        found = copy(self)
+        found.clock = clock
+        return found
+
+    def references(self, times: Array) -> Array:
+        """See `ExternalForce`."""
+        return super().references(times if self.clock is None else self.clock(times))
+
+    def breaks(self) -> Array:
+        """See `ExternalForce`: when phases end is not known before."""
+        return np.zeros(0)
 
 
 class Pushing(ExternalForce):

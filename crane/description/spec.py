@@ -10,6 +10,7 @@ from crane.common.errors import InputError
 from crane.common.samples import as_number
 from crane.description.estimation import Estimation
 from crane.description.external import ExternalForce, Wrench
+from crane.description.phases import Phase
 from crane.description.sensors import Sensor
 from crane.description.tree import Joint, Tree, Vector
 from crane.hydraulics.components import Hydraulics
@@ -369,6 +370,7 @@ class Via:
     rates: Mapping[str, float] = field(default_factory=dict)
 
 
+RAMP = 0.3  # [s] in which a hand moves a lever from neutral to its end
 TIP = ("x", "y", "z")  # coordinates of tasks of the tip
 ATTITUDES = (("inclination",), ("roll", "pitch", "yaw"))  # and of how its frame is turned
 
@@ -380,7 +382,7 @@ class Task:
     Attributes:
         name: The task's name.
         description: One line on what it is.
-        duration: [s].
+        duration: [s]; at most, where phases end by positions.
         space: "tip" (coordinates x, y, z of the world), "active" (the active joints), or
             "joystick" (levers of valves).
         coefficients: Per coordinate the polynomial in time [s], lowest power first [m], [rad].
@@ -388,6 +390,8 @@ class Task:
         levers: Per joint, or JOINT_b of a second spool, a polygon of time [s] and lever, -1 to 1.
         loads: What acts from outside while it is done, beside what always does.
         start: Active coordinates where levers begin [m], [rad]; at home where not given.
+        phases: Of levers that are held until positions, in the place of polygons.
+        ramp: How long a hand takes from neutral to a full lever there [s].
     """
 
     name: str
@@ -399,6 +403,8 @@ class Task:
     loads: tuple[Wrench, ...] = ()
     via: tuple[Via, ...] = ()
     start: Mapping[str, float] = field(default_factory=dict)
+    phases: tuple[Phase, ...] = ()
+    ramp: float = RAMP
 
     @property
     def coordinates(self) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -33,7 +33,7 @@ from crane.description import (
     inertia_problem,
 )
 from crane.description.estimation import Estimation
-from crane.description.external import ExternalForce
+from crane.description.external import ExternalForce, PhasedWrench
 from crane.description.rigid import loaded
 from crane.description.sources import WITH
 from crane.description.tree import Tree
@@ -424,6 +424,26 @@ class Machine:
             if [other.name for other in every].count(force.name) > 1:
                 raise InputError(f"two loads are called '{force.name}', give them names")
         return dataclasses.replace(self, external=every)
+
+    def timed(self, clock: Callable[[Array], Array] | None) -> "Machine":
+        """The same machine, with the forces that count phases by the clock of a run.
+
+        Args:
+            clock: Tells the phase (N,) at times (N,) [s]; None where there are none.
+
+        Raises:
+            InputError: There is no clock for them.
+        """
+        phased = [force for force in self.external if isinstance(force, PhasedWrench)]
+        if not phased:
+            return self
+        if clock is None:
+            raise InputError(
+                f"the load '{phased[0].name}' counts phases, simulate it with the task of levers "
+                "that has them"
+            )
+        every = (x.ticking(clock) if x in phased else x for x in self.external)
+        return dataclasses.replace(self, external=tuple(every))
 
     def with_payload(self, payload: Payload) -> "Machine":
         """The same machine carrying a payload.

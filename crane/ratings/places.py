@@ -67,6 +67,8 @@ class Places:
         high: (n,) upper limits.
         pair: The two strokes, among the active joints.
         others: Further strokes that move it.
+        postures: (N, nq) closed ones all over the strokes.
+        reach: (N, 2) their places.
 
     Raises:
         InputError: Fewer than two strokes move the frame in its section, or more than four.
@@ -111,8 +113,8 @@ class Places:
         self._patches = list(self._filled())
         if not self._patches:
             raise InputError(f"no posture of '{machine.name}' closes on the way from home")
-        every = np.concatenate([patch.q[patch.closed] for patch in self._patches])
-        self.reach = self.section.coordinates(statics.at(every).tip)
+        self.postures = np.concatenate([patch.q[patch.closed] for patch in self._patches])
+        self.reach = self.section.coordinates(statics.at(self.postures).tip)
 
     def _filled(self) -> list[Patch]:
         """Patches over the pair, at levels of the other strokes."""

@@ -110,7 +110,14 @@ def simulate_batch(
             beyond[i] = text
         dynamics = Dynamics(machine)
         time, rows, notes = integrate(
-            dynamics, control, starts[i], steps, step, method, tolerance=tolerance
+            dynamics,
+            control,
+            starts[i],
+            steps,
+            step,
+            method,
+            tolerance=tolerance,
+            ends=duration is None,
         )
         energy = np.hstack([rows.kinetic, rows.potential, rows.work[:, :1], rows.lost])
         q_a = rows.q[:, machine.closure.active]

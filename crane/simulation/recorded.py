@@ -6,7 +6,7 @@ import numpy as np
 
 from crane.codegen import Parts
 from crane.common.samples import Array
-from crane.control import Controller, Free, Signals, ValveDrive, reference_of
+from crane.control import Controller, Free, ValveDrive, reference_of
 from crane.description.external import PARTS
 from crane.dynamics.joint_forces import sticking
 from crane.dynamics.stability import Stability, has_supports
@@ -142,6 +142,5 @@ def _point(name: str, positions: Array) -> Iterator[Column]:
 def _name_of(control: Controller) -> str:
     """What drives the machine: what its command calls itself, or the name of its class."""
     if isinstance(control, ValveDrive):
-        command = control.command
-        return command.title if isinstance(command, Signals) else type(command).__name__
+        return getattr(control.command, "title", type(control.command).__name__)
     return "" if isinstance(control, Free) else type(control).__name__

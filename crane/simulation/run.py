@@ -59,6 +59,10 @@ _CONTROLLED: dict[str, Stepper] = {
 }
 
 
+class _EndedError(Exception):
+    """What commands the valves has no more to do."""
+
+
 class InterruptedRun(KeyboardInterrupt):
     """A run that was interrupted.
 
@@ -103,7 +107,8 @@ def simulate(
             force, and valves at their neutral signal where the machine has any.
         initial: Active coordinates (n,) to start at rest from, or a pair (q_a, v_a); the start of
             the controller's reference, or of its levers, at rest, or else the home posture.
-        duration: [s]; that of the controller's reference if not given.
+        duration: [s]; that of the controller's reference or levers if not given, which ends where
+            the last of their phases does.
         step: [s].
         label: Name of the motion to put into the recording, as its `task`.
         backend: "compiled" or "pinocchio", see `Dynamics`.
@@ -150,12 +155,13 @@ def simulate(
     if text := reference_beyond(machine, control, steps * step):
         warnings.warn(text, CraneWarning, stacklevel=2)
     dynamics = Dynamics(machine, formulation, backend)
+    ends = duration is None
     time, rows, notes = integrate(
-        dynamics, control, initial, steps, step, method, progress, tolerance
+        dynamics, control, initial, steps, step, method, progress, tolerance, ends=ends
     )
     for note in notes:
         warnings.warn(note, CraneWarning, stacklevel=2)
-    if len(time) <= steps:
+    if len(time) <= steps and not (ends and _has_ended(control)):
         if text := limits_passed(machine, time, rows.q):
             warnings.warn(text, CraneWarning, stacklevel=2)
         cut = f"cut at {time[-1]:g} s of {steps * step:g} s"
@@ -180,6 +186,7 @@ def integrate(
     progress: Progress | None = None,
     tolerance: float | None = None,
     chart: Chart | None = None,
+    ends: bool = False,
 ) -> tuple[Array, Parts, list[str]]:
     """What `simulate` computes, without channels; see there for arguments and errors.
 
@@ -193,10 +200,12 @@ def integrate(
         progress: See `simulate`.
         tolerance: See `simulate`.
         chart: The machine in its own coordinates, for who wants to know when what stuck.
+        ends: Whether to end where what commands the valves has no more to do.
 
     Returns:
         Times (N,), what `crane.simulation.integration.row_layout` names, (N, .) each, and what is
-        to be said of the motion. N is smaller than there are steps where it was interrupted.
+        to be said of the motion. N is smaller than there are steps where it was interrupted, or
+        has ended.
     """
     machine = dynamics.machine
     q_a, v_a = start_of(machine, initial, control)
@@ -220,6 +229,8 @@ def integrate(
     def report(done: int) -> None:
         if progress is not None:
             progress(done / (steps + 1))
+        if ends and done and _has_ended(control):
+            raise _EndedError
 
     try:
         integration.run(times[:-1], state, step, rows, report)
@@ -230,7 +241,7 @@ def integrate(
         raise explained(
             machine, halt, times[:done], q_a, reference_of(control, machine), finer
         ) from None
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, _EndedError):
         done = integration.done
         if not done:
             raise
@@ -238,6 +249,10 @@ def integrate(
     if progress is not None:
         progress(1.0)
     return times, layout.view(rows), [*integration.notes, *chart.sticking.notes]
+
+
+def _has_ended(control: Controller) -> bool:
+    return isinstance(control, ValveDrive) and control.command.ended
 
 
 def fixed(dynamics: Dynamics, control: Controller, method: str | None) -> bool:
@@ -337,7 +352,15 @@ def as_controller(controller: Controller | Command | Force | None, machine: Mach
 
 
 def as_driven(machine: Machine, control: Controller) -> Machine:
-    """The machine without seals and brakes where no circuit says what presses them."""
+    """The machine with what acts on it by the controller's clock.
+
+    And without seals and brakes where no circuit says what presses them.
+
+    Raises:
+        InputError: A load counts phases, and the controller has none.
+    """
+    clock = control.command.clock if isinstance(control, ValveDrive) else None
+    machine = machine.timed(clock)
     hydraulics = machine.hydraulics
     if hydraulics is None or not hydraulics.gripped or isinstance(control, ValveDrive):
         return machine
@@ -349,16 +372,18 @@ def as_driven(machine: Machine, control: Controller) -> Machine:
 
 
 def count_steps(control: Controller, duration: float | None, step: float) -> int:
-    """Steps [s] in a duration [s], that of the controller's reference if not given.
+    """Steps [s] in a duration [s], that of the controller's reference or levers if not given.
 
     Raises:
         InputError: There is no duration, there are too many steps, or no whole number of them.
     """
     if duration is None:
-        reference = getattr(control, "reference", None)
-        if reference is None:
+        known_by = getattr(control, "reference", None)
+        if known_by is None and isinstance(control, ValveDrive) and control.command.duration:
+            known_by = control.command
+        if known_by is None:
             raise InputError("no duration and no reference to take it from, give a duration")
-        duration = reference.duration
+        duration = known_by.duration
     duration = as_number(duration, "the duration", "s", above=0)
     step = as_number(step, "the step", "s", above=0)
     if duration / step > _MOST:

@@ -29,6 +29,17 @@ PARTS = (
     SHAFT, "friction", "slip", "relief", "bypass", "element", "inlet", "compensator", "outlet",
     "regeneration", "leak", "refill", "damper", "cooling", LOAD, *STORED,
 )  # fmt: skip
+CLASSES = (  # what belongs together of that
+    LOAD, "friction", "outlet", "inlet", "compensator", "leaks and relief", "pump", "elements",
+    "stored",
+)  # fmt: skip
+_CLASSES = {
+    "friction": "friction", "damper": "friction", "outlet": "outlet", "float": "outlet",
+    "inlet": "inlet", "regeneration": "inlet", "compensator": "compensator",
+    "leak": "leaks and relief", "relief": "leaks and relief", "refill": "leaks and relief",
+    "element": "elements", "cooling": "elements", LOAD: LOAD, "stored": "stored",
+    "spring": "stored",
+}  # fmt: skip
 _TOLD = 1e-4  # share of the shafts' energy that a table tells
 _HEAD = ("item", "energy [kJ]", "share", "back [kJ]", "mean [kW]", "peak [kW]")
 
@@ -186,6 +197,14 @@ def kind_of(name: str) -> str:
     """Which total a part belongs to: "shaft", "load", "stored", or "lost"."""
     what = what_of(name)
     return "stored" if what in STORED else what if what in (SHAFT, LOAD) else "lost"
+
+
+def class_of(account: PowerAccount, name: str) -> str:
+    """What a part belongs to that is not a shaft, of `CLASSES`."""
+    what = what_of(name)
+    if owner_of(name) in account.pumps and what != "stored":
+        return "pump"
+    return _CLASSES[what]
 
 
 def power_account(machine: Machine, recording: Recording) -> PowerAccount:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,6 +42,8 @@ _DESCRIBED = (
 )  # fmt: skip
 
 Progress = Callable[[float], None]
+J = TypeVar("J")
+R = TypeVar("R")
 
 # One machine per set of formulas: as long as it lives, variants share its machine code.
 _KEPT: dict[int, Machine] = {}
@@ -123,7 +125,7 @@ def study(
         for row in values
     ]
     rows: dict[int, tuple[dict[str, float], str]] = {}
-    for index, row in _computed(jobs, processes, scheduler):
+    for index, row in computed(variant, jobs, processes, scheduler):
         rows[index] = row
         if progress is not None:
             progress(len(rows) / len(jobs))
@@ -255,19 +257,26 @@ def _unit(machine: Machine, head: str, rest: list[str]) -> str:
     return {"mass": "kg", "x": "m", "y": "m", "z": "m"}.get(last, "rad")
 
 
-def _computed(
-    jobs: list[Job], processes: int, scheduler: str | None
-) -> Iterator[tuple[int, tuple[dict[str, float], str]]]:
-    """Indices and rows as they get ready."""
-    if scheduler is not None:
-        from crane.studies.cluster import computed
+def computed(
+    function: Callable[[J], R], jobs: Sequence[J], processes: int, scheduler: str | None
+) -> Iterator[tuple[int, R]]:
+    """Indices and results of jobs as they get ready, here or elsewhere.
 
-        yield from computed(variant, jobs, scheduler)
+    Args:
+        function: What is computed; other processes import it from this package.
+        jobs: Its arguments.
+        processes: How many compute.
+        scheduler: Address of a Dask scheduler whose workers compute instead.
+    """
+    if scheduler is not None:
+        from crane.studies.cluster import computed as by_workers
+
+        yield from by_workers(function, jobs, scheduler)
     elif processes <= 1 or len(jobs) == 1:
         for index, job in enumerate(jobs):
-            yield index, variant(job)
+            yield index, function(job)
     else:
-        yield from _by_processes(jobs, min(processes, len(jobs)))
+        yield from _by_processes(function, jobs, min(processes, len(jobs)))
 
 
 def _end_with_parent() -> None:
@@ -283,13 +292,13 @@ def _end_with_parent() -> None:
 
 
 def _by_processes(
-    jobs: list[Job], processes: int
-) -> Iterator[tuple[int, tuple[dict[str, float], str]]]:
+    function: Callable[[J], R], jobs: Sequence[J], processes: int
+) -> Iterator[tuple[int, R]]:
     # threads would wait for each other: most of a variant is computed in Python
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(processes, context, initializer=_end_with_parent)
     try:
-        futures = {pool.submit(variant, job): index for index, job in enumerate(jobs)}
+        futures = {pool.submit(function, job): index for index, job in enumerate(jobs)}
         for future in as_completed(futures):
             yield futures[future], future.result()
     except BrokenProcessPool:

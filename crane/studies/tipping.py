@@ -88,6 +88,5 @@ def _run(machine: Machine, task: str) -> Recording:
     chosen = machine.tasks[task]
     under = machine.under(*chosen.loads)
     if chosen.space == "joystick":
-        levers = joystick(machine, task)
-        return simulate(under, levers, duration=chosen.duration, step=_STEP)
+        return simulate(under, joystick(machine, task), step=_STEP)
     return simulate(under, ComputedTorque(machine, task_trajectory(machine, task)), step=_STEP)

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from crane.common.errors import InputError, known
-from crane.description.external import ExternalForce, Wrench
+from crane.description.external import ExternalForce, PhasedWrench, Wrench
 from crane.description.findings import recoverable
 from crane.description.ground import DAMPING, FRICTION, SMOOTHING, STIFFNESS, Contact, Ground
 from crane.description.soil import SOILS, Cutting, Soil
@@ -41,10 +41,11 @@ def _frame(item: Section, tree: TreeBuilder) -> str:
     return frame
 
 
-def read_loads(top: Section, tree: TreeBuilder) -> Iterator[Wrench]:
-    """The section `loads` of a machine or of a task."""
-    keys = ("frame", "force", "moment", "times", "axes", "name")
-    for item in top.sections("loads", "load of", *keys):
+def read_loads(top: Section, tree: TreeBuilder, phased: bool = False) -> Iterator[Wrench]:
+    """The section `loads` of a machine or of a task, which may have phases."""
+    clocks = ("times", *["phases"] * phased)
+    for item in top.sections("loads", "load of", "frame", "force", "moment", *clocks, "axes",
+                             "name"):  # fmt: skip
         with recoverable():
             yield _wrench(item, _frame(item, tree))
 
@@ -54,10 +55,13 @@ def _wrench(item: Section, frame: str) -> Wrench:
         raise item.fail(None, f"the load on '{frame}' does nothing, give force or moment")
     rows = (item.rows(key, (0.0, 0.0, 0.0)) for key in ("force", "moment"))
     force, moment = (part[0] if len(part) == 1 else part for part in rows)
-    times = item.numbers("times") if "times" in item else None
+    if "times" in item and "phases" in item:
+        raise item.fail("phases", f"the load on '{frame}' has times and phases, give one of both")
+    clock = next((key for key in ("times", "phases") if key in item), None)
+    kind = PhasedWrench if clock == "phases" else Wrench
     axes, name = item.text("axes", "world"), item.text("name", "")
     try:
-        return Wrench(frame, force, moment, times, axes, name)
+        return kind(frame, force, moment, clock and item.numbers(clock), axes, name)
     except InputError as error:
         raise item.fail(None, str(error)) from None
 
@@ -194,7 +198,8 @@ def load_data(force: Wrench) -> dict[str, Any]:
     several = len(force.times) > 1
     for key, part in (("force", force.values[:, :3]), ("moment", force.values[:, 3:])):
         data[key] = part.tolist() if several else part[0].tolist()
-    return data | ({"times": force.times.tolist()} if several else {})
+    clock = "phases" if isinstance(force, PhasedWrench) else "times"
+    return data | ({clock: force.times.tolist()} if several else {})
 
 
 def _named(force: ExternalForce) -> dict[str, str]:

@@ -158,7 +158,7 @@ def _read_machine(path: Path) -> MachineSpec:
             where |= circuit_places(top)
         if hydraulics is not None and not isinstance(active, Anything):
             valves = tuple(hydraulics.spools)
-        tasks = _part(read_tasks, tasks, top, tree, active, tip, valves)
+        tasks = _part(read_tasks, tasks, top, tree, active, tip, valves, home)
         control = _part(_control, control, top, active)
     outside = _part(read_outside, (), top, tree)
     return MachineSpec(

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from crane.description.findings import Anything, flag, recoverable
 from crane.description.spec import ATTITUDES, TIP, Task, Via
 from crane.formats.machine_file.outside import read_loads
+from crane.formats.machine_file.phases import phased_task
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
 
-_MOTIONS = "'tip', 'active', 'via', 'joystick'"
+_MOTIONS = "'tip', 'active', 'via', 'joystick', 'phases'"
 
 
 def read_tasks(
@@ -18,6 +19,7 @@ def read_tasks(
     active: tuple[str, ...],
     tip: str | None,
     valves: tuple[str, ...],
+    home: dict[str, float],
 ) -> dict[str, Task]:
     """Named motions.
 
@@ -25,17 +27,26 @@ def read_tasks(
         DescriptionError: With file, line, and what is wrong.
     """
     tasks = {}
-    keys = ("description", "duration", "tip", "active", "via", "joystick", "start", "loads")
+    keys = (
+        "description", "duration", "tip", "active", "via", "joystick", "phases", "ramp", "start",
+        "loads",
+    )  # fmt: skip
     for name, item in top.mappings("tasks", "task", *keys):
         with recoverable():
             spaces = {"tip": TIP, "active": active, "joystick": valves}
-            task = _task(name, item, spaces, tip)
-            tasks[name] = dataclasses.replace(task, loads=tuple(read_loads(item, tree)))
+            phased = "phases" in item
+            if phased:
+                task = phased_task(name, item, _start(name, item, active), valves, tree, home)
+            else:
+                task = _task(name, item, spaces, tip)
+            tasks[name] = dataclasses.replace(task, loads=tuple(read_loads(item, tree, phased)))
     return tasks
 
 
 def _task(name: str, item: Section, spaces: dict[str, tuple[str, ...]], tip: str | None) -> Task:
     """A task of one of the spaces, each of which is given with the names of its coordinates."""
+    if "ramp" in item:
+        raise item.fail("ramp", f"task '{name}' has no phases, leave 'ramp' to these")
     if "via" in item:
         return _via_task(name, item, spaces, tip)
     duration = item.number("duration", minimum=0.0)

@@ -11,6 +11,7 @@ from lxml import etree
 
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError, one_line
 from crane.common.output import file_name, staging
+from crane.description.phases import Phase
 from crane.description.sensors import unit_of
 from crane.description.spec import Task, Via
 from crane.formats.machine_file.circuit import MOTOR
@@ -278,7 +279,8 @@ def _numbers(item: Any, *without: str) -> dict[str, Any]:
 
 def _task(task: Task) -> dict[str, Any]:
     data: dict[str, Any] = {"description": task.description} if task.description else {}
-    data["duration"] = task.duration
+    if not task.phases:
+        data["duration"] = task.duration
     if task.loads:
         data["loads"] = [load_data(load) for load in task.loads]
     if task.space == "joystick":
@@ -287,11 +289,18 @@ def _task(task: Task) -> dict[str, Any]:
             for joint, polygon in task.levers.items()
         }
         start = {"start": dict(task.start)} if task.start else {}
+        if task.phases:
+            return data | {"phases": [_phase(x) for x in task.phases], "ramp": task.ramp} | start
         return data | {"joystick": levers} | start
     if task.via:
         del data["duration"]
         return data | {"via": [_via(via) for via in task.via]}
     return data | {task.space: {key: list(row) for key, row in task.coefficients.items()}}
+
+
+def _phase(phase: Phase) -> dict[str, Any]:
+    data = {"name": phase.name, "levers": dict(phase.levers), "until": dict(phase.until)}
+    return data | {"within": phase.within}
 
 
 def _via(via: Via) -> dict[str, Any]:

@@ -12,32 +12,17 @@ from crane.common.samples import Array
 from crane.common.units import reading
 from crane.hydraulics.powers import SHAFT
 from crane.recordings.summary import title
-from crane.studies.power import PowerAccount, owner_of, what_of
+from crane.studies.power import CLASSES, PowerAccount, class_of, owner_of, what_of
 from crane.view.plots.recording import INK, STYLE, write_figure
 from crane.view.plots.text import plain
 
-COLORS: Mapping[str, str] = {  # of what belongs together, from below upwards
-    "load": "#2a8c4a", "friction": "#9a6b3f", "outlet": "#1f5fa8", "inlet": "#6f9bca",
-    "compensator": "#e0701a", "leaks and relief": "#b04a7a", "pump": "#7a7a7a",
-    "elements": "#8a5fb0", "stored": "#d9b53f",
-}  # fmt: skip
-_CLASSES = {
-    "friction": "friction", "damper": "friction", "outlet": "outlet", "float": "outlet",
-    "inlet": "inlet", "regeneration": "inlet", "compensator": "compensator",
-    "leak": "leaks and relief", "relief": "leaks and relief", "refill": "leaks and relief",
-    "element": "elements", "cooling": "elements", "load": "load", "stored": "stored",
-    "spring": "stored",
-}  # fmt: skip
+_COLORS = (
+    "#2a8c4a", "#9a6b3f", "#1f5fa8", "#6f9bca", "#e0701a", "#b04a7a", "#7a7a7a", "#8a5fb0",
+    "#d9b53f",
+)  # fmt: skip
+COLORS: Mapping[str, str] = dict(zip(CLASSES, _COLORS, strict=True))
 _OWNERS = ("#1f5fa8", "#e0701a", "#2a8c4a", "#8a5fb0", "#d9b53f", "#b04a7a", "#3f8f9f", "#9a6b3f")
 _MOST = 1500  # points of a stack
-
-
-def class_of(account: PowerAccount, name: str) -> str:
-    """What a part belongs to, a key of `COLORS`."""
-    what = what_of(name)
-    if owner_of(name) in account.pumps and what != "stored":
-        return "pump"
-    return _CLASSES[what]
 
 
 def plot_power(account: PowerAccount, path: str | Path) -> None:

@@ -14,8 +14,8 @@ from matplotlib.patheffects import withStroke
 from crane.common.units import number
 from crane.hydraulics.powers import SHAFT
 from crane.recordings.summary import title
-from crane.studies.power import LOAD, PowerAccount, owner_of, what_of
-from crane.view.plots.power import COLORS, class_of
+from crane.studies.power import LOAD, PowerAccount, class_of, owner_of, what_of
+from crane.view.plots.power import COLORS
 from crane.view.plots.recording import INK, STYLE, write_figure
 from crane.view.plots.text import plain
 
