@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from crane.ratings.pressures import chamber_pressures
 from crane.ratings.rules import Rule, rule_of
 from crane.ratings.slopes import load_slopes
 from crane.ratings.strength import strengths
+from crane.ratings.tables import LoadTable, load_table
 from crane.ratings.words import to_markdown
 from crane.recordings.timeseries import Table, write
 
@@ -94,6 +96,11 @@ class Capacity(Brief):
             By joint (s, b, a, 2) of its chambers A and B [Pa].
         """
         return chamber_pressures(self)
+
+    @cached_property
+    def table(self) -> LoadTable:
+        """Its table at round steps, as manuals print it."""
+        return load_table(self)
 
     def at_places(self, radii: Sequence[float], heights: Sequence[float]) -> "Capacity":
         """The same at other places, see `capacity`."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from crane.common.units import quantity
 from crane.ratings.strength import strengths
-from crane.ratings.tables import LoadTable, load_table
+from crane.ratings.tables import LoadTable
 
 if TYPE_CHECKING:
     from crane.ratings.lifting import Capacity
@@ -82,7 +82,7 @@ def headings(chart: "Capacity", table: LoadTable) -> list[str]:
 
 def to_markdown(chart: "Capacity") -> str:
     """What the loads hold for, their table, and what ends them."""
-    table = load_table(chart)
+    table = chart.table
     rows = [[f"{height:g}", *row] for height, row in zip(table.heights, table.rows(), strict=True)]
     lines = [f"# Lifting capacity of {chart.machine.name}\n"]
     lines += [f"- {name}: {text}" for name, text in facts(chart)]

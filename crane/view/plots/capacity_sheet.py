@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from crane.ratings import Capacity
-from crane.ratings.tables import LoadTable, load_table
+from crane.ratings.tables import LoadTable
 from crane.ratings.words import facts, note, shares, sides
 from crane.view.plots.capacity import colours, draw_panel, extent, heading
 from crane.view.plots.recording import FAINT, INK, STYLE, write_figure
@@ -37,7 +37,7 @@ def plot_sheet(chart: Capacity, path: str | Path) -> None:
 
 def sheet_figure(chart: Capacity) -> Figure:
     """The page as a figure."""
-    table = load_table(chart)
+    table = chart.table
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(_WIDE, _TALL))
         top = _TALL - _EDGE
