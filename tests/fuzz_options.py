@@ -89,6 +89,7 @@ CALLS = {
     "plot": ["motion.csv --out {out}.png", "valves.csv --out {out}.png"],
     "demo": ["--out motion.csv"],  # nothing of it depends on its options
     "calibrate": ["rig.yaml valves.csv --fit load_x.mass --train 0:1 --out {out}"],
+    "capacity": ["excavator --frame bucket --rule iso10567 --step 1 --out {out}"],
     "convert": ["slider.yaml {out}.urdf", "slider.yaml {out}", "slider.yaml {out}.xml"],
     "study": ["slider.yaml --out {out} --vary crank.mass=0.7:0.9:2 --processes 1"],
     "excite": ["slider.yaml --out {out} --period 4 --harmonics 1 --step 0.05"],

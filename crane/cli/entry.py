@@ -13,6 +13,7 @@ from crane.cli import (  # noqa: F401  register their commands
     add,
     breakout,
     calibrate,
+    capacity,
     check,
     circuit,
     commands,

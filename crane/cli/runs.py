@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from crane.identification.calibration.result import Calibration
     from crane.identification.mechanics.result import Identification
     from crane.motion.workspaces import Workspace
-    from crane.ratings import Breakout, ToolForce, WorkingRange
+    from crane.ratings import Breakout, Capacity, ToolForce, WorkingRange
     from crane.simulation.linear import LinearModel
     from crane.simulation.sensitivity import Sensitivities
     from crane.studies.design import Design
@@ -222,6 +222,29 @@ def write_working_range(folder: Path, found: "WorkingRange") -> str:
         (part / "working_range.md").write_text(text, encoding="utf-8")
         found.to_csv(part / "working_range.csv")
         plot_working_range(found, part / "working_range.png")
+    return text
+
+
+def write_capacity(folder: Path, chart: "Capacity") -> str:
+    """Write tables, pictures and page of rated loads into a folder, created where there is none.
+
+    Returns:
+        The table with what it holds for, Markdown.
+
+    Raises:
+        OutputError: The folder or a file cannot be written.
+    """
+    from crane.view.page.capacity import write_capacity_page
+    from crane.view.plots.capacity import plot_capacity
+    from crane.view.plots.capacity_sheet import plot_sheet
+
+    text = chart.to_markdown()
+    with staging(folder) as part:
+        chart.to_csv(part / "capacity.csv")
+        (part / "capacity.md").write_text(text, encoding="utf-8")
+        plot_capacity(chart, part / "capacity.png")
+        plot_sheet(chart, part / "sheet.pdf")
+        write_capacity_page(chart, part / "capacity.html")
     return text
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -11,7 +12,10 @@ from crane.machine import Machine
 from crane.ratings.actions import load_on
 from crane.ratings.field import Field, charted, places_of
 from crane.ratings.places import Places
+from crane.ratings.pressures import chamber_pressures
 from crane.ratings.rules import Rule, rule_of
+from crane.ratings.tables import LoadTable, load_table
+from crane.ratings.words import to_markdown
 
 _STEEPEST = np.deg2rad(45.0)
 
@@ -35,6 +39,31 @@ class Capacity(Field):
     def notes(self) -> dict[str, str]:
         """Its rule."""
         return {"rule": self.rule.says}
+
+    def pressures(self) -> dict[str, Array]:
+        """Pressures that hold the rated loads, see `crane.ratings.pressures`.
+
+        Returns:
+            By joint (s, b, a, 2) of its chambers A and B [Pa].
+        """
+        return chamber_pressures(self)
+
+    @cached_property
+    def table(self) -> LoadTable:
+        """Its table at round steps, as manuals print it."""
+        return load_table(self)
+
+    def at_places(self, radii: Sequence[float], heights: Sequence[float]) -> "Capacity":
+        """The same at other places, see `capacity`."""
+        slews = None if self.section.slew is None else self.slews.tolist()
+        return capacity(
+            self.machine, self.frame, rule=self.rule, raising=self.raising, slews=slews,
+            slope=self.slope, friction=self.friction, radii=radii, heights=heights,
+        )  # fmt: skip
+
+    def to_markdown(self) -> str:
+        """What the loads hold for, their table as manuals print it, and what ends them."""
+        return to_markdown(self)
 
 
 def capacity(

@@ -37,9 +37,10 @@ RULES = {
         Rule("none", "what is possible: all drives work at their pump's pressure, no reserve"),
         Rule(
             "iso10567",
-            "ISO 10567 (excavators): the less of 87 % of what the boom's cylinders raise at the "
-            "working pressure, while all others hold at that of their relief valves, and 75 % of "
-            "the load that tips the machine, on firm level ground",
+            "ISO 10567 (excavators), as makers' manuals give it: the less of 87 % of what the "
+            "boom's cylinders raise at the working pressure, while all others hold at that of "
+            "their relief valves, and 75 % of the load that tips the machine, on firm level "
+            "ground",
             hydraulic=0.87,
             tipping=0.75,
             raises=True,
@@ -47,7 +48,8 @@ RULES = {
         Rule(
             "en12999",
             "in the manner of EN 12999 (loader cranes): what is lifted at the working pressure, "
-            "and 1/1.25 of the load that tips, so that a test with 1.25 times the load stands",
+            "and 1/1.25 of the load that tips, so that a test with 1.25 times the load stands; "
+            "this share is assumed here, not read in the standard",
             tipping=0.8,
         ),
         Rule(

@@ -9,7 +9,7 @@ from crane.common.errors import InputError, known
 from crane.hydraulics.components import Cylinder, Hydraulics
 from crane.machine import Machine
 
-RAISES, HOLDS, MOTOR = "working pressure", "holding pressure", "torque"
+RAISES, HOLDS, MOTOR = "working pressure", "holding pressure", "effort"
 
 
 class Strength(NamedTuple):
@@ -21,6 +21,8 @@ class Strength(NamedTuple):
         least: The most that it pulls, below 0 [N], [N m].
         most: The most that it pushes [N], [N m].
         why: What limits it: `RAISES`, `HOLDS` or `MOTOR`.
+        pressures: Of chambers A and B at these ends [Pa]; none without hydraulics.
+        areas: What a pressure more in A and in B adds to them [m2], [m3/rad].
     """
 
     joint: str
@@ -28,6 +30,8 @@ class Strength(NamedTuple):
     least: float
     most: float
     why: str
+    pressures: tuple[float, ...] = ()
+    areas: tuple[float, ...] = ()
 
 
 def strengths(
@@ -54,13 +58,15 @@ def strengths(
     found, circuit = [], machine.hydraulics
     for joint in machine.driven_joints:
         column = machine.active.index(joint)
-        works = joint in raising
+        works, both, areas, seals = joint in raising, [], np.zeros(2), 0.0
         if circuit is not None and joint in circuit.joints:
             cylinder, tank = circuit.cylinders[joint], circuit.supply.tank
             both = [_pressure(circuit, cylinder, side, works) for side in "ab"]
+            areas = np.array([cylinder.area_a, cylinder.area_b])
             most = both[0] * cylinder.area_a - tank * cylinder.area_b
             least = tank * cylinder.area_a - both[1] * cylinder.area_b
-            grip = cylinder.seal_friction * (np.array(both) + tank)
+            seals = cylinder.seal_friction
+            grip = seals * (np.array(both) + tank)
             why = RAISES if works else HOLDS
         else:
             effort = float(machine.model.effortLimit[machine.column(joint)])
@@ -71,7 +77,9 @@ def strengths(
             law = machine.friction[joint]
             most -= law.breakaway + law.coulomb_offset + grip[0]
             least += law.breakaway - law.coulomb_offset + grip[1]
-        found.append(Strength(joint, column, least, most, why))
+            areas = areas - seals
+        ends = (tuple(both), tuple(areas.tolist())) if both else ((), ())
+        found.append(Strength(joint, column, least, most, why, *ends))
     if not found:
         raise InputError(
             f"nothing limits the drives of '{machine.name}', give it hydraulics, or its joints an "
