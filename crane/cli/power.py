@@ -61,5 +61,5 @@ def power(
     run = read_run(recording, loaded, columns, span)
     with status("adding up"):
         account = power_account(loaded, run)
-    print(write_power(out, account), end="")
+    print(write_power(out, account, force), end="")
     print(f"\nwritten to {out}")

@@ -33,7 +33,9 @@ if TYPE_CHECKING:
     from crane.studies.power import PowerAccount
 
 RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
-COMPARISON = "comparison.md"
+REPORT, MACHINE = "report.html", "machine"
+COMPARISON, CURVES = "comparison.md", "comparison.png"
+OF_RUNS = (FIGURE, PAGE, COMPARISON, CURVES)  # beside a recording, of an earlier one
 
 
 def check_folder(folder: Path, force: bool) -> None:
@@ -65,28 +67,38 @@ def check_free(file: Path, force: bool) -> None:
         raise OutputError(f"{file}: exists already, choose another name or add --force")
 
 
-def write_run(folder: Path, recording: Recording) -> str:
+def write_run(folder: Path, recording: Recording, force: bool = True) -> str:
     """Write a recording and its summary into a folder, created where there is none.
 
-    Figure and page of an earlier run in the same folder are removed: they show something else.
+    Figure, page and comparison of an earlier run in the same folder are removed: they show
+    something else.
+
+    Args:
+        folder: The folder; of all that follow here, too.
+        recording: The recording.
+        force: Whether an earlier run is replaced; of all that follow here, too.
 
     Returns:
         The summary, Markdown.
 
     Raises:
-        OutputError: The folder or a file cannot be written.
+        OutputError: The folder or a file cannot be written, or it is filled and `force` is off.
     """
+    with staging(folder, force, OF_RUNS) as part:
+        return _write_run(part, recording)
+
+
+def _write_run(part: Path, recording: Recording) -> str:
     heading = title(subject(recording), recording.task)
     text = f"# {heading}\n\n{summarize(recording).to_markdown()}"
-    with staging(folder) as part:
-        recording.to_csv(part / RECORDING)
-        (part / SUMMARY).write_text(text, encoding="utf-8")
-        for name in (FIGURE, PAGE):
-            (folder / name).unlink(missing_ok=True)
+    recording.to_csv(part / RECORDING)
+    (part / SUMMARY).write_text(text, encoding="utf-8")
     return text
 
 
-def write_comparison(folder: Path, recording: Recording, comparison: Comparison) -> str:
+def write_comparison(
+    folder: Path, recording: Recording, comparison: Comparison, force: bool = True
+) -> str:
     """Write a replay into a folder: its recording, and how it compares with what was measured.
 
     Returns:
@@ -97,13 +109,13 @@ def write_comparison(folder: Path, recording: Recording, comparison: Comparison)
     """
     from crane.view.plots.comparison import plot_comparison
 
-    write_run(folder, recording)
     heading = title(subject(recording), recording.task)
     text = f"# {heading}\n\n{comparison.to_markdown()}"
-    with staging(folder) as part:
+    with staging(folder, force, OF_RUNS) as part:
+        _write_run(part, recording)
         (part / COMPARISON).write_text(text, encoding="utf-8")
         if comparison.channels:
-            plot_comparison(comparison, part / "comparison.png")
+            plot_comparison(comparison, part / CURVES)
     return text
 
 
@@ -116,7 +128,7 @@ def write_views(folder: Path, machine: Machine, recording: Recording) -> None:
     report(machine, recording, folder / PAGE)
 
 
-def write_study(folder: Path, study: Study) -> None:
+def write_study(folder: Path, study: Study, force: bool = True) -> None:
     """Write table and picture of a study into a folder, created where there is none.
 
     Raises:
@@ -124,12 +136,12 @@ def write_study(folder: Path, study: Study) -> None:
     """
     from crane.view.plots.study import plot_study
 
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         study.to_csv(part / "study.csv")
         plot_study(study, part / "study.png")
 
 
-def write_workspace(folder: Path, space: "Workspace") -> str:
+def write_workspace(folder: Path, space: "Workspace", force: bool = True) -> str:
     """Write tables, summary and picture of a workspace into a folder, created where there is none.
 
     Returns:
@@ -141,7 +153,7 @@ def write_workspace(folder: Path, space: "Workspace") -> str:
     from crane.view.plots.workspace import plot_workspace
 
     text = space.to_markdown()
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         space.to_csv(part / "workspace.csv")
         space.curves_to_csv(part / "curves.csv")
         (part / "workspace.md").write_text(text, encoding="utf-8")
@@ -149,7 +161,7 @@ def write_workspace(folder: Path, space: "Workspace") -> str:
     return text
 
 
-def write_calibration(folder: Path, found: "Calibration") -> None:
+def write_calibration(folder: Path, found: "Calibration", force: bool = True) -> None:
     """Write report, page, picture and the fitted machine into a folder.
 
     The folder is created where there is none. A machine that no machine file can say
@@ -162,18 +174,18 @@ def write_calibration(folder: Path, found: "Calibration") -> None:
     from crane.view.page.calibration import write_calibration_report
     from crane.view.plots.calibration import plot_calibration
 
-    with staging(folder) as part:
-        write_calibration_report(found, part / "report.html")
+    with staging(folder, force, _machine_files(folder, found.machine)) as part:
+        write_calibration_report(found, part / REPORT)
         (part / "calibration.md").write_text(found.to_text() + "\n", encoding="utf-8")
         plot_calibration(found, part / "calibration.png")
         try:
-            write_machine(found.machine, part / "machine", found.notes)
+            write_machine(found.machine, part / MACHINE, found.notes)
         except InputError as error:
             text = f"the machine is not written, take the --set options of the report: {error}"
             warnings.warn(text, CraneWarning, stacklevel=2)
 
 
-def write_sensitivities(folder: Path, found: "Sensitivities") -> None:
+def write_sensitivities(folder: Path, found: "Sensitivities", force: bool = True) -> None:
     """Write table, derivatives and picture into a folder, created where there is none.
 
     Raises:
@@ -181,13 +193,13 @@ def write_sensitivities(folder: Path, found: "Sensitivities") -> None:
     """
     from crane.view.plots.sensitivities import plot_sensitivities
 
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         (part / "sensitivities.md").write_text(found.to_text() + "\n", encoding="utf-8")
         found.to_csv(part / "sensitivities.csv")
         plot_sensitivities(found, part / "sensitivities.png")
 
 
-def write_power(folder: Path, account: "PowerAccount") -> str:
+def write_power(folder: Path, account: "PowerAccount", force: bool = True) -> str:
     """Write table, powers over time and pictures into a folder, created where there is none.
 
     Returns:
@@ -201,7 +213,7 @@ def write_power(folder: Path, account: "PowerAccount") -> str:
 
     heading = title(account.machine, f"{account.task} power".strip())
     text = f"# {heading}\n\n{account.to_markdown()}"
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         (part / "power.md").write_text(text, encoding="utf-8")
         account.to_csv(part / "power.csv")
         plot_power(account, part / "power.png")
@@ -210,7 +222,10 @@ def write_power(folder: Path, account: "PowerAccount") -> str:
 
 
 def write_modes(
-    folder: Path, model: "LinearModel", over: "Sequence[tuple[dict[str, float], LinearModel]]"
+    folder: Path,
+    model: "LinearModel",
+    over: "Sequence[tuple[dict[str, float], LinearModel]]",
+    force: bool = True,
 ) -> None:
     """Write a linear model, its table, picture and page into a folder.
 
@@ -218,6 +233,7 @@ def write_modes(
         folder: Created where there is none.
         model: The model.
         over: Of what was varied, drawn in a picture of their own.
+        force: Whether an earlier one is replaced.
 
     Raises:
         OutputError: The folder or a file cannot be written.
@@ -225,7 +241,7 @@ def write_modes(
     from crane.view.page.build import report
     from crane.view.plots.modes import plot_modes, plot_modes_over
 
-    with staging(folder) as part:
+    with staging(folder, force, ("over.png", PAGE)) as part:
         model.save(part / "model.mat")
         model.save(part / "model.npz")
         (part / "modes.md").write_text(model.to_text() + "\n", encoding="utf-8")
@@ -238,7 +254,11 @@ def write_modes(
 
 
 def write_identification(
-    folder: Path, result: "Identification", recording: str = "", validation: str = ""
+    folder: Path,
+    result: "Identification",
+    recording: str = "",
+    validation: str = "",
+    force: bool = True,
 ) -> None:
     """Write report and parameters into a folder, and the machine where all are known.
 
@@ -250,11 +270,22 @@ def write_identification(
     from crane.identification.mechanics.write import write_parameters
     from crane.view.page.identification import write_report
 
-    with staging(folder) as part:
-        write_report(result, part / "report.html", recording, validation)
+    with staging(folder, force, _machine_files(folder, result.machine)) as part:
+        write_report(result, part / REPORT, recording, validation)
         write_parameters(result, part / "parameters.csv")
         if result.parameters is not None:
-            _write_machine(result, part / "machine")
+            _write_machine(result, part / MACHINE)
+
+
+def _machine_files(folder: Path, read: Machine) -> Sequence[str]:
+    """Those that an earlier result of the same kind has left in a folder; none that were read."""
+    place = folder / MACHINE
+    files = (read.path, *(chain.urdf for chain in read.chains))
+    if not (folder / REPORT).is_file() or any(
+        file.resolve().is_relative_to(place.resolve()) for file in files
+    ):
+        return ()
+    return [f"{MACHINE}/**/*.{kind}" for kind in ("yaml", "urdf")]
 
 
 def _write_machine(result: "Identification", folder: Path) -> None:
