@@ -533,6 +533,10 @@ def test_from_a_simulated_file_to_a_folder(run, simulated, tmp_path):
     assert crane.load(tmp_path / "result" / "machine" / "mini_forwarder.yaml").name
     status, out, errors = run(*command, "--out", "result")
     assert status == 2 and out == "" and "is not empty" in errors[0]
+    (tmp_path / "result" / "mine").write_text("kept")
+    assert run(*command[:-1], "--out", "result", "--force")[0] == 0  # of no machine
+    written = {path.name for path in (tmp_path / "result").iterdir()}
+    assert written == {"report.html", "parameters.csv", "mine"}
 
 
 def test_a_load_from_a_simulated_file(run, simulated):

@@ -127,6 +127,8 @@ def test_logs_that_cannot_be_read(log, tmp_path):
             read_log(tmp_path / path, good)
     with pytest.raises(RecordingError, match="no such file or directory, give a file of columns"):
         read_log(log, tmp_path / "gone.txt")
+    with pytest.raises(RecordingError, match="/dev/zero: it is no plain file, copy it into one"):
+        read_log(log, "/dev/zero")
 
 
 def test_command_line(log, tmp_path):

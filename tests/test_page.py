@@ -125,6 +125,12 @@ def test_every_column_is_on_the_page_once(machine, recording):
     assert sorted(names) == sorted(set(recording.columns()) - {"time"} - references)
 
 
+def test_equal_runs_give_equal_pages(machine, recording, tmp_path):
+    pages = [crane.report(machine, recording, tmp_path / f"{i}.html") for i in range(2)]
+    one, two = (page.read_bytes() for page in pages)
+    assert one == two
+
+
 def test_work_and_limits(machine, recording):
     given, taken = mechanical_work(recording)
     power = (recording.tau * recording.v).sum(axis=1)

@@ -55,6 +55,7 @@ def test_written_file(tmp_path):
         "# crane recording",
         "# machine: mini_forwarder",
         "# task: lift",
+        "# crane samples: 3",
         "time [s],q1 [rad],X1 [m],q1_velocity [rad/s],X1_velocity [m/s],"
         "q1_force [N m],X1_force [N],tip_x [m],valve",
         "0.0,0.0,0.01,1.0,0.1,0.3,-16.0,0.4,0.0",

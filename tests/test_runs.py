@@ -147,7 +147,8 @@ def test_files_that_results_cannot_go_to(tmp_path):
 
 
 def test_views_of_an_earlier_run_do_not_stay_beside_a_new_one(tmp_path, recording):
-    for name in ("recording.csv", "figure.png", "view.html", "notes.txt"):
+    old = "figure.png", "view.html", "comparison.md", "comparison.png"
+    for name in ("recording.csv", "notes.txt", *old):
         (tmp_path / name).write_text("old")
     text = write_run(tmp_path, recording)
     assert set(tree(tmp_path)) == {"recording.csv", "summary.md", "notes.txt"}

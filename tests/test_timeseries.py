@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from crane.common.errors import RecordingError
 from crane.recordings import timeseries
-from crane.recordings.timeseries import Table, read, read_csv, read_npz, spellings, write
+from crane.recordings.timeseries import Table, arrays, read, read_csv, read_npz, spellings, write
 
 GOOD = "time [s],a [m],b\n0,1,2\n0.5,3,4\n"
 
@@ -48,6 +48,28 @@ def test_other_ways_to_write_the_same(tmp_path, text):
 def test_notes_keep_what_follows_the_first_colon(tmp_path):
     notes = read_text(tmp_path, "# machine: C:\\cranes\\big.yaml\n#task:lift\n" + GOOD).notes
     assert notes == {"machine": "C:\\cranes\\big.yaml", "task": "lift"}
+
+
+@pytest.mark.parametrize("read", [read, arrays], ids=["as recording", "as log"])
+def test_a_file_that_is_cut_short_anywhere_is_told(tmp_path, read):
+    path, whole = tmp_path / "cut.csv", tmp_path / "whole.csv"
+    values = np.array([[0.0, 1.25, -3e-5], [0.5, 1.5, 22.75]])
+    write(whole, Table({"time": "s", "a": "m", "b": ""}, values, {"machine": "x"}))
+    data = whole.read_bytes()
+    for length in range(len(data)):
+        path.write_bytes(data[:length])
+        with pytest.raises(RecordingError):
+            read(path)
+    path.write_bytes(data[:-2])
+    with pytest.raises(RecordingError, match=r"cut.csv: is cut short in its last line, copy it"):
+        read(path)
+    path.write_bytes(data[: data.rindex(b"0.5")])
+    with pytest.raises(
+        RecordingError, match=r"cut.csv: has 1 of the 2 samples that it says, copy"
+    ):
+        read(path)
+    path.write_bytes(data.replace(b"# crane samples: 2\n", b"")[:-2])
+    assert read(path) is not None  # whoever removes the count has said so
 
 
 # What is written, and the line that the user sees after the name of the file.

@@ -1,9 +1,12 @@
 """Every line that a user sees for a broken URDF, with the loops of URDF+ too."""
 
+import os
+
 import pytest
 from broken import GROUND, LOOPED, Broken, assert_refused, case, swap, whole
 
 import crane
+from crane.formats.xml import XmlFile
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
 
@@ -717,6 +720,39 @@ def test_entities_are_not_expanded(place, tmp_path):
     edit = swap('<robot name="four_bar_ground">', LAUGHS + place, GROUND)
     message = "ground.urdf:1: <!DOCTYPE> is not supported, remove it"
     assert_refused(Broken("laughs", message, (edit,)), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "written"),
+    [
+        ("utf-8", None), ("utf-16", None), ("utf-16-le", None), ("utf-16-be", None),
+        ("utf-32", None), ("utf-7", None), ("utf-7", "+ADwAIQ-DOCTYPE"),
+    ],
+)  # fmt: skip
+def test_document_types_are_refused_in_every_encoding(tmp_path, encoding, written):
+    text = f'<?xml version="1.0" encoding="{encoding}"?>{LAUGHS}<robot name="&j;"/>'
+    data = text.encode(encoding)
+    if written is not None:
+        data = data.replace(b"<!DOCTYPE", written.encode())
+    (tmp_path / "robot.urdf").write_bytes(data)
+    with pytest.raises(crane.CraneError, match="^robot.urdf:1: <!DOCTYPE> is not supported"):
+        crane.load(tmp_path / "robot.urdf")
+
+
+def test_a_document_type_that_is_only_spoken_of_is_none(tmp_path):
+    text = '<robot name="r"><!-- <!DOCTYPE robot> --><link name="a"/></robot>'
+    (tmp_path / "robot.urdf").write_text(text)
+    assert XmlFile(tmp_path / "robot.urdf").root.tag == "robot"
+
+
+def test_files_without_end_are_refused(tmp_path):
+    (tmp_path / "large.urdf").touch()
+    os.truncate(tmp_path / "large.urdf", 10**12)  # which takes no space
+    (tmp_path / "zero.urdf").symlink_to("/dev/zero")
+    with pytest.raises(crane.CraneError, match=r"cannot be read \(1e\+06 MB, more than 50\)"):
+        XmlFile(tmp_path / "large.urdf")
+    with pytest.raises(crane.CraneError, match="it is no plain file, copy it into one"):
+        XmlFile(tmp_path / "zero.urdf")
 
 
 def test_files_are_not_fetched(tmp_path):

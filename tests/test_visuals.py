@@ -206,6 +206,42 @@ def test_too_large_a_mesh_is_not_opened(tmp_path):
     }
 
 
+def instanced(faces, nodes):
+    """A glb with different triangles, drawn by each of many nodes."""
+    vertices = np.random.default_rng(0).normal(size=(3 * faces, 3)).astype("<f4").tobytes()
+    numbers = np.arange(3 * faces, dtype="<u4").tobytes()
+    length = len(vertices)
+    about = {
+        "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [*range(nodes)]}],
+        "nodes": [{"mesh": 0}] * nodes,
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3 * faces, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5125, "count": 3 * faces, "type": "SCALAR"},
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": length},
+            {"buffer": 0, "byteOffset": length, "byteLength": len(numbers)},
+        ],
+        "buffers": [{"byteLength": length + len(numbers)}],
+    }  # fmt: skip
+    text = json.dumps(about).encode()
+    text += b" " * (-len(text) % 4)
+    parts = ((b"JSON", text), (b"BIN\0", vertices + numbers))
+    body = b"".join(struct.pack("<I4s", len(x), kind) + x for kind, x in parts)
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+
+
+def test_a_small_file_that_repeats_its_parts_is_drawn_up_to_a_bound(tmp_path):
+    """Half a megabyte would be four million triangles; screws that occur often are fine."""
+    (tmp_path / "bomb.glb").write_bytes(instanced(10_000, 399))
+    (tmp_path / "screws.glb").write_bytes(instanced(100, 900))
+    bomb, screws = meshes.read_meshes([tmp_path / "bomb.glb", tmp_path / "screws.glb"]).values()
+    assert bomb == "it repeats its 10000 triangles to more than 100000"
+    (part,) = screws  # all of one colour
+    assert len(part.faces) == 90_000 and part.faces.max() == len(part.vertices) - 1
+
+
 def test_a_reader_that_ends_costs_one_mesh(tmp_path, monkeypatch):
     """It begins anew after the file at which it ended."""
     source = Path(mesh_process.__file__).read_text()

@@ -73,14 +73,14 @@ def breakout(
     if direction is None:
         with status("digging"):
             found = dig(loaded, frame, bucket=bucket, arm=arm, weights=weights)
-        print(f"{write_breakout(out, found)}\nwritten to {out}")
+        print(f"{write_breakout(out, found, force)}\nwritten to {out}")
         return
     with status("digging"):
         field = tool_force(
             loaded, _way(direction), frame, joint=bucket, weights=weights, step=step
         )
     with status("drawing"):
-        text = write_tool_force(out, field)
+        text = write_tool_force(out, field, force)
     print(f"{text}\nwritten to {out}")
 
 

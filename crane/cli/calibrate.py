@@ -82,7 +82,7 @@ def calibrate(
         )  # fmt: skip
     text = found.to_text()
     if out is not None:
-        write_calibration(out, found)
+        write_calibration(out, found, force)
         text += f"\nwritten to {out}; see {out}/report.html"
     print(text)
 

@@ -89,7 +89,7 @@ def capacity(
             slope=lean, friction=friction, step=step,
         )  # fmt: skip
     with status("drawing"):
-        text = write_capacity(out, chart)
+        text = write_capacity(out, chart, force)
     print(f"{text}\nwritten to {out}")
 
 

@@ -104,7 +104,7 @@ def circuit(
     print(text, end="")
     if out is None:
         return
-    with staging(out) as part:
+    with staging(out, force) as part:
         (part / f"{model}.txt").write_text(text, encoding="utf-8")
         figure.savefig(part / f"{model}.png", format="png", dpi=200)
     print(f"\nwritten to {out}")

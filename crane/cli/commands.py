@@ -166,7 +166,7 @@ def demo(out: Out = Path("demo-output"), force: Force = False) -> None:
 
     check_folder(out, force)
     with progress_bar("simulating") as progress:
-        text = run_demo(out, progress)
+        text = run_demo(out, progress, force)
     print(text)
     print(f"figures:    {out}/*/{FIGURE}\nanimations: {out}/*/{PAGE} (open them in a browser)")
 

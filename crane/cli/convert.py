@@ -65,7 +65,7 @@ def convert(
         check_free(out, force)
     loaded = load(machine, lock, change, active, free, floating, packages, argument)
     if kind == "machine":
-        written = write_machine(loaded, out)
+        written = write_machine(loaded, out, force=force)
     else:
         written = out
         (write_urdf_plus if kind == "urdf+" else write_mjcf)(loaded, out)

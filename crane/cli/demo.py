@@ -13,13 +13,14 @@ MACHINES = "mini_forwarder", "excavator"
 _SIMULATED = 0.3  # share of a task's time when it has been simulated, but not yet drawn
 
 
-def run_demo(folder: Path, progress: Progress) -> str:
+def run_demo(folder: Path, progress: Progress, force: bool = True) -> str:
     """Simulate the tasks of the reduced-scale forwarder and of the excavator.
 
     Args:
         folder: Where results go, one folder per task; created where there is none. Nothing
             appears there before everything is done; files of the same names are replaced.
         progress: Called with the finished share, 0 to 1.
+        force: Whether an earlier demonstration is replaced.
 
     Returns:
         The summary of all tasks, Markdown.
@@ -29,7 +30,7 @@ def run_demo(folder: Path, progress: Progress) -> str:
     """
     runs = [(machine, task) for machine in map(load, MACHINES) for task in machine.tasks]
     texts = []
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         for done, (machine, task) in enumerate(runs):
 
             def report(share: float, done: int = done) -> None:

@@ -73,5 +73,5 @@ def design(
             processes=(os.cpu_count() or 1) if processes is None else processes,
             progress=progress,
         )  # fmt: skip
-    write_design(out, found)
+    write_design(out, found, force)
     print(f"{found.to_markdown()}\nwritten to {out}")

@@ -97,7 +97,7 @@ def excite(
                 criterion=criterion, rate=rate, margin=margin, step=step, seed=seed,
                 progress=progress,
             )  # fmt: skip
-    with staging(out) as part:
+    with staging(out, force) as part:
         if wanted is None:
             motion.to_csv(part / "reference.csv")
             motion.to_yaml(part / "coefficients.yaml")

@@ -150,7 +150,7 @@ def identify(
             named = [f"{named[0]}, {train} s", ", ".join(filter(None, [rest, named[1]]))]
         if result.validation is None:
             named[1] = ""
-        write_identification(out, result, *named)
+        write_identification(out, result, named[0], named[1], force)
     print(f"{result.to_text()}\nwritten to {out}; see {out}/report.html")
 
 

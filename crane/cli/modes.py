@@ -90,6 +90,6 @@ def modes(
     text = model.to_text()
     if out is not None:
         with status("drawing"):
-            write_modes(out, model, found)
+            write_modes(out, model, found, force)
         text += f"\nwritten to {out}"
     print(text)

@@ -86,7 +86,7 @@ def power(
     with status("adding up"):
         account = power_account(loaded, run)
     if not beside:
-        print(write_power(out, account), end="")
+        print(write_power(out, account, force), end="")
         print(f"\nwritten to {out}")
         return
     accounts = {names[0]: account}
@@ -96,7 +96,7 @@ def power(
         circuit_of(machine_)
         with status("adding up"):
             accounts[name] = power_account(machine_, other)
-    print(write_power_comparison(out, PowerComparison(accounts, moved)), end="")
+    print(write_power_comparison(out, PowerComparison(accounts, moved), force), end="")
     print(f"\nwritten to {out}")
 
 

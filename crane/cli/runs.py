@@ -36,7 +36,9 @@ if TYPE_CHECKING:
     from crane.studies.power_comparison import PowerComparison
 
 RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
-COMPARISON = "comparison.md"
+REPORT, MACHINE = "report.html", "machine"
+COMPARISON, CURVES = "comparison.md", "comparison.png"
+OF_RUNS = (FIGURE, PAGE, COMPARISON, CURVES)  # beside a recording, of an earlier one
 
 
 def check_folder(folder: Path, force: bool) -> None:
@@ -68,28 +70,38 @@ def check_free(file: Path, force: bool) -> None:
         raise OutputError(f"{file}: exists already, choose another name or add --force")
 
 
-def write_run(folder: Path, recording: Recording) -> str:
+def write_run(folder: Path, recording: Recording, force: bool = True) -> str:
     """Write a recording and its summary into a folder, created where there is none.
 
-    Figure and page of an earlier run in the same folder are removed: they show something else.
+    Figure, page and comparison of an earlier run in the same folder are removed: they show
+    something else.
+
+    Args:
+        folder: The folder; of all that follow here, too.
+        recording: The recording.
+        force: Whether an earlier run is replaced; of all that follow here, too.
 
     Returns:
         The summary, Markdown.
 
     Raises:
-        OutputError: The folder or a file cannot be written.
+        OutputError: The folder or a file cannot be written, or it is filled and `force` is off.
     """
+    with staging(folder, force, OF_RUNS) as part:
+        return _write_run(part, recording)
+
+
+def _write_run(part: Path, recording: Recording) -> str:
     heading = title(subject(recording), recording.task)
     text = f"# {heading}\n\n{summarize(recording).to_markdown()}"
-    with staging(folder) as part:
-        recording.to_csv(part / RECORDING)
-        (part / SUMMARY).write_text(text, encoding="utf-8")
-        for name in (FIGURE, PAGE):
-            (folder / name).unlink(missing_ok=True)
+    recording.to_csv(part / RECORDING)
+    (part / SUMMARY).write_text(text, encoding="utf-8")
     return text
 
 
-def write_comparison(folder: Path, recording: Recording, comparison: Comparison) -> str:
+def write_comparison(
+    folder: Path, recording: Recording, comparison: Comparison, force: bool = True
+) -> str:
     """Write a replay into a folder: its recording, and how it compares with what was measured.
 
     Returns:
@@ -100,13 +112,13 @@ def write_comparison(folder: Path, recording: Recording, comparison: Comparison)
     """
     from crane.view.plots.comparison import plot_comparison
 
-    write_run(folder, recording)
     heading = title(subject(recording), recording.task)
     text = f"# {heading}\n\n{comparison.to_markdown()}"
-    with staging(folder) as part:
+    with staging(folder, force, OF_RUNS) as part:
+        _write_run(part, recording)
         (part / COMPARISON).write_text(text, encoding="utf-8")
         if comparison.channels:
-            plot_comparison(comparison, part / "comparison.png")
+            plot_comparison(comparison, part / CURVES)
     return text
 
 
@@ -119,7 +131,7 @@ def write_views(folder: Path, machine: Machine, recording: Recording) -> None:
     report(machine, recording, folder / PAGE)
 
 
-def write_study(folder: Path, study: Study) -> None:
+def write_study(folder: Path, study: Study, force: bool = True) -> None:
     """Write table and picture of a study into a folder, created where there is none.
 
     Raises:
@@ -127,12 +139,12 @@ def write_study(folder: Path, study: Study) -> None:
     """
     from crane.view.plots.study import plot_study
 
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         study.to_csv(part / "study.csv")
         plot_study(study, part / "study.png")
 
 
-def write_design(folder: Path, found: "Design") -> None:
+def write_design(folder: Path, found: "Design", force: bool = True) -> None:
     """Write report, table, picture and the best machine into a folder, created if there is none.
 
     Raises:
@@ -141,7 +153,7 @@ def write_design(folder: Path, found: "Design") -> None:
     from crane.formats import write_machine
     from crane.view.plots.design import plot_design
 
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         (part / "design.md").write_text(found.to_markdown(), encoding="utf-8")
         found.to_csv(part / "solutions.csv")
         plot_design(found, part / "design.png")
@@ -152,7 +164,7 @@ def write_design(folder: Path, found: "Design") -> None:
             warnings.warn(text, CraneWarning, stacklevel=2)
 
 
-def write_workspace(folder: Path, space: "Workspace") -> str:
+def write_workspace(folder: Path, space: "Workspace", force: bool = True) -> str:
     """Write tables, summary and picture of a workspace into a folder, created where there is none.
 
     Returns:
@@ -164,7 +176,7 @@ def write_workspace(folder: Path, space: "Workspace") -> str:
     from crane.view.plots.workspace import plot_workspace
 
     text = space.to_markdown()
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         space.to_csv(part / "workspace.csv")
         space.curves_to_csv(part / "curves.csv")
         (part / "workspace.md").write_text(text, encoding="utf-8")
@@ -172,7 +184,7 @@ def write_workspace(folder: Path, space: "Workspace") -> str:
     return text
 
 
-def write_breakout(folder: Path, found: "Breakout") -> str:
+def write_breakout(folder: Path, found: "Breakout", force: bool = True) -> str:
     """Write the table of break-out forces into a folder, created where there is none.
 
     Returns:
@@ -182,12 +194,12 @@ def write_breakout(folder: Path, found: "Breakout") -> str:
         OutputError: The folder or a file cannot be written.
     """
     text = found.to_markdown()
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         (part / "breakout.md").write_text(text, encoding="utf-8")
     return text
 
 
-def write_tool_force(folder: Path, field: "ToolForce") -> str:
+def write_tool_force(folder: Path, field: "ToolForce", force: bool = True) -> str:
     """Write table, summary and picture of tool forces into a folder, created where there is none.
 
     Returns:
@@ -199,14 +211,14 @@ def write_tool_force(folder: Path, field: "ToolForce") -> str:
     from crane.view.plots.tool_force import plot_tool_force
 
     text = field.to_markdown()
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         (part / "tool_force.md").write_text(text, encoding="utf-8")
         field.to_csv(part / "tool_force.csv")
         plot_tool_force(field, part / "tool_force.png")
     return text
 
 
-def write_working_range(folder: Path, found: "WorkingRange") -> str:
+def write_working_range(folder: Path, found: "WorkingRange", force: bool = True) -> str:
     """Write tables and picture of a working range into a folder, created where there is none.
 
     Returns:
@@ -218,14 +230,14 @@ def write_working_range(folder: Path, found: "WorkingRange") -> str:
     from crane.view.plots.working_range import plot_working_range
 
     text = found.to_markdown()
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         (part / "working_range.md").write_text(text, encoding="utf-8")
         found.to_csv(part / "working_range.csv")
         plot_working_range(found, part / "working_range.png")
     return text
 
 
-def write_capacity(folder: Path, chart: "Capacity") -> str:
+def write_capacity(folder: Path, chart: "Capacity", force: bool = True) -> str:
     """Write tables, pictures and page of rated loads into a folder, created where there is none.
 
     Returns:
@@ -239,7 +251,7 @@ def write_capacity(folder: Path, chart: "Capacity") -> str:
     from crane.view.plots.capacity_sheet import plot_sheet
 
     text = chart.to_markdown()
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         chart.to_csv(part / "capacity.csv")
         (part / "capacity.md").write_text(text, encoding="utf-8")
         plot_capacity(chart, part / "capacity.png")
@@ -248,7 +260,7 @@ def write_capacity(folder: Path, chart: "Capacity") -> str:
     return text
 
 
-def write_calibration(folder: Path, found: "Calibration") -> None:
+def write_calibration(folder: Path, found: "Calibration", force: bool = True) -> None:
     """Write report, page, picture and the fitted machine into a folder.
 
     The folder is created where there is none. A machine that no machine file can say
@@ -261,18 +273,18 @@ def write_calibration(folder: Path, found: "Calibration") -> None:
     from crane.view.page.calibration import write_calibration_report
     from crane.view.plots.calibration import plot_calibration
 
-    with staging(folder) as part:
-        write_calibration_report(found, part / "report.html")
+    with staging(folder, force, _machine_files(folder, found.machine)) as part:
+        write_calibration_report(found, part / REPORT)
         (part / "calibration.md").write_text(found.to_text() + "\n", encoding="utf-8")
         plot_calibration(found, part / "calibration.png")
         try:
-            write_machine(found.machine, part / "machine", found.notes)
+            write_machine(found.machine, part / MACHINE, found.notes)
         except InputError as error:
             text = f"the machine is not written, take the --set options of the report: {error}"
             warnings.warn(text, CraneWarning, stacklevel=2)
 
 
-def write_sensitivities(folder: Path, found: "Sensitivities") -> None:
+def write_sensitivities(folder: Path, found: "Sensitivities", force: bool = True) -> None:
     """Write table, derivatives and picture into a folder, created where there is none.
 
     Raises:
@@ -280,13 +292,13 @@ def write_sensitivities(folder: Path, found: "Sensitivities") -> None:
     """
     from crane.view.plots.sensitivities import plot_sensitivities
 
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         (part / "sensitivities.md").write_text(found.to_text() + "\n", encoding="utf-8")
         found.to_csv(part / "sensitivities.csv")
         plot_sensitivities(found, part / "sensitivities.png")
 
 
-def write_power(folder: Path, account: "PowerAccount") -> str:
+def write_power(folder: Path, account: "PowerAccount", force: bool = True) -> str:
     """Write table, powers over time and pictures into a folder, created where there is none.
 
     Returns:
@@ -300,7 +312,7 @@ def write_power(folder: Path, account: "PowerAccount") -> str:
 
     heading = title(account.machine, f"{account.task} power".strip())
     text = f"# {heading}\n\n{account.to_markdown()}"
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         (part / "power.md").write_text(text, encoding="utf-8")
         account.to_csv(part / "power.csv")
         plot_power(account, part / "power.png")
@@ -308,7 +320,7 @@ def write_power(folder: Path, account: "PowerAccount") -> str:
     return text
 
 
-def write_power_comparison(folder: Path, comparison: "PowerComparison") -> str:
+def write_power_comparison(folder: Path, comparison: "PowerComparison", force: bool = True) -> str:
     """Write table and picture into a folder, created where there is none.
 
     Returns:
@@ -320,14 +332,17 @@ def write_power_comparison(folder: Path, comparison: "PowerComparison") -> str:
     from crane.view.plots.power_comparison import plot_power_comparison
 
     text = f"# power of {', '.join(comparison.accounts)}\n\n{comparison.to_markdown()}"
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         (part / "comparison.md").write_text(text, encoding="utf-8")
         plot_power_comparison(comparison, part / "comparison.png")
     return text
 
 
 def write_modes(
-    folder: Path, model: "LinearModel", over: "Sequence[tuple[dict[str, float], LinearModel]]"
+    folder: Path,
+    model: "LinearModel",
+    over: "Sequence[tuple[dict[str, float], LinearModel]]",
+    force: bool = True,
 ) -> None:
     """Write a linear model, its table, picture and page into a folder.
 
@@ -335,6 +350,7 @@ def write_modes(
         folder: Created where there is none.
         model: The model.
         over: Of what was varied, drawn in a picture of their own.
+        force: Whether an earlier one is replaced.
 
     Raises:
         OutputError: The folder or a file cannot be written.
@@ -342,7 +358,7 @@ def write_modes(
     from crane.view.page.build import report
     from crane.view.plots.modes import plot_modes, plot_modes_over
 
-    with staging(folder) as part:
+    with staging(folder, force, ("over.png", PAGE)) as part:
         model.save(part / "model.mat")
         model.save(part / "model.npz")
         (part / "modes.md").write_text(model.to_text() + "\n", encoding="utf-8")
@@ -355,7 +371,11 @@ def write_modes(
 
 
 def write_identification(
-    folder: Path, result: "Identification", recording: str = "", validation: str = ""
+    folder: Path,
+    result: "Identification",
+    recording: str = "",
+    validation: str = "",
+    force: bool = True,
 ) -> None:
     """Write report and parameters into a folder, and the machine where all are known.
 
@@ -367,11 +387,22 @@ def write_identification(
     from crane.identification.mechanics.write import write_parameters
     from crane.view.page.identification import write_report
 
-    with staging(folder) as part:
-        write_report(result, part / "report.html", recording, validation)
+    with staging(folder, force, _machine_files(folder, result.machine)) as part:
+        write_report(result, part / REPORT, recording, validation)
         write_parameters(result, part / "parameters.csv")
         if result.parameters is not None:
-            _write_machine(result, part / "machine")
+            _write_machine(result, part / MACHINE)
+
+
+def _machine_files(folder: Path, read: Machine) -> Sequence[str]:
+    """Those that an earlier result of the same kind has left in a folder; none that were read."""
+    place = folder / MACHINE
+    files = (read.path, *(chain.urdf for chain in read.chains))
+    if not (folder / REPORT).is_file() or any(
+        file.resolve().is_relative_to(place.resolve()) for file in files
+    ):
+        return ()
+    return [f"{MACHINE}/**/*.{kind}" for kind in ("yaml", "urdf")]
 
 
 def _write_machine(result: "Identification", folder: Path) -> None:

@@ -68,6 +68,6 @@ def sensitivities(
         )  # fmt: skip
     text = found.to_text()
     if out is not None:
-        write_sensitivities(out, found)
+        write_sensitivities(out, found, force)
         text += f"\n\nwritten to {out}"
     print(text)

@@ -120,7 +120,7 @@ def simulate(
         for option, value in {"--method": method, "--tolerance": tolerance}.items():
             if value is not None:
                 raise InputError(f"{option} does not go with --inputs, leave it out")
-        _replay(loaded, inputs, out, step, columns, span_of(since, until))
+        _replay(loaded, inputs, out, step, columns, span_of(since, until), force)
         return
     of_inputs = {"--columns": columns, "--from": since, "--until": until}
     for option in [option for option, given in of_inputs.items() if given is not None]:
@@ -144,10 +144,10 @@ def simulate(
                 tolerance=tolerance, progress=progress,
             )  # fmt: skip
     except InterruptedRun as cut:
-        write_run(out, cut.recording)
+        write_run(out, cut.recording, force)
         say(f"{cut}: what there is of it is in {out}, whose summary says where it was cut")
         sys.exit(INTERRUPTED)
-    print(write_run(out, recording), end="")
+    print(write_run(out, recording, force), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")
 
 
@@ -223,11 +223,12 @@ def _replay(
     step: float,
     columns: Path | None,
     span: tuple[float, float],
+    force: bool,
 ) -> None:
     from crane.cli.runs import write_comparison
     from crane.simulation.replays import replay
 
     with progress_bar("simulating") as progress:
         recording, comparison = replay(machine, inputs, step, progress, columns, span)
-    print(write_comparison(out, recording, comparison), end="")
+    print(write_comparison(out, recording, comparison, force), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")

@@ -54,5 +54,5 @@ def study(
             processes=(os.cpu_count() or 1) if processes is None else processes,
             progress=progress,
         )  # fmt: skip
-    write_study(out, result)
+    write_study(out, result, force)
     print(f"{result.to_text()}\nwritten to {out}")

@@ -53,5 +53,5 @@ def working_range(
     with status("measuring"):
         found = measure(loaded, frame, bucket=bucket, level=level)
     with status("drawing"):
-        text = write_working_range(out, found)
+        text = write_working_range(out, found, force)
     print(f"{text}\nwritten to {out}")

@@ -49,5 +49,5 @@ def workspace(
     with status("exploring"):
         space = explore(loaded, samples, frame, seed)
     with status("drawing"):
-        text = write_workspace(out, space)
+        text = write_workspace(out, space, force)
     print(f"{text}\nwritten to {out}")

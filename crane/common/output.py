@@ -3,11 +3,13 @@
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from crane.common import leftovers
 from crane.common.errors import OutputError
+from crane.common.exchange import appeared, exchanged
 
 
 @contextmanager
@@ -23,23 +25,73 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """
     path = Path(path)
     _check_place(path)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        yield part
-        os.replace(part, path)
+        leftovers.clear(path)
+        with leftovers.temporary(path) as part:
+            yield part
+            os.replace(part, path)
     except OSError as error:
         raise _unwritable(path, error) from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 @contextmanager
-def staging(folder: str | Path) -> Iterator[Path]:
-    """A temporary folder to write to, whose files go into `folder` at the end.
+def staging(folder: str | Path, force: bool = True, stale: Iterable[str] = ()) -> Iterator[Path]:
+    """A temporary folder to write to, which takes the place of `folder` at the end.
 
-    The temporary folder stands in `folder`, or where that does not exist in the nearest folder
-    above it that does, and is removed when the block raises. At the end `folder` is created, and
-    files of the same names in it are replaced; others stay.
+    It stands beside `folder`, or where that does not exist in the nearest folder above it that
+    does, and is removed when the block raises. Whatever else is in `folder` stays there: of its
+    files there are links in the new folder. Whoever looks, at any instant, and whoever finds it
+    after a kill, sees what was there or what was written, and never some of both.
+
+    There is no place beside the current folder and those above it, where a disk is mounted, or in
+    a folder that may not be written to, and some file systems have no links: such a folder is
+    filled file by file, as by `filling`.
+
+    Args:
+        folder: Created where there is none.
+        force: Whether files of the same names are replaced; if not, `folder` has to be new or
+            empty, at the end, too.
+        stale: Patterns of paths in `folder`, of files that do not stay.
+
+    Raises:
+        OutputError: Nothing can be written there, a folder is where a file is to go, or a file
+            where a folder is to go, or `folder` was filled meanwhile.
+    """
+    target = Path(os.path.realpath(folder))
+    _check_writable(target)
+    if not _can_be_moved(target):
+        with filling(folder, stale) as part:
+            yield part
+            if not force:
+                _check_free(target, folder)
+        return
+    top = _first_missing(target)
+    with _temporary(folder, top, inner=target.relative_to(top)) as (whole, part):
+        yield part
+        if appeared(whole, top):
+            return
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if part != whole and appeared(part, target):
+            return
+        if not force:
+            _check_free(target, folder)
+        try:
+            _keep_others(target, part, _found(target, stale))
+            exchanged(part, target)
+        except OSError:  # no links here, or another user's folder
+            _move_all(part, target, stale)
+
+
+@contextmanager
+def filling(folder: str | Path, stale: Iterable[str] = ()) -> Iterator[Path]:
+    """A temporary folder to write to, whose files go one by one into `folder` at the end.
+
+    For a folder that is the user's place rather than a result. The temporary folder stands in it,
+    or where there is none in the nearest folder above it, and is removed when the block raises.
+
+    Args:
+        folder: Created where there is none; files of the same names are replaced, others stay.
+        stale: Patterns of paths in `folder`, of files that do not stay.
 
     Raises:
         OutputError: Nothing can be written there, or a folder is where a file is to go, or a file
@@ -47,17 +99,31 @@ def staging(folder: str | Path) -> Iterator[Path]:
     """
     target = Path(os.path.realpath(folder))
     _check_writable(target)
-    part = _existing(target) / f".{target.name}.{os.getpid()}.part"
-    try:
-        part.mkdir()
+    with _temporary(folder, target, within=_existing(target)) as (_, part):
         yield part
-        _move_all(part, target)
-    except OutputError as error:  # told of the place that the user knows
-        raise OutputError(str(error).replace(str(part), str(folder))) from error
+        _move_all(part, target, stale)
+
+
+@contextmanager
+def _temporary(
+    folder: str | Path, place: Path, within: Path | None = None, inner: Path = Path()
+) -> Iterator[tuple[Path, Path]]:
+    """A temporary folder for a place, and the one in it that is written to.
+
+    Raises:
+        OutputError: One that is raised in the block, told of the folder that the user knows, or
+            nothing can be written.
+    """
+    try:
+        leftovers.clear(place, within)
+        with leftovers.temporary(place, folder=True, within=within) as whole:
+            (part := whole / inner).mkdir(parents=True, exist_ok=True)
+            try:
+                yield whole, part
+            except OutputError as error:
+                raise OutputError(str(error).replace(str(part), str(folder))) from error
     except OSError as error:
         raise _unwritable(Path(folder), error) from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def check_file(path: Path) -> None:
@@ -74,10 +140,15 @@ def check_file(path: Path) -> None:
 def check_folder(folder: Path) -> None:
     """See that a folder can be made or filled, before its files are computed.
 
+    What killed processes left over of it is removed.
+
     Raises:
         OutputError: A file is in the way, or the nearest folder may not be written to.
     """
     _check_writable(folder)
+    target = Path(os.path.realpath(folder))
+    leftovers.clear(_first_missing(target))
+    leftovers.clear(target, _existing(target))
 
 
 def file_name(text: str) -> str:
@@ -119,20 +190,87 @@ def _existing(path: Path) -> Path:
     return path
 
 
-def _move_all(source: Path, target: Path) -> None:
-    """Move all files from one folder into another, the same names replaced."""
+def _first_missing(path: Path) -> Path:
+    """The path itself, or the highest one above it that does not exist."""
+    while not path.parent.exists() and path != path.parent:
+        path = path.parent
+    return path
+
+
+def _can_be_moved(target: Path) -> bool:
+    """Whether a folder can be put in the place of this one."""
+    if not os.access(_first_missing(target).parent, os.W_OK | os.X_OK):
+        return False
+    try:
+        current = Path(os.path.realpath(os.getcwd()))
+    except OSError:  # it is gone
+        return not os.path.ismount(target)
+    return not (current.is_relative_to(target) or os.path.ismount(target))
+
+
+def _check_free(target: Path, folder: str | Path) -> None:
+    """Raise if a folder holds something besides what is being written to it."""
+    if any(not leftovers.is_temporary(name, target) for name in os.listdir(target)):
+        raise OutputError(
+            f"{folder}: is there now, another program has filled it meanwhile, choose another "
+            "folder or add --force"
+        )
+
+
+def _found(target: Path, patterns: Iterable[str]) -> set[Path]:
+    """Files that patterns name."""
+    return {x for pattern in patterns for x in target.glob(pattern) if not x.is_dir()}
+
+
+def _keep_others(old: Path, new: Path, stale: set[Path]) -> None:
+    """Link into a new folder what of an old one is not in it, and not stale."""
+    for entry in os.scandir(old):
+        here, there = old / entry.name, new / entry.name
+        is_folder = entry.is_dir(follow_symlinks=False)
+        if here in stale:
+            continue
+        if os.path.lexists(there):
+            if there.is_dir() and not is_folder:
+                raise OutputError(f"{here}: is a file, give the name of a folder")
+            if is_folder and not there.is_dir():
+                raise _in_the_way(here)
+            if is_folder:
+                _keep_others(here, there, stale)
+        elif is_folder:
+            there.mkdir()
+            _keep_others(here, there, stale)
+            if any(there.iterdir()) or not any(here.iterdir()):
+                shutil.copystat(here, there)
+            else:  # all of it was stale
+                there.rmdir()
+        else:
+            os.link(here, there, follow_symlinks=False)
+    shutil.copymode(old, new)
+
+
+def _move_all(source: Path, target: Path, patterns: Iterable[str]) -> None:
+    """Move all files from one folder into another, the same names replaced, then remove others."""
     if not target.exists():
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(source, target)
         return
     files = [path.relative_to(source) for path in sorted(source.rglob("*")) if path.is_file()]
+    stale = _found(target, patterns) - {target / file for file in files}
     for file in files:  # what is in the way is found before anything is moved
         _check_writable((target / file).parent)
         if (target / file).is_dir():
-            raise OutputError(f"{target / file}: is a folder, remove it or choose another place")
+            raise _in_the_way(target / file)
     for file in files:
         (target / file).parent.mkdir(parents=True, exist_ok=True)
         os.replace(source / file, target / file)
+    for path in stale:
+        path.unlink(missing_ok=True)
+        if path.parent != target and not any(path.parent.iterdir()):
+            path.parent.rmdir()
+
+
+def _in_the_way(path: Path) -> OutputError:
+    return OutputError(f"{path}: is a folder, remove it or choose another place")
 
 
 def _unwritable(path: Path, error: OSError) -> OutputError:

@@ -5,10 +5,11 @@ import re
 from pathlib import Path
 
 from crane.common.errors import DescriptionError, known
+from crane.common.inputs import content
 from crane.description.spec import Chain, Drive, LoopSpec, MachineSpec, places
 from crane.description.tree import Joint, Link, Tree
 from crane.formats.machine_file.posture import read_home
-from crane.formats.machine_file.section import Section
+from crane.formats.machine_file.section import LARGEST, Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
 from crane.formats.series import series
 from crane.formats.urdf.graph import MOVING
@@ -29,7 +30,7 @@ _UNIVERSAL = re.compile(r"UJOINT_([XYZ])([XYZ])")
 def is_parallel_robot(file: Path) -> bool:
     """Whether a YAML file is of this convention and no machine file."""
     try:
-        text = file.read_text(encoding="utf-8")
+        text = content(file, LARGEST).decode("utf-8")
     except (OSError, UnicodeDecodeError):
         return False  # which the reader of machine files says better
     return _OWN.search(text) is not None and _MACHINE.search(text) is None

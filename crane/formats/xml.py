@@ -8,10 +8,12 @@ from pathlib import Path
 from lxml import etree
 
 from crane.common.errors import DescriptionError, known
+from crane.common.inputs import content
 from crane.description.findings import flag
 from crane.description.spec import unit_vector
 from crane.description.tree import Placement, Vector
 
+LARGEST = 50_000_000  # bytes of a file
 _X = (1.0, 0.0, 0.0)
 _LINES = 1 << 16
 _LONG = 60  # characters of a value in an error
@@ -40,6 +42,43 @@ class Places:
         element.sourceline = number if number < _LINES else 0  # all that the parser holds
 
 
+class _Beginning:
+    """What a parser finds up to the root element, in whatever encoding the file is."""
+
+    class End(Exception):  # noqa: N818
+        """The root element is there."""
+
+    class DocumentType(Exception):  # noqa: N818
+        """There is one."""
+
+    def doctype(self, *_: object) -> None:
+        """Called before anything of it is declared."""
+        raise self.DocumentType
+
+    def start(self, *_: object) -> None:
+        """Called at each element."""
+        raise self.End
+
+    def end(self, *_: object) -> None:
+        """Never called."""
+
+    def close(self) -> None:
+        """Called at the end of a file without elements."""
+
+
+def _refuse_document_type(file: Path, data: bytes) -> None:
+    """Raise for <!DOCTYPE>, whose entities may grow without bounds, or fetch."""
+    try:
+        etree.fromstring(data, etree.XMLParser(target=_Beginning(), no_network=True))
+    except _Beginning.DocumentType:
+        line = data.count(b"\n", 0, max(data.find(b"<!DOCTYPE"), 0)) + 1
+        raise DescriptionError(
+            f"{file.name}:{line}: <!DOCTYPE> is not supported, remove it"
+        ) from None
+    except (_Beginning.End, etree.XMLSyntaxError):  # told by whoever reads all
+        pass
+
+
 class XmlFile:
     """An XML file.
 
@@ -62,16 +101,14 @@ class XmlFile:
         self.nameless: set[str] = set()
         self.places: Sequence[str] = ()
         try:
-            data = file.read_bytes()
+            data = content(file, LARGEST)
         except OSError as error:
             raise DescriptionError(
                 f"{file}: cannot be read ({error.strerror}), check the path"
             ) from None
         if not data.strip():
             raise DescriptionError(f"{file.name}: the file is empty, write a <robot> in it")
-        if (at := data.find(b"<!DOCTYPE")) >= 0:  # entities may grow without bounds, or fetch
-            line = data.count(b"\n", 0, at) + 1
-            raise DescriptionError(f"{file.name}:{line}: <!DOCTYPE> is not supported, remove it")
+        _refuse_document_type(file, data)
         if b"encoding" not in data[:200] and not data.startswith((b"\xff\xfe", b"\xfe\xff")):
             try:
                 data.decode("utf-8")

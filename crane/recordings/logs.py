@@ -24,9 +24,11 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.errors import RecordingError, known
+from crane.common.inputs import content
 from crane.recordings import timeseries
 from crane.recordings.timeseries import TIME, Table
 
+_LARGEST = 2_000_000  # bytes of a file of columns
 _LONGEST = 1000  # characters of an expression
 _LINE = re.compile(r"\s*([^=\[\]]+?\s*(?:\[[^\]]*\])?)\s*=\s*(.+?)\s*")
 _OPERATORS = {
@@ -153,7 +155,7 @@ def lines_of(path: Path) -> tuple[dict[str, str], list[Line]]:
         RecordingError: It is missing or malformed.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = content(path, _LARGEST).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: is not text, save it as UTF-8") from None
     except OSError as error:

@@ -1,13 +1,16 @@
 """Time series as a CSV: a table of columns with names and units, the first of them time.
 
 Comment lines `# key: value`, then one header row `time [s],name [unit],...`, then one row per
-sample. A unit may be left out, for all columns but time. What is read is in SI units: columns in
+sample. A file that is written here says by `# crane samples: N` how many there are, so that one
+that is cut short is told. A unit may be left out, for all columns but time. What is read is in SI
+units: columns in
 bar, deg, mm and others of `crane.common.units.TO_SI` are converted, those in other units stay as
 they are. Numbers are written with the fewest digits that give the same float64 again.
 """
 
 import csv
 import io
+import os
 import re
 import stat
 import warnings
@@ -29,9 +32,11 @@ from crane.recordings.npz import MOST, MOST_COLUMNS, read_arrays, read_columns
 T = TypeVar("T")
 
 _WORD = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
+SAMPLES = "crane samples"  # the comment that says how many there are
 _ROWS_AT_ONCE = 4096
 _BLOCK = 1 << 20  # bytes, and so many at most in a line
 _LONG_HEADING, _LONG_NAME = 1 << 16, 200  # characters
+_AGAIN = f"copy it again, or remove '# {SAMPLES}' if that is meant"
 _LARGEST = 1e30  # in SI units; what is computed from larger ones overflows
 
 
@@ -94,7 +99,8 @@ def write_columns(
     Raises:
         OutputError: It cannot be written there.
     """
-    head = [f"# {key}: {value}" if value else f"# {key}" for key, value in notes.items()]
+    counted = {**notes, SAMPLES: str(len(columns[0]))}
+    head = [f"# {key}: {value}" if value else f"# {key}" for key, value in counted.items()]
     head.append(",".join(f"{x} [{unit}]" if unit else x for x, unit in units.items()))
     with replacing(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(head) + "\n")
@@ -136,7 +142,10 @@ def read_csv(path: str | Path) -> Table:
             raise RecordingError(
                 f"holds {lines - line} lines of {len(units)} columns, give at most {MOST} numbers"
             )
-        return _in_si(Table(units, _values(path, line, units), notes))
+        _check_end(path, notes)
+        values = _values(path, line, units)
+        _check_count(values, notes)
+        return _in_si(Table(units, values, {key: x for key, x in notes.items() if key != SAMPLES}))
     except RecordingError as error:
         raise RecordingError(at(str(path), error)) from None
     except UnicodeDecodeError:
@@ -169,12 +178,12 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         check_plain(path)
         _count_lines(path)
-        _, heading, line = _head(path)
+        notes, heading, line = _head(path)
+        _check_end(path, notes)
         between = max(",;\t", key=heading.count)
         names = [cell.strip() for cell in next(csv.reader([heading], delimiter=between))]
-        values = np.loadtxt(
-            path, delimiter=between, comments=None, skiprows=line, ndmin=2, encoding="utf-8"
-        )
+        values = _numbers(path, line, between)
+        _check_count(values, notes)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
     except OSError as error:
@@ -249,6 +258,31 @@ def _count_lines(path: Path) -> int:
             if last >= 0:
                 since = len(block) - last - 1
     return ended + (since > 0)
+
+
+def _check_end(path: Path, notes: Mapping[str, str]) -> None:
+    """See that the last line of a file that says how many samples it has ends.
+
+    Raises:
+        RecordingError: It may be cut inside of a number.
+    """
+    if SAMPLES not in notes:
+        return
+    with path.open("rb") as file:
+        file.seek(-1, os.SEEK_END)
+        if file.read(1) not in b"\r\n":
+            raise RecordingError(f"is cut short in its last line, {_AGAIN}")
+
+
+def _check_count(values: Array, notes: Mapping[str, str]) -> None:
+    """See that there are as many samples as a file says.
+
+    Raises:
+        RecordingError: There are not.
+    """
+    if SAMPLES in notes and notes[SAMPLES] != str(len(values)):
+        said = notes[SAMPLES][:20]
+        raise RecordingError(f"has {len(values)} of the {said} samples that it says, {_AGAIN}")
 
 
 def _in_si(table: Table) -> Table:
@@ -364,23 +398,34 @@ def check_unit(column: str, unit: str, allowed: Iterable[str]) -> None:
 def _values(path: Path, header: int, units: Mapping[str, str]) -> Array:
     """Numbers (N, columns) below the header row, which is line `header`."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about a file without samples
-            values = np.loadtxt(
-                path, delimiter=",", comments=None, skiprows=header, ndmin=2, encoding="utf-8"
-            )
+        values = _numbers(path, header, ",")
     except ValueError as error:
         _find_fault(path, header, units)
         reason = " ".join(str(error).split())[:120]
         raise RecordingError(f"{reason}, correct the file") from None
-    if not values.size:
-        raise RecordingError("has a header and no samples, write one row per sample")
     if (
         values.shape[1] != len(units)
         or not np.isfinite(values).all()
         or (np.diff(values[:, list(units).index(TIME)]) <= 0).any()
     ):
         _find_fault(path, header, units)
+    return values
+
+
+def _numbers(path: Path, header: int, between: str) -> Array:
+    """Numbers (N, columns) below the header row.
+
+    Raises:
+        RecordingError: There are none.
+        ValueError: Something else is there.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about a file without samples
+        values = np.loadtxt(
+            path, delimiter=between, comments=None, skiprows=header, ndmin=2, encoding="utf-8"
+        )
+    if not values.size:
+        raise RecordingError("has a header and no samples, write one row per sample")
     return values
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.errors import CraneWarning, InputError
-from crane.common.output import file_name, staging
+from crane.common.output import file_name, filling
 from crane.formats.adding.eyes import eye_of, path_between
 from crane.formats.adding.fitting import fitted, warn_of_masses, warn_of_strokes
 from crane.formats.adding.hanging import hung
@@ -128,7 +128,7 @@ def add_cylinder(
     notes = _notes(span, start, shares) + hung(draft, loaded, name, eyes, steel, span.q[start])
     driven_instead(draft, loaded, name, None if shares else span.joint)
     check_free(draft, file, force)
-    with staging(file.parent) as part:
+    with filling(file.parent) as part:
         draft.write(part, file.name)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CraneWarning)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from crane.common.errors import CraneError, CraneWarning, InputError, MechanismError
-from crane.common.output import file_name, staging
+from crane.common.output import file_name, filling
 from crane.description import MachineSpec
 from crane.formats.adding.open_loops import Proposal, proposals
 from crane.formats.adding.place import check_free, machine_file
@@ -73,7 +73,7 @@ def add_loops(
         "active": list(spec.active or ()), "free": list(spec.free), "home": dict(spec.home),
     }  # fmt: skip
     draft.data["loops"] += [_entry(proposal) for proposal in found]
-    with staging(file.parent) as part:
+    with filling(file.parent) as part:
         draft.write(part, file.name)
         closed = _closed(part / file.name, found)
         driven = closed.driven_joints

@@ -1,11 +1,13 @@
 """Curves of data sheets over a spool's stroke, as a machine file has them."""
 
 import csv
+import io
 import math
 from pathlib import Path
 
 from crane.common.errors import InputError
-from crane.formats.machine_file.section import Section
+from crane.common.inputs import content
+from crane.formats.machine_file.section import LARGEST, Section
 from crane.hydraulics.curve import Curve
 
 _KEYS = ("coefficient", "shape", "flow", "drop", "area", "discharge", "density", "file")
@@ -71,8 +73,8 @@ def _tabled(inner: Section) -> tuple[str, list[tuple[float, float]]]:
 
 def _of_file(path: Path) -> tuple[str, list[tuple[float, float]]]:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            rows = list(csv.DictReader(stream, skipinitialspace=True))
+        text = content(path, LARGEST).decode("utf-8-sig")
+        rows = list(csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path.name} cannot be read ({error}), give a CSV file") from None
     names = [name for name in ("flow", "area", "coefficient") if rows and name in rows[0]]

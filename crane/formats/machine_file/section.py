@@ -1,5 +1,6 @@
 """Strict reading of YAML: every key known, every value of its kind, every error with its line."""
 
+import errno
 import math
 from collections.abc import Collection, Iterable, Iterator
 from difflib import get_close_matches
@@ -9,6 +10,7 @@ from typing import Any, overload
 import yaml
 
 from crane.common.errors import DescriptionError, known
+from crane.common.inputs import content
 from crane.description.findings import flag, recoverable
 from crane.description.sources import bundled
 
@@ -82,7 +84,7 @@ def _construct_map(loader: _Loader, node: yaml.MappingNode) -> _Map:
 _Loader.add_constructor("tag:yaml.org,2002:map", _construct_map)
 
 _MISSING: Any = object()
-_LARGEST = 2_000_000  # bytes of a file; the reader takes a minute for ten million
+LARGEST = 2_000_000  # bytes of a file; the reader takes a minute for ten million
 
 
 def _plain(value: Any) -> Any:
@@ -120,14 +122,15 @@ def _parsed(file: Path) -> _Map:
         DescriptionError: The file is missing, not YAML, or no mapping.
     """
     try:
-        if file.stat().st_size > _LARGEST:
-            size = f"{file.stat().st_size / 1e6:.3g} MB, more than {_LARGEST / 1e6:g}"
-            raise DescriptionError(f"{file.name}: {size}, which takes too long, shorten it")
-        with file.open(encoding="utf-8") as stream:
-            data = yaml.load(stream, _Loader)  # noqa: S506 (a SafeLoader)
+        loader = _Loader(content(file, LARGEST).decode("utf-8"))  # a SafeLoader
+        loader.name = str(file)
+        data = loader.get_single_data()
     except UnicodeDecodeError:
         raise DescriptionError(f"{file.name}: not UTF-8, save it as UTF-8 text") from None
     except OSError as error:
+        if error.errno == errno.EFBIG:
+            what = f"{error.strerror}, which takes too long, shorten it"
+            raise DescriptionError(f"{file.name}: {what}") from None
         raise DescriptionError(
             f"{file}: cannot be read ({error.strerror}), check the path"
         ) from None

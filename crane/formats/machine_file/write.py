@@ -38,7 +38,10 @@ from crane.machine import Machine
 
 
 def write_machine(
-    machine: Machine, folder: str | Path, notes: Mapping[str, str] | None = None
+    machine: Machine,
+    folder: str | Path,
+    notes: Mapping[str, str] | None = None,
+    force: bool = True,
 ) -> Path:
     """Write a machine as a machine file, with one URDF per sub-chain beside it.
 
@@ -47,6 +50,8 @@ def write_machine(
         folder: Created where there is none; files of the same names are replaced.
         notes: What is to be said of numbers, by their names, see `crane.description.parameters`:
             comments in the lines where these stand, or at the head of the machine file.
+        force: Whether files that are there are replaced; if not, the folder has to be new or
+            empty.
 
     Returns:
         The machine file.
@@ -64,7 +69,7 @@ def write_machine(
             raise OutputError(
                 f"{place}: is what '{machine.name}' was read from, choose another folder"
             )
-    with staging(folder) as part:
+    with staging(folder, force) as part:
         draft.write(part, file)
     return Path(folder) / file
 

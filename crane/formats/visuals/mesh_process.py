@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 
 MEMORY, SECONDS = 2 << 30, 20  # [bytes], [s] of computing per file
 TRIANGLES = 4_000_000  # in all files; a page with as many has 300 MB
+_FEW, _TIMES = 100_000, 10  # triangles that a file may repeat its parts to: as many, or tenfold
 _FORMATS = ("stl", "obj", "dae", "glb", "gltf", "ply", "off")
 
 
@@ -81,8 +82,9 @@ def _read(file: str, most: int) -> tuple[list[dict[str, Any]], list[Any]]:
         raise ValueError(f"no mesh ends in .{kind}, known: {', '.join(_FORMATS)}")
     # unmerged vertices keep the edges of the drawing sharp
     scene = trimesh.load_scene(file, process=False)
-    parts: list[dict[str, Any]] = []
-    arrays: list[Any] = []
+    own = sum(len(getattr(part, "faces", ())) for part in scene.geometry.values())
+    repeated = max(_FEW, _TIMES * own)
+    by_colour: dict[tuple[float, ...] | None, list[tuple[Any, Any]]] = {}
     count = 0
     for node in scene.graph.nodes_geometry:
         placement, name = scene.graph[node]
@@ -90,6 +92,8 @@ def _read(file: str, most: int) -> tuple[list[dict[str, Any]], list[Any]]:
         if not isinstance(part, trimesh.Trimesh) or not len(part.faces):
             continue
         count += len(part.faces)
+        if count > repeated:
+            raise ValueError(f"it repeats its {own} triangles to more than {repeated}")
         if count > most:
             raise ValueError(f"with it there are more than {TRIANGLES} triangles to draw")
         vertices = trimesh.transform_points(np.asarray(part.vertices, np.float64), placement)
@@ -100,20 +104,27 @@ def _read(file: str, most: int) -> tuple[list[dict[str, Any]], list[Any]]:
             raise ValueError("a triangle of vertices that are not there")
         if not np.isfinite(vertices).all():
             raise ValueError("coordinates that are not finite")
-        parts.append({"vertices": len(vertices), "faces": len(faces), "colour": _colour(part)})
-        arrays += [vertices, faces]
-    if not parts:
+        by_colour.setdefault(_colour(part), []).append((vertices, faces))
+    if not by_colour:
         raise ValueError("no triangles in it")
+    parts: list[dict[str, Any]] = []
+    arrays: list[Any] = []
+    for colour, pieces in by_colour.items():
+        first = np.cumsum([0, *(len(vertices) for vertices, _ in pieces)])
+        vertices = np.concatenate([vertices for vertices, _ in pieces])
+        faces = np.concatenate([x + start for start, (_, x) in zip(first, pieces, strict=False)])
+        parts.append({"vertices": len(vertices), "faces": len(faces), "colour": colour})
+        arrays += [vertices, faces]
     return parts, arrays
 
 
-def _colour(part: Any) -> list[float] | None:
+def _colour(part: Any) -> tuple[float, ...] | None:
     """Its own colour, if it has one that can be read."""
     try:
         if not part.visual.defined:
             return None
         painted = getattr(part.visual, "material", part.visual)
-        colour = [min(max(float(value) / 255, 0.0), 1.0) for value in painted.main_color]
+        colour = tuple(min(max(float(x) / 255, 0.0), 1.0) for x in painted.main_color)
     except MemoryError:
         raise
     except Exception:  # a texture that is damaged, a colour that is none

@@ -15,13 +15,34 @@ _UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 @dataclass
 class Recorder:
-    """Stands in for meshcat's window: no server, no port, only a list of commands."""
+    """Stands in for meshcat's window: no server, no port, only a list of commands.
+
+    Meshcat's identifiers tell time and computer. Here they are numbers in the order of the
+    commands, so that equal runs give equal pages.
+    """
 
     commands: list[dict[str, Any]] = field(default_factory=list)
+    _numbers: dict[str, str] = field(default_factory=dict)
 
     def send(self, command: Any) -> None:
         """Keep a command."""
-        self.commands.append(command.lower())
+        lowered = command.lower()
+        self._number(lowered)
+        self.commands.append(self._numbered(lowered))
+
+    def _number(self, part: Any) -> None:
+        for key, value in part.items() if isinstance(part, dict) else enumerate(part):
+            if key == "uuid":
+                self._numbers.setdefault(value, str(len(self._numbers)))
+            elif isinstance(value, dict | list):
+                self._number(value)
+
+    def _numbered(self, part: Any) -> Any:
+        if isinstance(part, dict):
+            return {key: self._numbered(value) for key, value in part.items()}
+        if isinstance(part, list):
+            return [self._numbered(value) for value in part]
+        return self._numbers.get(part, part) if isinstance(part, str) else part
 
 
 def draw_visuals(viewer: Any, visuals: Sequence[Visual]) -> None:
