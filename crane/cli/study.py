@@ -1,15 +1,19 @@
 """The command that changes parameters: study."""
 
 import os
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from crane.cli.shared import (
+    Change,
     Force,
+    Lock,
     MachineName,
     Out,
     app,
+    load,
     progress_bar,
 )
 
@@ -29,8 +33,20 @@ def study(
         list[str] | None, typer.Option(help="A task to measure with; all if not given.")
     ] = None,
     measure: Annotated[
-        list[str] | None, typer.Option(help="What to report, such as peak_X2; all if not given.")
+        list[str] | None,
+        typer.Option(help="What to report: peak_X2, load(4, 0) / mass; all if not given."),
     ] = None,
+    require: Annotated[
+        list[str] | None, typer.Option(metavar="A>=B", help="What has to hold, or A<=B.")
+    ] = None,
+    measures: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.py", help="Measures of your own: functions of a machine."),
+    ] = None,
+    frame: Annotated[
+        str | None, typer.Option(metavar="LINK", help="Where loads hang; the tip if not given.")
+    ] = None,
+    rule: Annotated[str, typer.Option(help="By which loads are rated.")] = "none",
     draws: Annotated[int | None, typer.Option(help="Number of random variants.")] = None,
     seed: Annotated[int, typer.Option(help="Of the random variants.")] = 0,
     processes: Annotated[
@@ -39,6 +55,8 @@ def study(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster to compute on.")
     ] = None,
+    change: Change = None,
+    lock: Lock = None,
     force: Force = False,
 ) -> None:
     """Measure variants of a machine: any parameters over a grid or at random."""
@@ -50,7 +68,8 @@ def study(
     axes = ranges(vary, draws)
     with progress_bar("computing variants") as progress:
         result = run(
-            machine, axes, task, measure, draws=draws, seed=seed, scheduler=scheduler,
+            load(machine, lock, change), axes, task, measure, require=require or (),
+            own=measures, frame=frame, rule=rule, draws=draws, seed=seed, scheduler=scheduler,
             processes=(os.cpu_count() or 1) if processes is None else processes,
             progress=progress,
         )  # fmt: skip

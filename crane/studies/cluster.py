@@ -14,7 +14,7 @@ J = TypeVar("J")
 R = TypeVar("R")
 
 
-def computed(
+def by_workers(
     function: Callable[[J], R], jobs: Sequence[J], scheduler: str
 ) -> Iterator[tuple[int, Any]]:
     """Indices and results of jobs as they get ready.

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from crane.common.errors import ClosureError
 from crane.common.samples import Array
-from crane.control import ComputedTorque
+from crane.control import ComputedTorque, joystick
 from crane.dynamics import Dynamics
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
@@ -19,6 +19,7 @@ from crane.recordings.recording import FORCE_UNITS
 from crane.simulation import simulate
 
 _RATE = 200  # samples per second of a task
+_LEVERS = 5e-3  # [s] between samples of a task of levers
 _CELLS = 1000  # postures of the grid over the strokes that move passive joints
 _POSTURES = 5000  # with those of the other strokes
 _STEPS = 16  # from one of the grid to the next
@@ -30,13 +31,15 @@ _APART = 0.2  # of the strokes, between two of them
 
 
 def task_measures(machine: Machine) -> dict[str, str]:
-    """Names and units of what is measured task by task."""
+    """Names and units of what is measured task by task; pump_work of tasks of levers alone."""
     units = {joint: FORCE_UNITS[machine.unit(joint)] for joint in machine.driven_joints}
     return {
         **{f"peak_{joint}": unit for joint, unit in units.items()},
         **{f"rms_{joint}": unit for joint, unit in units.items()},
         "energy": "J",
         "work": "J",
+        "duration": "s",
+        **({"pump_work": "J"} if machine.hydraulics is not None else {}),
     }
 
 
@@ -54,7 +57,9 @@ def of_task(machine: Machine, dynamics: Dynamics, task: str) -> tuple[float, dic
     """What the driven joints need to move as a task asks, and its duration [s].
 
     Inverse dynamics of the reference motion, friction included, while free joints move as they
-    will: with some, the motion is that of a simulation under `ComputedTorque`.
+    will: with some, the motion is that of a simulation under `ComputedTorque`. A task of levers
+    is simulated with its circuit: the forces are those of the cylinders then, and pump_work is
+    what the pumps gave.
 
         tau = inverse(q_ref, v_ref, a_ref),     peak = max |tau|,   rms^2 = 1/T int tau^2 dt,
         energy = int sum max(0, tau_i v_i) dt,  work = int sum tau_i v_i dt.
@@ -62,6 +67,8 @@ def of_task(machine: Machine, dynamics: Dynamics, task: str) -> tuple[float, dic
     Raises:
         CraneError: The machine cannot do it.
     """
+    if machine.tasks[task].space == "joystick":
+        return _of_levers(machine, task)
     path = task_trajectory(machine, task)
     time = np.linspace(0.0, path.duration, int(np.ceil(_RATE * path.duration)) + 1)
     if machine.free:
@@ -71,23 +78,43 @@ def of_task(machine: Machine, dynamics: Dynamics, task: str) -> tuple[float, dic
     else:
         q_a, v_a, a_a = path(time)
         tau = dynamics.inverse(q_a, v_a, a_a, friction=True)
-    power = tau * v_a
+    return path.duration, _of_forces(machine, time, v_a, tau)
+
+
+def _of_levers(machine: Machine, name: str) -> tuple[float, dict[str, float]]:
+    """The same of a task of levers, simulated with its circuit and loads."""
+    task = machine.tasks[name]
+    run = simulate(
+        machine.under(*task.loads),
+        joystick(machine, name),
+        duration=None if task.phases else task.duration,
+        step=_LEVERS,
+    )
+    found = _of_forces(machine, run.time, run.v, run.tau)
+    found["pump_work"] = float(run.channels["pump_work"][-1])
+    return float(run.time[-1]), found
+
+
+def _of_forces(machine: Machine, time: Array, v_a: Array, tau: Array) -> dict[str, float]:
+    """Measures of forces (N, n) along a motion."""
+    power, duration = tau * v_a, float(time[-1] - time[0])
     found = {}
     for joint in machine.driven_joints:
         i = machine.active.index(joint)
         found[f"peak_{joint}"] = float(np.abs(tau[:, i]).max())
-        square = np.trapezoid(tau[:, i] ** 2, time) / path.duration
+        square = np.trapezoid(tau[:, i] ** 2, time) / duration
         found[f"rms_{joint}"] = float(np.sqrt(square))
     found["energy"] = float(np.trapezoid(np.maximum(power, 0.0).sum(axis=1), time))
     found["work"] = float(np.trapezoid(power.sum(axis=1), time))
-    return path.duration, found
+    found["duration"] = duration
+    return found
 
 
 def together(tasks: Sequence[tuple[float, dict[str, float]]]) -> dict[str, float]:
     """Measures of tasks done one after the other, from those of each, see `of_task`."""
     whole = sum(duration for duration, _ in tasks)
     out = {}
-    for name in tasks[0][1]:
+    for name in [x for x in tasks[0][1] if all(x in found for _, found in tasks)]:
         values = [found[name] for _, found in tasks]
         if name.startswith("peak_"):
             out[name] = max(values)

@@ -2,15 +2,11 @@
 
 import itertools
 import math
-import multiprocessing
 import os
-import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +16,13 @@ from crane.common.samples import Array, as_count, as_samples, as_seed
 from crane.description import parameters
 from crane.dynamics import Dynamics
 from crane.formats import load, read
+from crane.formats.loading import Variants
 from crane.machine import Machine
+from crane.ratings.rules import rule_of
+from crane.studies.computing import computed
+from crane.studies.design.expressions import Expression, requirement
+from crane.studies.design.own import Measure, own_measures
+from crane.studies.design.quantities import PLAIN, Point, Terms, places_in
 from crane.studies.measures import (
     notes,
     of_strokes,
@@ -32,6 +34,7 @@ from crane.studies.measures import (
 from crane.studies.table import Study
 
 _MOST = 100_000  # variants
+_SLACK = 1e-9  # by which a requirement may fail
 _PER_CORE = 8  # processes: more would wait for each other, and each has the machine in memory
 # Parameters that inverse dynamics does not know, by their first word.
 _IDLE = ("control", "supply", "oil", "cylinder", "valve", "valve_control")
@@ -42,8 +45,6 @@ _DESCRIBED = (
 )  # fmt: skip
 
 Progress = Callable[[float], None]
-J = TypeVar("J")
-R = TypeVar("R")
 
 # One machine per set of formulas: as long as it lives, variants share its machine code.
 _KEPT: dict[int, Machine] = {}
@@ -58,6 +59,11 @@ class Job(NamedTuple):
         lock: Joints that are fixed.
         tasks: To measure it with.
         strokes: Whether to measure its strokes.
+        expressions: Of measures, see `crane.studies.design`.
+        require: What has to hold.
+        own: A Python file of a user's own measures, or these.
+        frame: Where loads hang.
+        rule: By which they are rated.
     """
 
     machine: str
@@ -65,6 +71,11 @@ class Job(NamedTuple):
     lock: dict[str, float]
     tasks: tuple[str, ...]
     strokes: bool
+    expressions: tuple[str, ...] = ()
+    require: tuple[str, ...] = ()
+    own: str | Mapping[str, Measure] | None = None
+    frame: str | None = None
+    rule: str = "none"
 
 
 def study(
@@ -73,6 +84,10 @@ def study(
     tasks: Sequence[str] | None = None,
     measures: Sequence[str] | None = None,
     *,
+    require: Sequence[str] = (),
+    own: str | Path | Mapping[str, Measure] | None = None,
+    frame: str | None = None,
+    rule: str = "none",
     draws: int | None = None,
     seed: int = 0,
     processes: int = 1,
@@ -82,8 +97,10 @@ def study(
     """Measure variants of a machine: the grid of all values, or random draws.
 
     Measures, see `crane.studies.measures`: peak_JOINT, rms_JOINT, energy and work of the active
-    joints over the tasks; reach, range, lower_JOINT and upper_JOINT of the strokes. Every variant
-    is loaded afresh, so its row does not depend on where it is computed, or after what.
+    joints over the tasks; reach, range, lower_JOINT and upper_JOINT of the strokes; and any
+    expression that `crane.design` takes, such as "load(4, 0) / mass". Tasks of levers are
+    simulated with their circuit. Every variant is loaded afresh, so its row does not depend on
+    where it is computed, or after what.
 
     Args:
         machine: What `crane.load` takes, or what it gave.
@@ -91,6 +108,11 @@ def study(
             combinations are taken, or with `draws` the two ends of a range.
         tasks: Of the machine; all if not given.
         measures: Which ones; all if not given.
+        require: "A >= B", "A <= B" or "A == B" of such expressions; variants that fail are not
+            measured, and say by how much.
+        own: Functions of a machine by name that expressions know, or a Python file of them.
+        frame: Where loads hang, of expressions; the tip if not given.
+        rule: By which they are rated.
         draws: Number of variants drawn uniformly from the ranges.
         seed: Of the draws.
         processes: How many to compute with, at most eight per core; more than one need a main
@@ -107,20 +129,32 @@ def study(
     base = _base(machine)
     name = base.reference if base.reference == str(machine) else str(base.path.resolve())
     values, grid = _variants(vary, draws, seed)
-    units = _parameter_units(base, vary)
     tasks = _chosen("task", base.tasks, tasks)
+    levers = any(base.tasks[task].space == "joystick" for task in tasks)
     of_tasks = task_measures(base) if tasks else {}
     available = of_tasks | stroke_measures(base)
-    measures = _chosen("measure", available, measures)
-    if not set(measures) & set(of_tasks):
+    functions = own_measures(own)
+    expressions = tuple(x for x in measures or () if _composed(x, available, functions))
+    for text in require:
+        requirement(text)
+    plain = [x for x in measures or () if x not in expressions]
+    chosen = _chosen("measure", available, plain or (None if not expressions else ()))
+    units = _parameter_units(base, vary, levers or bool(expressions) or bool(require))
+    asked = tasks
+    if not set(chosen) & set(of_tasks):
         tasks = ()
     jobs = [
         Job(
             name,
             {**base.changes, **dict(zip(vary, row.tolist(), strict=True))},
             dict(base.locks),
-            tasks,
-            not set(measures) <= set(of_tasks),
+            asked if expressions or require else tasks,
+            not set(chosen) <= set(of_tasks),
+            expressions,
+            tuple(require),
+            own if own is None or isinstance(own, Mapping) else str(own),
+            frame,
+            rule_of(rule).name,
         )
         for row in values
     ]
@@ -130,6 +164,8 @@ def study(
         if progress is not None:
             progress(len(rows) / len(jobs))
     columns = dict(zip(vary, values.T, strict=True))
+    measures = tuple(dict.fromkeys((*(measures or ()), *chosen)))
+    available |= dict.fromkeys(expressions, "")
     for measure in measures:
         names = [measure]
         if measure in of_tasks and len(tasks) > 1:
@@ -175,6 +211,11 @@ def _measured(machine: Machine, job: Job) -> tuple[dict[str, float], str]:
     if machine.closure.compiled:
         _KEPT.setdefault(id(machine.closure.fast.programs), machine)
     dynamics, done = Dynamics(machine), []
+    if job.expressions or job.require:
+        try:
+            found |= _expressed(machine, job)
+        except CraneError as error:
+            return {}, str(error)
     for task in job.tasks:
         try:
             done.append(of_task(machine, dynamics, task))
@@ -186,6 +227,39 @@ def _measured(machine: Machine, job: Job) -> tuple[dict[str, float], str]:
     if job.strokes:
         found |= of_strokes(machine)
     return found, "; ".join(reasons)
+
+
+def _composed(text: str, available: Mapping[str, str], functions: Mapping[str, Measure]) -> bool:
+    """Whether a measure is an expression and no name of the study's own.
+
+    Raises:
+        InputError: It is neither.
+    """
+    if text in available:
+        return False
+    if text.isidentifier() and text not in functions and text not in PLAIN:
+        names = [*available, *PLAIN, *functions]
+        raise InputError(f"measure '{text}' is unknown, {known(names, text)}")
+    places_in([Expression(text)])
+    return True
+
+
+def _expressed(machine: Machine, job: Job) -> dict[str, float]:
+    """Values of a variant's expressions.
+
+    Raises:
+        CraneError: One has no value, or a requirement fails.
+    """
+    texts = [*map(Expression, job.expressions), *(requirement(x)[0] for x in job.require)]
+    terms = Terms(job.frame, job.rule, job.tasks, own_measures(job.own))
+    none = np.zeros(0)
+    point = Point(Variants(machine), (), none, none, terms, places_in(texts))
+    values = [point.value(x) for x in texts]
+    for text, value in zip(job.require, values[len(job.expressions) :], strict=True):
+        lacks = abs(value) if requirement(text)[1] else -value
+        if lacks > _SLACK * max(1.0, abs(value)):
+            raise InputError(f"requires {text}: lacks {lacks:.4g}")
+    return dict(zip(job.expressions, values, strict=False))
 
 
 def _variants(
@@ -221,18 +295,24 @@ def _chosen(
     return tuple(dict.fromkeys(available if wanted is None else wanted))
 
 
-def _parameter_units(machine: Machine, vary: Mapping[str, object]) -> dict:
-    """Units by parameter; refuses those that do not exist or change nothing."""
+def _parameter_units(machine: Machine, vary: Mapping[str, object], driven: bool) -> dict:
+    """Units by parameter; refuses those that do not exist or change nothing.
+
+    Args:
+        machine: The machine.
+        vary: By name.
+        driven: Whether something is measured that circuits and controllers change.
+    """
     names = parameters(read(machine.path))
     units = {}
     for wanted in vary:
         if wanted not in names:
             raise InputError(f"parameter '{wanted}' is unknown, {known(names, wanted)}")
         head, *rest = wanted.split(".")
-        if head in _IDLE and rest[-1] not in ("lower", "upper"):
+        if not driven and head in _IDLE and rest[-1] not in ("lower", "upper"):
             raise InputError(
                 f"'{wanted}' changes nothing: the forces are those of the reference motion, "
-                "without controller and hydraulics; vary something else"
+                "without controller and hydraulics; take a task of levers, or a load"
             )
         units[wanted] = _unit(machine, head, rest)
     return units
@@ -255,56 +335,3 @@ def _unit(machine: Machine, head: str, rest: list[str]) -> str:
     if "inertia" in rest:
         return "kg m2"
     return {"mass": "kg", "x": "m", "y": "m", "z": "m"}.get(last, "rad")
-
-
-def computed(
-    function: Callable[[J], R], jobs: Sequence[J], processes: int, scheduler: str | None
-) -> Iterator[tuple[int, R]]:
-    """Indices and results of jobs as they get ready, here or elsewhere.
-
-    Args:
-        function: What is computed; other processes import it from this package.
-        jobs: Its arguments.
-        processes: How many compute.
-        scheduler: Address of a Dask scheduler whose workers compute instead.
-    """
-    if scheduler is not None:
-        from crane.studies.cluster import computed as by_workers
-
-        yield from by_workers(function, jobs, scheduler)
-    elif processes <= 1 or len(jobs) == 1:
-        for index, job in enumerate(jobs):
-            yield index, function(job)
-    else:
-        yield from _by_processes(function, jobs, min(processes, len(jobs)))
-
-
-def _end_with_parent() -> None:
-    """Let this process end when the one that started it has, however that was."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def wait() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=wait, daemon=True).start()
-
-
-def _by_processes(
-    function: Callable[[J], R], jobs: Sequence[J], processes: int
-) -> Iterator[tuple[int, R]]:
-    # threads would wait for each other: most of a variant is computed in Python
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(processes, context, initializer=_end_with_parent)
-    try:
-        futures = {pool.submit(function, job): index for index, job in enumerate(jobs)}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-    except BrokenProcessPool:
-        raise InputError(
-            "a process ended before its time: guard what your script runs with "
-            "if __name__ == '__main__':, or take one process"
-        ) from None
-    finally:
-        pool.shutdown(cancel_futures=True)

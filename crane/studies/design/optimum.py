@@ -16,6 +16,7 @@ from crane.formats import load
 from crane.formats.loading import Variants
 from crane.machine import Machine
 from crane.ratings.rules import rule_of
+from crane.studies.computing import computed
 from crane.studies.design.dual import Dual
 from crane.studies.design.expressions import Expression, requirement
 from crane.studies.design.own import Measure, own_measures
@@ -233,8 +234,6 @@ def design(
     Raises:
         InputError: Unknown names, no goal, ranges that are none, or no solution.
     """
-    from crane.studies.run import computed
-
     base = machine if isinstance(machine, Machine) else load(machine)
     starts = as_count(starts, "the number of starts", 1, 10_000)
     goals = [("minimise", x) for x in minimise] + [("maximise", x) for x in maximise]

@@ -25,7 +25,7 @@ _STEP = 1e-4  # of a number's range, of differences
 _STARTS = 6  # of the search for an extreme of the tip
 _CHARTS = {"load": (2, 3), "nearest": (3, 3), "net_torque": (1, 1), "number": (1, 1)}
 _CHART_UNITS = {"load": "kg", "nearest": "m", "net_torque": "N m", "number": ""}
-_PLAIN = {
+PLAIN = {
     "highest": "m", "lowest": "m", "mass": "kg", "gross_torque": "N m", "slewing_torque": "N m",
 }  # fmt: skip
 
@@ -338,7 +338,7 @@ def available(point: Point) -> dict[str, str]:
     """All measures and functions of a machine, and their units."""
     machine = point.machine
     return {
-        **task_measures(machine), **stroke_measures(machine), **_PLAIN, **_CHART_UNITS,
+        **task_measures(machine), **stroke_measures(machine), **PLAIN, **_CHART_UNITS,
         **dict.fromkeys(point._terms.own, ""),
     }  # fmt: skip
 
