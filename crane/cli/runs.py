@@ -21,16 +21,16 @@ from crane.recordings.measured import completed, is_measured
 from crane.recordings.reading import ALWAYS, Span, quantities, read, readings
 from crane.recordings.recording import Recording
 from crane.recordings.summary import subject, summarize, title
-from crane.simulation.replays import Comparison
-from crane.studies.table import Study
 
 if TYPE_CHECKING:
     from crane.identification.calibration.result import Calibration
     from crane.identification.mechanics.result import Identification
     from crane.motion.workspaces import Workspace
     from crane.simulation.linear import LinearModel
+    from crane.simulation.replays import Comparison
     from crane.simulation.sensitivity import Sensitivities
     from crane.studies.power import PowerAccount
+    from crane.studies.table import Study
 
 RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
 COMPARISON = "comparison.md"
@@ -86,7 +86,7 @@ def write_run(folder: Path, recording: Recording) -> str:
     return text
 
 
-def write_comparison(folder: Path, recording: Recording, comparison: Comparison) -> str:
+def write_comparison(folder: Path, recording: Recording, comparison: "Comparison") -> str:
     """Write a replay into a folder: its recording, and how it compares with what was measured.
 
     Returns:
@@ -116,7 +116,7 @@ def write_views(folder: Path, machine: Machine, recording: Recording) -> None:
     report(machine, recording, folder / PAGE)
 
 
-def write_study(folder: Path, study: Study) -> None:
+def write_study(folder: Path, study: "Study") -> None:
     """Write table and picture of a study into a folder, created where there is none.
 
     Raises:

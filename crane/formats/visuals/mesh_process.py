@@ -29,6 +29,8 @@ def main() -> None:
     warnings.simplefilter("ignore")
     logging.disable()
     files = json.load(sys.stdin)
+    # what trimesh does without when it reads, and takes longer to import than most meshes to read
+    sys.modules.update(dict.fromkeys(("networkx", "rtree", "scipy", "shapely")))
     try:
         import trimesh  # noqa: F401  before time is counted
     except ImportError as error:
