@@ -30,7 +30,8 @@ def main() -> None:
     logging.disable()
     files = json.load(sys.stdin)
     # what trimesh does without when it reads, and takes longer to import than most meshes to read
-    sys.modules.update(dict.fromkeys(("networkx", "rtree", "scipy", "shapely")))
+    for name in ("networkx", "rtree", "scipy", "shapely"):
+        sys.modules[name] = None  # type: ignore[assignment]
     try:
         import trimesh  # noqa: F401  before time is counted
     except ImportError as error:
