@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from broken import MINI, copy_machine
+from broken import DATA, MINI, copy_machine
 from typed import MAIN, typed
 
 import crane
@@ -70,6 +70,29 @@ def test_info_has_the_whole_home_posture_and_the_path(mini):
     for joint, value in told.items():
         assert float(value) == pytest.approx(mini.home[mini.column(joint)], rel=1e-4)
     assert "  computed    compiled" in lines
+
+
+def loaded_by(tmp_path, *arguments):
+    """Packages that a command imports, of those that are slow to import."""
+    slow = ("casadi", "matplotlib", "rich.progress", "scipy", "trimesh", "urllib.request", "viser")
+    told = f"print('loaded:', [m for m in {slow} if m in sys.modules])"
+    code = f"import atexit, sys; atexit.register(lambda: {told}); {MAIN}"
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    out = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path).stdout
+    return re.search(r"^loaded: (.*)$", out, re.MULTILINE)[1]
+
+
+def test_check_of_a_tree_imports_no_scipy(tmp_path):
+    """Importing scipy takes as long as all else that it does."""
+    urdf = (DATA / "four_bar" / "ground.urdf").read_text()
+    (tmp_path / "tree.urdf").write_text(urdf)
+    assert loaded_by(tmp_path, "check", "tree.urdf") == "[]"
+
+
+def test_a_run_imports_no_pictures_and_no_network(tmp_path):
+    run = ("simulate", "mini_forwarder", "--task", "lift", "--duration", "0.01", "--out", "run")
+    assert loaded_by(tmp_path, *run) == "['scipy']"  # of which it has splines
+    assert (tmp_path / "run" / "summary.md").is_file()
 
 
 def test_version_and_units_in_help():

@@ -576,6 +576,13 @@ LOOPS = [
         machine=LOOPED,
     ),
     case(
+        "tip without a link",
+        'four_bar_loop.urdf:50: the tip has no link, write parent_link="LINK", known: '
+        "coupler_arm, crank_arm, ground, rocker_arm",
+        swap("</robot>", '<end_effector name="tip" link="ground"/></robot>', LOOPED),
+        machine=LOOPED,
+    ),
+    case(
         "loop without name",
         'four_bar_loop.urdf:45: a loop has no name, add name="..."',
         swap('<loop name="pin" type="continuous">', '<loop type="revolute">', LOOPED),

@@ -2,6 +2,8 @@
 
 import json
 import struct
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -272,3 +274,14 @@ def test_a_reader_that_ends_costs_one_mesh(tmp_path, monkeypatch):
         assert part.faces.tolist() == [[0, 1, 2]]
     found = read(*(f"{i}end.stl" for i in range(5)))
     assert found == ["damaged"] * 3 + ["not tried after 3 that ended the reader"] * 2
+
+
+def test_meshes_are_read_without_what_takes_long_to_import(tmp_path):
+    """By the process that reads them: scipy and networkx take twice as long as trimesh itself."""
+    code = (
+        f"import runpy, sys; runpy.run_path({mesh_process.__file__!r}, run_name='__main__'); "
+        "heavy = [m for m in ('networkx', 'rtree', 'scipy', 'shapely') if sys.modules.get(m)]; "
+        "open('told', 'w').write(f\"{heavy} {'trimesh' in sys.modules}\")"
+    )
+    subprocess.run([sys.executable, "-P", "-c", code], input=b"[]", cwd=tmp_path, check=True)
+    assert (tmp_path / "told").read_text() == "[] True"

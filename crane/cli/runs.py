@@ -21,8 +21,6 @@ from crane.recordings.measured import completed, is_measured
 from crane.recordings.reading import ALWAYS, Span, quantities, read, readings
 from crane.recordings.recording import Recording
 from crane.recordings.summary import subject, summarize, title
-from crane.simulation.replays import Comparison
-from crane.studies.table import Study
 
 if TYPE_CHECKING:
     from crane.identification.calibration.result import Calibration
@@ -30,10 +28,12 @@ if TYPE_CHECKING:
     from crane.motion.workspaces import Workspace
     from crane.ratings import Breakout, Capacity, ToolForce, WorkingRange
     from crane.simulation.linear import LinearModel
+    from crane.simulation.replays import Comparison
     from crane.simulation.sensitivity import Sensitivities
     from crane.studies.design import Design
     from crane.studies.power import PowerAccount
     from crane.studies.power_comparison import PowerComparison
+    from crane.studies.table import Study
 
 RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
 REPORT, MACHINE = "report.html", "machine"
@@ -100,7 +100,7 @@ def _write_run(part: Path, recording: Recording) -> str:
 
 
 def write_comparison(
-    folder: Path, recording: Recording, comparison: Comparison, force: bool = True
+    folder: Path, recording: Recording, comparison: "Comparison", force: bool = True
 ) -> str:
     """Write a replay into a folder: its recording, and how it compares with what was measured.
 
@@ -131,7 +131,7 @@ def write_views(folder: Path, machine: Machine, recording: Recording) -> None:
     report(machine, recording, folder / PAGE)
 
 
-def write_study(folder: Path, study: Study, force: bool = True) -> None:
+def write_study(folder: Path, study: "Study", force: bool = True) -> None:
     """Write table and picture of a study into a folder, created where there is none.
 
     Raises:

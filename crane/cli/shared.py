@@ -218,11 +218,15 @@ def names(words: str | None) -> list[str] | None:
 def progress_bar(what: str) -> Iterator[Callable[[float], None]]:
     """A bar on a terminal, and what takes the finished share, 0 to 1."""
     from rich.console import Console
-    from rich.progress import Progress
 
     console = Console(stderr=True)
-    off = not console.is_terminal
-    with shown(), Progress(console=console, transient=True, disable=off) as bar:
+    if not console.is_terminal:
+        with shown():
+            yield lambda share: None
+        return
+    from rich.progress import Progress
+
+    with shown(), Progress(console=console, transient=True) as bar:
         job = bar.add_task("compiling the machine's formulas", total=1.0)
 
         def report(share: float) -> None:

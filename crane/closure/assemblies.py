@@ -12,8 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from crane.closure.anywhere import Search
 from crane.closure.closure import Closure
@@ -137,6 +135,9 @@ class _Search:
 
     def groups(self) -> list[Indices]:
         """Columns of passive joints that loops tie together, directly or through others."""
+        from scipy.sparse import csr_array
+        from scipy.sparse.csgraph import connected_components
+
         passive = self.closure.passive
         tied = np.vstack([self.equations.sign, self.equations.factors])[:, passive] != 0
         count, label = connected_components(csr_array(tied.T.astype(float) @ tied))

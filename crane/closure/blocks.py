@@ -4,8 +4,6 @@ from graphlib import TopologicalSorter
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
 
 Block = tuple[NDArray[np.intp], NDArray[np.intp]]
 
@@ -27,6 +25,9 @@ def block_triangular(incidence: NDArray[np.bool_]) -> list[Block] | None:
     size = len(incidence)
     if size == 0:
         return []
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
+
     unknown_of = maximum_bipartite_matching(csr_array(incidence), perm_type="column")
     if (unknown_of < 0).any():
         return None

@@ -19,7 +19,6 @@ of the machine's size. What locks up opens further than that.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import qr
 
 from crane.closure.choice import Indices, choose
 from crane.closure.equations import LoopEquations
@@ -100,6 +99,8 @@ class Exact:
     ) -> tuple[Indices, Indices] | None:
         """As many independent rows as the rank, and the others; None where J_P has a lower one."""
         jacobian = self._equations.scaled(home)[1][:, passive]
+        from scipy.linalg import qr  # slow to import, and not needed without loops
+
         _, upper, pivots = qr(jacobian.T, mode="economic", pivoting=True)
         diagonal = np.abs(np.diag(upper))
         if (diagonal > tolerance * diagonal[0]).sum() < rank:

@@ -9,7 +9,6 @@ leaves the surplus rows open by c h^2.
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from scipy.linalg import qr
 
 from crane.closure.choice import Indices, motions, scales, slides, units
 from crane.closure.equations import LoopEquations
@@ -50,6 +49,8 @@ def locked_up(
         The row that stays open by most, and by how much [rad], [machine's size]; None where all is
         well.
     """
+    from scipy.linalg import qr  # slow to import, and not needed without loops
+
     scale = scales(equations.model)
     jacobian = equations.evaluate(q)[1] / equations.row_units[:, None]
     basis = motions(jacobian, scale, tolerance)

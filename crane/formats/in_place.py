@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import yaml
@@ -239,6 +238,8 @@ def _value(text: str, at: int, value: float) -> Edit:
 
 
 def _joints(home: Mapping[str, float], line: str) -> str:
+    from xml.sax.saxutils import quoteattr  # which imports what the network needs
+
     tags = (
         f'    <joint name={quoteattr(x)} value="{value!r}"/>{line}' for x, value in home.items()
     )

@@ -50,6 +50,8 @@ def read_tip(xml: XmlFile, links: Mapping[str, etree._Element]) -> str | None:
     if not tips:
         return None
     link: str = tips[0].get("parent_link", "").strip()
+    if not link:
+        raise xml.fail(tips[0], f'the tip has no link, write parent_link="LINK", {known(links)}')
     if link not in links:
         raise xml.fail(tips[0], f"the tip is the unknown link '{link}', {known(links, link)}")
     return link

@@ -30,6 +30,9 @@ def main() -> None:
     warnings.simplefilter("ignore")
     logging.disable()
     files = json.load(sys.stdin)
+    # what trimesh does without when it reads, and takes longer to import than most meshes to read
+    for name in ("networkx", "rtree", "scipy", "shapely"):
+        sys.modules[name] = None  # type: ignore[assignment]
     try:
         import trimesh  # noqa: F401  before time is counted
     except ImportError as error:

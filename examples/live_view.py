@@ -1,0 +1,28 @@
+"""How do I move a machine by sliders in a browser, and end that from a program?"""
+
+import os
+import signal
+import threading
+
+import numpy as np
+
+import crane
+from crane.view.live import Session
+from crane.view.live.serve import serve
+
+machine = crane.load("patu655")
+session = Session(machine)
+posture = session.move("X_lift", 0.3)  # what a slider does [m]
+session.load(200.0)  # [kg] at the tip
+print(f"the tip is {session.posture.tip[2]:.2f} m high, loops closed to {posture.residual:.0e} m")
+lift = machine.active.index("X_lift")
+print(f"the lift cylinder holds {session.posture.gravity[lift] / 1e3:.1f} kN")
+
+loaded = machine.with_payload(crane.Payload(machine.tip, mass=200.0))
+expected = crane.Dynamics(loaded).gravity(session.posture.q_a)
+assert np.allclose(session.posture.gravity, expected, rtol=1e-9)
+
+# Ctrl+C ends a live view; here a timer presses it after three seconds
+threading.Timer(3.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+serve(session)  # prints the address to open
+print("the live view has ended")

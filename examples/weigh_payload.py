@@ -1,0 +1,21 @@
+"""How heavy is the log that the crane just lifted?"""
+
+from dataclasses import replace
+
+import numpy as np
+
+import crane
+
+LOG = 0.15  # [kg], to be found: the crane is a model on a table
+
+empty = crane.load("mini_forwarder")
+loaded = crane.load("mini_forwarder", changes={"payload.mass": LOG})
+trajectory = crane.task_trajectory(loaded, "loading")
+run = crane.simulate(loaded, crane.ComputedTorque(loaded, trajectory), step=0.005)
+noise = np.random.default_rng(0).normal(size=run.tau.shape)
+recording = replace(run, tau=run.tau + 0.1 * noise)  # sensors of force: 0.1 N, 0.1 N m
+
+found = crane.identify_payload(empty, recording)
+low, high = found.interval()[0]
+print(f"it carries {1e3 * found.mass:.0f} g, 95 % between {1e3 * low:.0f} and {1e3 * high:.0f} g")
+assert low < LOG < high and high - low < 0.02
