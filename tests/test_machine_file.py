@@ -143,8 +143,8 @@ TEXT = [
         "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, known: "
         "active, chains, contacts, control, couplings, cutters, drives, end_stops, extends, "
         "floating, forces, free, friction, gas_springs, ground, home, hydraulics, identification, "
-        "loads, loops, name, payload, ropes, rotor_inertia, sensors, soil, source, supports, "
-        "tasks, tip",
+        "loads, loops, name, payload, pins, ropes, rotor_inertia, sensors, soil, source, "
+        "supports, tasks, tip",
         swap("tip: coupler_pin", '"tip\\n\\e[31m": coupler_pin'),
     ),
     case(
@@ -166,8 +166,8 @@ KEYS = [
         "four_bar.yaml:29: unknown key 'gravity' in the machine file, known: "
         "active, chains, contacts, control, couplings, cutters, drives, end_stops, extends, "
         "floating, forces, free, friction, gas_springs, ground, home, hydraulics, identification, "
-        "loads, loops, name, payload, ropes, rotor_inertia, sensors, soil, source, supports, "
-        "tasks, tip",
+        "loads, loops, name, payload, pins, ropes, rotor_inertia, sensors, soil, source, "
+        "supports, tasks, tip",
         swap("tip: coupler_pin", "gravity: 9.81"),
     ),
     case(
@@ -630,6 +630,21 @@ NAMES = [
         "unknown joint in friction",
         "four_bar.yaml:21: joint 'couplr' is unknown, did you mean 'coupler'?",
         swap("  coupler: {viscous", "  couplr: {viscous"),
+    ),
+    case(
+        "unknown pin",
+        "four_bar.yaml:29: 'couplr' under 'pins' is no joint or loop, did you mean 'coupler'?",
+        swap("tip: coupler_pin", "pins: {couplr: 5}\ntip: coupler_pin"),
+    ),
+    case(
+        "pin that bears nothing",
+        "four_bar.yaml:29: the pin 'coupler' bears 0 N, give a force above 0",
+        swap("tip: coupler_pin", "pins: {coupler: 0}\ntip: coupler_pin"),
+    ),
+    case(
+        "pin without number",
+        "four_bar.yaml:29: 'coupler' of 'pins' is 'a', give a number",
+        swap("tip: coupler_pin", "pins: {coupler: a}\ntip: coupler_pin"),
     ),
     case(
         "unknown joint in forces",

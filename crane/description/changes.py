@@ -38,6 +38,7 @@ from crane.hydraulics.components import Hydraulics
 from crane.hydraulics.numbers import number_names
 
 PAYLOAD = "payload.mass"
+PINS = "pins."
 _LISTS = ("forces", "gas_springs", "ropes", "end_stops")
 _TURNS = ("roll", "pitch", "yaw")
 
@@ -98,7 +99,8 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
     along joints or between frames `spring.JOINT.stiffness`, `gas_spring.JOINT.pressure`,
     `rope.LINK-LINK.length`, `end_stop.JOINT.stiffness`; and `payload.mass`, a point mass at the
     tip, or the load that the machine file names, scaled to that mass; of its sensors
-    `sensor.QUANTITY.zero`, `.scale`, `.delay`, `.noise`, which may be set of any quantity.
+    `sensor.QUANTITY.zero`, `.scale`, `.delay`, `.noise`, which may be set of any quantity; of pins
+    `pins.JOINT`, the largest force that they bear.
     """
     every = tree_numbers(spec.tree, spec.chains)
     found = {name: number_at(part, way) for name, part, way in every}
@@ -119,6 +121,7 @@ def parameters(spec: MachineSpec) -> dict[str, float]:
             found |= {f"{head}.{name}": getattr(part, name) for name in of}
     if spec.tip is not None:
         found[PAYLOAD] = 0.0
+    found |= {f"{PINS}{name}": force for name, force in spec.pins.items()}
     return found | named_numbers(spec.sensors)
 
 
@@ -162,7 +165,7 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
     names = parameters(spec)
     numbers = {name: (part, way) for name, part, way in tree_numbers(spec.tree, spec.chains)}
     tree, chains = spec.tree, spec.chains
-    friction, control = dict(spec.friction), dict(spec.control)
+    friction, control, pins = dict(spec.friction), dict(spec.control), dict(spec.pins)
     circuit = circuit_parts(spec.hydraulics) if spec.hydraulics else {}
     acting = elements(**_lists(spec))
     replaced: dict[str, dict[str, float]] = {}
@@ -179,10 +182,14 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
             raise InputError(f"parameter '{name}' is {value:g} kg, it must not be negative")
         if name.endswith(".rotor_inertia") and value < 0:
             raise InputError(f"parameter '{name}' is {value:g}, it must not be negative")
+        if name.startswith(PINS) and value <= 0:
+            raise InputError(f"parameter '{name}' is {value:g} N, give a force above 0")
         if name == PAYLOAD:
             tree, chains = _load(spec, tree, value)
         elif name.startswith(SENSOR):
             off[name] = value
+        elif name.startswith(PINS):
+            pins[rest] = value
         elif head == "friction":
             _set(friction, rest, value, Friction)
         elif (part := name.rpartition(".")[0]) in acting:
@@ -210,6 +217,7 @@ def changed(spec: MachineSpec, changes: Mapping[str, float]) -> MachineSpec:
         tree=tree,
         friction=MappingProxyType(friction),
         control=MappingProxyType(control),
+        pins=MappingProxyType(pins),
         hydraulics=hydraulics,
         forces=tuple(lists["forces"]),
         gas_springs=tuple(lists["gas_springs"]),
@@ -358,6 +366,7 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
         home={joint: value for joint, value in spec.home.items() if joint not in lock},
         friction={joint: value for joint, value in spec.friction.items() if joint not in lock},
         control={joint: value for joint, value in spec.control.items() if joint not in lock},
+        pins={name: value for name, value in spec.pins.items() if name not in lock},
         forces=tuple(filter(acts, spec.forces)),
         external=tuple(filter(moves, spec.external)),
         hydraulics=spec.hydraulics and spec.hydraulics.only(active or ()),

@@ -1,6 +1,7 @@
 """SI units of a machine's numbers, by their names."""
 
 from crane.common.magnitudes import usual_of
+from crane.description.changes import PINS
 from crane.description.sensors import FORCE_UNITS, SENSOR, VELOCITY_UNITS, parsed, unit_of
 from crane.description.tree import Tree
 
@@ -24,6 +25,8 @@ def number_unit(tree: Tree, name: str) -> str:
     head, _, rest = name.partition(".")
     part, _, word = name.rpartition(".")
     owner = rest.rpartition(".")[0]
+    if name.startswith(PINS):
+        return "N"
     if head not in _HEADS:
         return _of_tree(tree, part, word)
     turns = owner in tree.joints and tree.joints[owner].kind == "revolute"

@@ -455,6 +455,7 @@ class MachineSpec:
     estimation: Estimation = Estimation()
     external: tuple[ExternalForce, ...] = ()  # forces from outside
     supports: tuple[str, ...] = ()  # links that it stands on
+    pins: Mapping[str, float] = field(default_factory=dict)  # by joint or loop, most force [N]
 
     @property
     def elements(self) -> tuple[Element, ...]:

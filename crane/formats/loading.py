@@ -209,6 +209,7 @@ def _assembled(
         free=free_joints(spec, closure.active_names),
         external=(),
         supports=spec.supports,
+        pins=MappingProxyType(dict(spec.pins)),
         motors=motors(spec, closure.active_names),
         locks=MappingProxyType({name: float(value) for name, value in (lock or {}).items()}),
     )

@@ -91,6 +91,7 @@ class Machine:
         free: Active joints that nothing drives: no force but friction, springs and stops.
         external: Forces from outside.
         supports: Links that it stands on; none where those are its contacts.
+        pins: The largest force that pins bear, by joint or loop [N].
         motors: What the file says that motors act on (actuators of a MJCF), or all drives where
             there are more than freedoms; empty where `drives` are the active joints.
         changes: Numbers that are not those of its files, by name.
@@ -126,6 +127,7 @@ class Machine:
     free: tuple[str, ...]
     external: tuple[ExternalForce, ...]
     supports: tuple[str, ...]
+    pins: Mapping[str, float]
     motors: tuple[Drive, ...]
     changes: Mapping[str, float]
     locks: Mapping[str, float]

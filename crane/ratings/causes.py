@@ -1,10 +1,11 @@
-"""What ends a load or a force: drives, and tipping lines."""
+"""What ends a load or a force: drives, tipping lines, and pins."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
+from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.dynamics.stability import Stability, has_supports
 from crane.dynamics.statics import AtRest, Statics
@@ -12,18 +13,19 @@ from crane.machine import Machine
 from crane.motion.workspaces.section import upwards
 from crane.ratings.actions import Action
 from crane.ratings.cones import largest
+from crane.ratings.pins import Pins
 from crane.ratings.rules import Rule
 from crane.ratings.strength import Strength
 
-TIPS = "tips"
+TIPS, PIN = "tips", "pin force"
 
 
 class Cause(NamedTuple):
     """What may end a load.
 
     Attributes:
-        what: Joint, or tipping line "A to B".
-        why: Such as "working pressure" or "tips".
+        what: Joint or loop, or tipping line "A to B".
+        why: Such as "working pressure", "tips" or "pin force".
         share: Of the load at its end that counts.
     """
 
@@ -41,15 +43,17 @@ class Bound(NamedTuple):
 
     Attributes:
         cause: Its index.
-        drive: Whose force it is, None for a line.
-        line: About which, None for a drive.
+        drive: Whose force it is, None for a line or a pin.
+        line: About which, None for a drive or a pin.
         sign: 1 of the most that a drive pushes, -1 of the most that it pulls, and of lines.
+        pin: Its index among those with a limit, None for a drive or a line.
     """
 
     cause: int
     drive: Strength | None
     line: "Line | None"
     sign: float
+    pin: int | None = None
 
 
 class Causes:
@@ -64,7 +68,11 @@ class Causes:
 
     with the first moment s and the mass M of the machine, the frame's place p, and w the direction
     of a line through p_1, as in `Stability`. On a slope g leans by its angle to any side: what is
-    least over all sides is a cone in x, see `crane.ratings.cones`.
+    least over all sides is a cone in x, see `crane.ratings.cones`. So is a pin's limit,
+
+        |R_0 + x R_1| <= R_max,
+
+    with its force R_0 without load and what a load adds per kg; of loads on level ground alone.
 
     Args:
         statics: The machine and the frame.
@@ -77,6 +85,10 @@ class Causes:
     Attributes:
         all: The causes.
         bounds: Their ends.
+
+    Raises:
+        InputError: Pins have limits and the ground leans, or statics does not determine their
+            forces.
     """
 
     def __init__(
@@ -94,35 +106,77 @@ class Causes:
         self._lean = np.tan(slope)
         self._down, self._aside = weight * np.cos(slope), weight * np.sin(slope)
         drives, lines = list(strengths), list(lines_of(machine)) if weights else []
+        pins = machine.pins if action.weight else {}
+        if pins and slope:
+            raise InputError(
+                f"pins of '{machine.name}' are rated on level ground, and this leans by "
+                f"{np.rad2deg(slope):.3g} degrees: rate without slope, or leave 'pins' out"
+            )
+        self._pins = Pins(machine, statics.frame, pins) if pins else None
+        self._most = list(pins.values())
         self.all = tuple(
             [Cause(x.joint, x.why, rule.hydraulic) for x in drives]
             + [Cause(x.name, TIPS, rule.tipping) for x in lines]
+            + [Cause(name, PIN, rule.structural) for name in pins]
         )
         self.bounds = [
             Bound(k, drive, None, sign) for k, drive in enumerate(drives) for sign in (1.0, -1.0)
-        ] + [Bound(k, None, line, -1.0) for k, line in enumerate(lines, start=len(drives))]
+        ]
+        self.bounds += [Bound(k, None, x, -1.0) for k, x in enumerate(lines, start=len(drives))]
+        before = len(drives) + len(lines)
+        self.bounds += [Bound(before + k, None, None, 1.0, k) for k in range(len(pins))]
         self.shares = np.array([cause.share for cause in self.all])
 
-    def largest(self, at: AtRest, angles: Array | None = None) -> Array:
+    def largest(self, at: AtRest, angles: Array | None = None, q: Array | None = None) -> Array:
         """The magnitude (N, K) [kg], [N] of each cause, times its share; infinite without end.
 
         Args:
             at: The machine at rest.
             angles: (N,) by which it is slewed from home; 0 if not given.
+            q: (N, nq) its postures, which pins need.
         """
+        pins = self.in_pins(at, angles, q)
         out = np.full((len(at.mass), len(self.all)), np.inf)
         for bound in self.bounds:
-            end = self.end(self.terms(bound, at, angles))
+            end = self.end(bound, self.terms(bound, at, angles, pins))
             out[:, bound.cause] = np.minimum(out[:, bound.cause], end)
         return np.asarray(out * self.shares)
 
-    def end(self, terms: tuple[Array, ...]) -> Array:
+    def in_pins(
+        self, at: AtRest, angles: Array | None = None, q: Array | None = None
+    ) -> tuple[Array, Array] | None:
+        """Forces (N, p, 3) of pins with limits, without load and per kg; None without limits."""
+        if self._pins is None:
+            return None
+        assert q is not None
+        angles = np.zeros(len(q)) if angles is None else angles
+        return self._pins.under(q, self.action.unit(at, angles))
+
+    def end(self, bound: Bound, terms: tuple[Array, ...]) -> Array:
         """The magnitude (N,) at which a bound of these terms ends."""
         a, b, c, d = terms
-        return largest(a, b, c, d) if self._aside else largest(a, b)
+        leans = self._aside or bound.pin is not None
+        return largest(a, b, c, d) if leans else largest(a, b)
 
-    def terms(self, bound: Bound, at: AtRest, angles: Array | None = None) -> tuple[Array, ...]:
-        """What a bound's a, b (N,), c and d (N, 3) are: a + b x + |c + d x| <= 0."""
+    def terms(
+        self,
+        bound: Bound,
+        at: AtRest,
+        angles: Array | None = None,
+        pins: tuple[Array, Array] | None = None,
+    ) -> tuple[Array, ...]:
+        """What a bound's a, b (N,), c and d (N, 3) are: a + b x + |c + d x| <= 0.
+
+        Args:
+            bound: One of `bounds`.
+            at: The machine at rest.
+            angles: See `largest`.
+            pins: See `in_pins`.
+        """
+        if bound.pin is not None:
+            assert pins is not None
+            none = np.zeros(len(at.mass))
+            return none - self._most[bound.pin], none, *(x[:, bound.pin] for x in pins)
         angles = np.zeros(len(at.mass)) if angles is None else angles
         weighs, lever, rest = self._levers(bound, at, 1.0)
         return self._terms(bound, weighs, rest, [(lever, self.action.unit(at, angles))])
@@ -130,7 +184,7 @@ class Causes:
     def changes(
         self, bound: Bound, at: AtRest, by: AtRest, angles: Array | None = None
     ) -> tuple[Array, ...]:
-        """Derivatives of `terms`, with those of the machine at rest by one number."""
+        """Derivatives of `terms`, not of pins, with those of the machine at rest by one number."""
         angles = np.zeros(len(at.mass)) if angles is None else angles
         unit, moved = self.action.unit(at, angles), self.action.change(at, by, angles)
         weighs, lever, rest = self._levers(bound, by, 0.0)

@@ -15,7 +15,7 @@ from crane.dynamics.statics import AtRest, Statics
 from crane.machine import Machine
 from crane.motion.workspaces.section import Section
 from crane.ratings.actions import Action, slewed
-from crane.ratings.causes import Cause, Causes
+from crane.ratings.causes import TIPS, Cause, Causes
 from crane.ratings.places import Places
 from crane.ratings.rules import Rule
 from crane.ratings.slopes import field_slopes
@@ -174,7 +174,7 @@ def charted(
     machine, statics = places.machine, places.statics
     causes = Causes(statics, strengths(machine, working, friction), rule, action, slope, weights)
     axes = _axes(places, step, radii, heights)
-    tips = len(causes.all) > len(machine.driven_joints)
+    tips = any(cause.why == TIPS for cause in causes.all)
     turns = _slews(machine, places, slews, tips)
     found = places.all(axes)
     if not len(found.place):
@@ -193,7 +193,7 @@ def charted(
                 q = q.copy()
                 q[:, active[slew]] = turn
                 at = statics.at(q)
-            return causes.largest(at, np.full(len(q), angle))
+            return causes.largest(at, np.full(len(q), angle), q)
 
         best, _ = places.best(found, axes, lambda q, at: values(q, at).min(axis=1))
         each[k, best.place] = values(best.q, best.at)

@@ -11,6 +11,8 @@ from crane.common.samples import Array, as_number
 from crane.machine import Machine
 from crane.ratings.actions import load_on
 from crane.ratings.field import Field, charted, places_of
+from crane.ratings.held import buckling_margins
+from crane.ratings.pins import pin_forces
 from crane.ratings.places import Places
 from crane.ratings.pressures import chamber_pressures
 from crane.ratings.rules import Rule, rule_of
@@ -48,6 +50,25 @@ class Capacity(Field):
         """
         return chamber_pressures(self)
 
+    def pin_forces(self) -> dict[str, Array]:
+        """Forces in the pins under the rated loads, see `crane.ratings.pins`.
+
+        Returns:
+            By joint and loop (s, b, a) [N].
+
+        Raises:
+            InputError: The ground leans.
+        """
+        return pin_forces(self)
+
+    def buckling(self) -> dict[str, Array]:
+        """Loads that buckle the cylinders over the forces that press them under the rated loads.
+
+        Returns:
+            By cylinder (s, b, a), infinite where it is pulled, see `crane.ratings.held`.
+        """
+        return buckling_margins(self)
+
     @cached_property
     def table(self) -> LoadTable:
         """Its table at round steps, as manuals print it."""
@@ -82,9 +103,9 @@ def capacity(
     """The largest load that a machine holds at rest, all over its reach.
 
     Of each place the least over all causes: the pressure of each cylinder, its own or that which
-    its closed valve holds, or a motor's torque; tipping over each line between its supports. What
-    the machine carries already belongs to it. Where several postures reach a place it is the one
-    that carries most.
+    its closed valve holds, or a motor's torque; tipping over each line between its supports; the
+    limits of its pins, on level ground. What the machine carries already belongs to it. Where
+    several postures reach a place it is the one that carries most.
 
     Args:
         machine: With hydraulics, or limits of `effort` in its URDFs.
@@ -102,8 +123,9 @@ def capacity(
         heights: Second coordinates [m].
 
     Raises:
-        InputError: An unknown rule, frame or joint, nothing that limits a load, or a frame that
-            two to four strokes do not move in a plane through the slewing axis.
+        InputError: An unknown rule, frame or joint, nothing that limits a load, limits of pins on
+            ground that leans, or a frame that two to four strokes do not move in a plane through
+            the slewing axis.
     """
     rule = rule_of(rule) if isinstance(rule, str) else rule
     slope = max(abs(as_number(slope, "the slope", "rad", most=_STEEPEST)), rule.slope)

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from crane.common.samples import Array
-from crane.dynamics.statics import Statics
-from crane.motion.workspaces.section import upwards
+from crane.ratings.held import held
 from crane.ratings.strength import strengths
 
 if TYPE_CHECKING:
@@ -30,24 +29,16 @@ def chamber_pressures(chart: "Capacity") -> dict[str, Array]:
         By joint (s, b, a, 2) of chambers A and B [Pa]; NaN where there is no load, or no end to
         it.
     """
-    machine, up = chart.machine, upwards(chart.machine)
+    machine = chart.machine
     if machine.hydraulics is None:
         return {}
     here = np.isfinite(chart.loads)
-    load, tank = chart.loads[here], machine.hydraulics.supply.tank
-    q = machine.closure.solve(np.ascontiguousarray(chart.q_a[here]))
-    at = Statics(machine, chart.frame).at(q)
-    weight = float(np.linalg.norm(machine.model.gravity.linear))
+    tank, (forces, sides) = machine.hydraulics.supply.tank, held(chart)
     out = {}
     for drive in strengths(machine, chart.raising, chart.friction):
         if not drive.pressures:
             continue
-        i = drive.column
-        moved = at.slopes[:, :, i] + load[:, None] * at.ways[:, :, i]
-        rises = moved @ up
-        level = weight * np.cos(chart.slope) * rises - at.passive[:, i]
-        aside = np.linalg.norm(moved - rises[:, None] * up, axis=1)
-        leans = weight * np.sin(chart.slope) * aside
+        level, leans = forces[:, drive.column], sides[:, drive.column]
         beyond = level + leans - drive.most, drive.least - level + leans
         both = np.full((*chart.loads.shape, 2), np.nan)
         for side in (0, 1):

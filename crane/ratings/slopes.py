@@ -44,7 +44,8 @@ def field_slopes(chart: "Field", names: Sequence[str]) -> Array:
         names: Numbers of the machine, such as "boom_eye.x".
 
     Returns:
-        (s, b, a, k) per unit of each number; NaN where there is no value, or no end to it.
+        (s, b, a, k) per unit of each number; NaN where there is no value or no end to it, or where
+        a pin's limit ends it, whose derivatives are not computed.
 
     Raises:
         InputError: There is no such number, or it moves a support.
@@ -68,12 +69,15 @@ def field_slopes(chart: "Field", names: Sequence[str]) -> Array:
     at, by_q, by_p = statics.at(q), statics.derivatives(q), statics.by_numbers(q, names)
     angles = slewed(machine, chart.frame, places.section, chart.slews[s])
     loads = chart.values[s, b, a]
-    each = {}  # by bound: derivatives of its load by q_A (N, n) and by numbers (N, k)
+    pins = causes.in_pins(at, angles, q)
+    each = {}  # by bound but pins: derivatives of its load by q_A (N, n) and by numbers (N, k)
     ends = np.empty((len(here), len(causes.bounds)))
     for j, bound in enumerate(causes.bounds):
-        parts = causes.terms(bound, at, angles)
-        x = causes.end(parts)
+        parts = causes.terms(bound, at, angles, pins)
+        x = causes.end(bound, parts)
         ends[:, j] = x * causes.shares[bound.cause]
+        if bound.pin is not None:
+            continue
         per_q, per_p = (_slopes(causes, j, x, parts, at, by, angles) for by in (by_q, by_p))
         if bound.drive is not None:  # what its strength changes by
             k = 2 * drives.index(bound.drive) + (bound.sign < 0)
@@ -86,6 +90,8 @@ def field_slopes(chart: "Field", names: Sequence[str]) -> Array:
     span = places.high - places.low
     for i in range(len(here)):
         together = np.flatnonzero(ends[i] <= loads[i] * (1 + _EQUAL)).tolist()
+        if not all(j in each for j in together):
+            continue
         rises = np.array([each[j][0][i, strokes] for j in together])
         if len(strokes) == 2:
             share = np.zeros(len(together))

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crane.common.samples import Array
-from crane.ratings.causes import TIPS
+from crane.ratings.causes import PIN, TIPS, Cause
 
 if TYPE_CHECKING:
     from crane.ratings.lifting import Capacity
@@ -80,7 +80,7 @@ def load_table(chart: "Capacity") -> LoadTable:
     step = _step(chart.radii[across], chart.heights[up], columns)
     a = across[_spread(chart.radii[across], step, columns)]
     b = up[_spread(chart.heights[up], step, _ROWS)][::-1]
-    drives = np.array([cause.why != TIPS for cause in chart.causes] + [False])[chart.cause]
+    drives = np.array([_drive(cause) for cause in chart.causes] + [False])[chart.cause]
     far = [_farthest(chart, int(i), np.flatnonzero(reached[i])) for i in b]
     return LoadTable(
         chart.heights[b], chart.radii[a], chart.loads[:, b][:, :, a], drives[:, b][:, :, a],
@@ -89,6 +89,11 @@ def load_table(chart: "Capacity") -> LoadTable:
         np.array([ends for _, _, ends in far]).T,
         any(cause.why == TIPS for cause in chart.causes),
     )  # fmt: skip
+
+
+def _drive(cause: Cause) -> bool:
+    """Whether it is a drive."""
+    return cause.why not in (TIPS, PIN)
 
 
 def _step(radii: Array, heights: Array, columns: int) -> float:
@@ -123,7 +128,7 @@ def _farthest(
         chart = chart.at_places(beyond.tolist(), [chart.heights[i]])
         i, last = 0, int(np.flatnonzero(~np.isnan(chart.loads[0, 0]))[-1])
     loads = chart.loads[:, i, last]
-    ends = [k >= 0 and chart.causes[k].why != TIPS for k in chart.cause[:, i, last]]
+    ends = [k >= 0 and _drive(chart.causes[k]) for k in chart.cause[:, i, last]]
     return float(chart.radii[last]), loads, np.array(ends)
 
 

@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from crane.common.errors import BranchEdgeError
 from crane.common.units import quantity
+from crane.ratings.causes import PIN
 from crane.ratings.strength import strengths
 from crane.ratings.tables import LoadTable
 
@@ -32,7 +34,7 @@ def facts(chart: "Capacity") -> list[tuple[str, str]]:
 
 
 def limits(chart: "Capacity") -> list[str]:
-    """Of each drive its pressure or torque: "X_boom 350 bar (working pressure)"."""
+    """Of each drive its pressure or torque: "X_boom 350 bar (working pressure)"; of pins too."""
     out = []
     for drive in strengths(chart.machine, chart.raising, chart.friction):
         if drive.pressures:
@@ -42,7 +44,9 @@ def limits(chart: "Capacity") -> list[str]:
             unit = "N" if chart.machine.unit(drive.joint) == "m" else "N m"
             value = quantity(drive.most, unit, 4)
         out.append(f"{drive.joint} {value} ({drive.why})")
-    return out
+    rated = {cause.what for cause in chart.causes if cause.why == PIN}
+    pins = {name: force for name, force in chart.machine.pins.items() if name in rated}
+    return out + [f"{name} {quantity(force, 'N', 4)} ({PIN})" for name, force in pins.items()]
 
 
 def sides(chart: "Capacity") -> list[str]:
@@ -89,14 +93,53 @@ def to_markdown(chart: "Capacity") -> str:
     lines += ["", *_table(headings(chart, table), rows), "", note(chart, table)]
     lines += ["\n| ended by | of all places |", "| --- | ---: |"]
     lines += [f"| {cause} | {100 * share:.3g} % |" for cause, share in shares(chart)]
+    if rows := bearing(chart):
+        lines += ["", *_table(["under these loads", "", *chart.section.names, "slew"], rows)]
     return "\n".join(lines) + "\n"
+
+
+def bearing(chart: "Capacity") -> list[list[str]]:
+    """What its parts bear, and where: the largest force in a pin, the least margin to buckling.
+
+    Pins are left out on ground that leans, and where the passive joints are not determined.
+    """
+    machine, rows = chart.machine, []
+    if not np.isfinite(chart.loads).any():
+        return []
+    slides = [joint.name for joint in machine.tree.moving if joint.kind == "prismatic"]
+    slides += [loop.name for loop in machine.closure.equations.loops if loop.type == "prismatic"]
+    try:
+        forces = {} if chart.slope else chart.pin_forces()
+    except BranchEdgeError:
+        forces = {}
+    pins = {name: x for name, x in forces.items() if name not in slides}
+    if pins:
+        name = max(pins, key=lambda pin: np.nanmax(pins[pin]))
+        at = int(np.nanargmax(pins[name]))
+        force = quantity(float(pins[name].flat[at]), "N", 4)
+        rows.append([f"largest force in a pin: {name}", force, *_place(chart, at)])
+    margins = {name: x for name, x in chart.buckling().items() if np.isfinite(x).any()}
+    if margins:
+        name = min(margins, key=lambda joint: np.nanmin(margins[joint]))
+        at = int(np.nanargmin(margins[name]))
+        margin = f"{margins[name].flat[at]:.3g} times its force"
+        rows.append([f"first to buckle: {name}", margin, *_place(chart, at)])
+    return rows
+
+
+def _place(chart: "Capacity", at: int) -> list[str]:
+    """First and second coordinate and slew angle of a place of the chart."""
+    s, b, a = np.unravel_index(at, chart.loads.shape)
+    turn = f"{np.rad2deg(chart.slews[s]):.4g}°"
+    return [f"{chart.radii[a]:.4g} m", f"{chart.heights[b]:.4g} m", turn]
 
 
 def note(chart: "Capacity", table: LoadTable) -> str:
     """What the table's marks and columns say."""
     far = f"Loads in kg by {chart.section.names[0]}; 'farthest' at the largest one of each row."
     if table.tips:
-        return f"{far} {ASTERISK[0]}: {ASTERISK[2:]}."
+        pins = " or by pins" if any(cause.why == PIN for cause in chart.causes) else ""
+        return f"{far} {ASTERISK[0]}: {ASTERISK[2:]}{pins}."
     return f"{far} Nothing tips: {chart.machine.name} has no supports."
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 from crane.description.changes import (
     CIRCUIT,
+    PINS,
     SPOOL_B,
     circuit_parts,
     elements,
@@ -88,6 +89,7 @@ def places(machine: Machine) -> dict[str, InURDF | InFile]:
         parts[head] = ("hydraulics", *own), part
     for quantity, sensor in machine.sensors.items():
         parts[f"{SENSOR}{quantity}"] = ("sensors", quantity), sensor
+    found |= {f"{PINS}{name}": InFile(("pins", name), x) for name, x in machine.pins.items()}
     for head, (way, item) in parts.items():
         found |= {
             f"{head}.{name}": InFile((*way, name), value)

@@ -54,8 +54,8 @@ Part = TypeVar("Part")
 _KEYS = (
     EXTENDS, "name", "source", "chains", "floating", "loops", "active", "free", "drives", "home",
     "friction", "forces", "gas_springs", "ropes", "loads", "ground", "contacts", "soil",
-    "cutters", "supports", "end_stops", "rotor_inertia", "couplings", "tip", "payload", "tasks",
-    "control", "hydraulics", "sensors", "identification",
+    "cutters", "supports", "pins", "end_stops", "rotor_inertia", "couplings", "tip", "payload",
+    "tasks", "control", "hydraulics", "sensors", "identification",
 )  # fmt: skip
 
 
@@ -169,6 +169,7 @@ def _read_machine(path: Path) -> MachineSpec:
         _part(read_estimation, Estimation(), top),
         outside,
         _part(_supports, (), top, tree, outside),
+        _part(_pins, {}, top, tree, loops),
     )  # fmt: skip
 
 
@@ -200,6 +201,26 @@ def _supports(
     if names and len(names) < 3:
         raise top.fail("supports", f"{len(names)} supports make no area, name three or more")
     return names
+
+
+def _pins(top: Section, tree: TreeBuilder, loops: Sequence[LoopSpec]) -> dict[str, float]:
+    """The largest force that pins bear, by joint or loop [N]."""
+    found: dict[str, float] = {}
+    section = top.section("pins", "'pins'")
+    names = [*tree.joints, *(loop.name for loop in loops)]
+    for name in section or ():
+        assert section is not None
+        with recoverable(harmless=True):
+            if name not in names:
+                problem = f"'{name}' under 'pins' is no joint or loop, {known(names, name)}"
+                raise tree.unknown(str(section.fail(name, problem)))
+            force = section.number(name)
+            if force <= 0:
+                raise section.fail(
+                    name, f"the pin '{name}' bears {force:g} N, give a force above 0"
+                )
+            found[name] = force
+    return found
 
 
 def _free(top: Section, tree: TreeBuilder, active: Container[str]) -> tuple[str, ...]:

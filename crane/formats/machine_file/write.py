@@ -249,6 +249,7 @@ def _content(machine: Machine) -> dict[str, Any]:
     data["ropes"] = [_numbers(item) for item in machine.ropes]
     data |= outside_data(machine.external)
     data["supports"] = list(machine.supports)
+    data["pins"] = dict(machine.pins)
     data["end_stops"] = {item.joint: _numbers(item, "joint") for item in machine.end_stops}
     data["rotor_inertia"] = rotors_of(machine)
     data["drives"] = drives_of(machine)

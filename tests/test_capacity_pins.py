@@ -1,0 +1,142 @@
+"""Limits of pins in lifting capacities, pin forces and buckling under them, by hand."""
+
+import re
+import shutil
+
+import numpy as np
+import pytest
+from broken import MODELS
+from free_bodies import balance
+from scipy.optimize import brentq
+from test_capacity import G, cells
+
+import crane
+
+PINS = {"boom": 260e3, "boom_eye": 250e3, "X_arm": 30e3}
+
+
+@pytest.fixture(scope="module")
+def excavator(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("pins") / "models"
+    shutil.copytree(MODELS, folder)
+    text = f"\npins: {PINS}\n".replace("'", "")
+    (folder / "excavator.yaml").write_text((folder / "excavator.yaml").read_text() + text)
+    return crane.load(folder / "excavator.yaml")
+
+
+@pytest.fixture(scope="module")
+def chart(excavator):
+    return crane.capacity(
+        excavator, "bucket", rule=crane.Rule("own", "", structural=0.8), step=1.0
+    )
+
+
+def force(machine, q, load, name):
+    return np.linalg.norm(balance(machine, q, G, load, "bucket")[1][name][:3])
+
+
+def test_pins_end_loads_where_statics_by_hand_has_their_limit(excavator, chart):
+    ends = {chart.causes[k].what for k in chart.ends if chart.causes[k].why == "pin force"}
+    assert ends == set(PINS)
+    for cell in map(tuple, cells(chart, 25)):
+        q = excavator.closure.solve(chart.q_a[cell])
+        for k, cause in enumerate(chart.causes):
+            if cause.why != "pin force":
+                continue
+            found = chart.each[cell][k] / 0.8
+            if not found:
+                assert force(excavator, q, 0.0, cause.what) >= PINS[cause.what]
+                continue
+
+            def left(load, name=cause.what, q=q):
+                return force(excavator, q, load, name) - PINS[name]
+
+            samples = [left(load) for load in np.linspace(0, found * (1 - 1e-9), 5)]
+            assert max(samples) <= 0
+            assert found == pytest.approx(brentq(left, 0, 2 * found, rtol=1e-12), rel=1e-9)
+
+
+def test_pin_forces_and_margins_are_those_of_statics_by_hand(excavator, chart):
+    forces, margins = chart.pin_forces(), chart.buckling()
+    assert set(forces) == set(crane.Reactions(excavator).names)
+    assert set(margins) == {"X_boom", "X_arm", "X_bucket"}
+    loads = crane.Buckling(excavator)
+    for cell in map(tuple, cells(chart, 5, seed=1)):
+        q = excavator.closure.solve(chart.q_a[cell])
+        drives, pins = balance(excavator, q, G, chart.loads[cell], "bucket")
+        most = max(np.linalg.norm(pin[:3]) for pin in pins.values())
+        for name, pin in pins.items():
+            assert forces[name][cell] == pytest.approx(np.linalg.norm(pin[:3]), abs=1e-9 * most)
+        for joint, column in loads.columns.items():
+            load = column.load(q[excavator.column(joint)])
+            pressed = column.pushes * drives[joint]
+            margin = load / pressed if pressed > 0 else np.inf
+            assert margins[joint][cell] == pytest.approx(float(margin), rel=1e-9)
+    none = np.isnan(chart.loads)
+    assert none.any()
+    assert all(np.isnan(x[none]).all() for x in (*forces.values(), *margins.values()))
+    text = chart.to_markdown()
+    assert "X_arm 30 kN (pin force)" in text and "by tipping or by pins" in text
+    name = max(set(forces) - {"X_boom", "X_arm", "X_bucket"}, key=lambda x: np.nanmax(forces[x]))
+    assert re.search(f"in a pin: {name} +[|] +{np.nanmax(forces[name]) / 1e3:.1f} kN", text)
+    first = min(margins, key=lambda x: np.nanmin(margins[x]))
+    assert re.search(f"buckle: {first} +[|] +{np.nanmin(margins[first]):.3g} times", text)
+
+
+def test_margins_on_a_slope_are_those_of_the_worst_side(excavator):
+    """Gravity leaned to many sides, one after another."""
+    slope = 0.1
+    bare = crane.load("excavator")
+    chart = crane.capacity(bare, "bucket", radii=[5.0, 7.0], heights=[0.0, 2.0], slope=slope)
+    margins, columns = chart.buckling(), crane.Buckling(bare).columns
+    cell = tuple(np.argwhere(np.isfinite(chart.loads))[0])
+    q = bare.closure.solve(chart.q_a[cell])
+    least = dict.fromkeys(columns, np.inf)
+    for side in np.linspace(0, 2 * np.pi, 181):
+        way = [np.sin(slope) * np.cos(side), np.sin(slope) * np.sin(side), -np.cos(slope)]
+        drives, _ = balance(bare, q, 9.81 * np.array(way), chart.loads[cell], "bucket")
+        for joint, column in columns.items():
+            if (pressed := column.pushes * drives[joint]) > 0:
+                load = float(column.load(q[bare.column(joint)]))
+                least[joint] = min(least[joint], load / pressed)
+    for joint, margin in least.items():
+        assert margins[joint][cell] == pytest.approx(margin, rel=1e-4)
+    with pytest.raises(crane.CraneError, match="leans by 5.73 degrees: rate without slope"):
+        chart.pin_forces()
+    assert "in a pin" not in chart.to_markdown() and "first to buckle" in chart.to_markdown()
+
+
+def test_derivatives_are_left_out_where_a_pin_ends_the_load(excavator):
+    more = {"pins.boom": 7e5, "pins.boom_eye": 9e5, "pins.X_arm": 9e5}
+    machine, bare = crane.load(excavator.path, changes=more), crane.load("excavator")
+    chart, without = (crane.capacity(x, "bucket", step=1.0, slews=[0.0]) for x in (machine, bare))
+    slopes, free = (x.slopes(["arm.mass"])[..., 0] for x in (chart, without))
+    pins = np.array([cause.why == "pin force" for cause in chart.causes] + [False])[chart.cause]
+    same = (chart.cause == without.cause) & (without.loads > 0)
+    assert pins.sum() > 3 and np.isnan(slopes[pins]).all()
+    assert same.sum() > 3 and slopes[same] == pytest.approx(free[same], rel=1e-9)
+
+
+def test_pins_are_read_written_and_changed(excavator, tmp_path):
+    assert dict(excavator.pins) == PINS
+    again = crane.load(crane.write_machine(excavator, tmp_path / "written"))
+    assert dict(again.pins) == PINS
+    more = crane.load(excavator.path, changes={"pins.boom": 5e5})
+    assert dict(more.pins) == PINS | {"boom": 5e5}
+    assert "X_arm" not in crane.load(excavator.path, lock={"X_arm": 0.5}).pins
+    assert not crane.load("excavator").pins
+
+
+@pytest.mark.parametrize(
+    ("change", "given", "said"),
+    [
+        ({"pins.boom": 0.0}, {}, "'pins.boom' is 0 N, give a force above 0"),
+        ({"pins.bom": 1.0}, {}, "'pins.bom' is unknown, did you mean 'pins.boom'"),
+        ({}, {"slope": 0.1}, "rated on level ground, and this leans by 5.73 degrees"),
+        ({}, {"rule": "sfs4677"}, "rated on level ground, and this leans by 5 degrees"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(excavator, change, given, said):
+    with pytest.raises(crane.CraneError, match=said) as error:
+        crane.capacity(crane.load(excavator.path, changes=change), "bucket", **given)
+    assert "\n" not in str(error.value)
