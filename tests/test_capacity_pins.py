@@ -1,5 +1,6 @@
 """Limits of pins in lifting capacities, pin forces and buckling under them, by hand."""
 
+import dataclasses
 import re
 import shutil
 
@@ -11,6 +12,7 @@ from scipy.optimize import brentq
 from test_capacity import G, cells
 
 import crane
+from crane.description.number_units import number_unit
 
 PINS = {"boom": 260e3, "boom_eye": 250e3, "X_arm": 30e3}
 
@@ -119,12 +121,20 @@ def test_derivatives_are_left_out_where_a_pin_ends_the_load(excavator):
 
 def test_pins_are_read_written_and_changed(excavator, tmp_path):
     assert dict(excavator.pins) == PINS
-    again = crane.load(crane.write_machine(excavator, tmp_path / "written"))
-    assert dict(again.pins) == PINS
+    written = crane.write_machine(excavator, tmp_path / "written", {"pins.boom": "from a drawing"})
+    assert dict(crane.load(written).pins) == PINS
+    assert re.search("boom: 260000.0 +# from a drawing", written.read_text())
     more = crane.load(excavator.path, changes={"pins.boom": 5e5})
     assert dict(more.pins) == PINS | {"boom": 5e5}
     assert "X_arm" not in crane.load(excavator.path, lock={"X_arm": 0.5}).pins
     assert not crane.load("excavator").pins
+
+
+def test_pins_that_are_not_there_are_named(excavator):
+    odd = dataclasses.replace(excavator, pins={"bom": 1e5})
+    with pytest.raises(crane.CraneError, match="'bom' is no joint or loop, did you mean 'boom'"):
+        crane.capacity(odd, "bucket", radii=[6.0], heights=[1.0])
+    assert number_unit(excavator.tree, "pins.boom") == "N"
 
 
 @pytest.mark.parametrize(
