@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from crane.identification.calibration.result import Calibration
     from crane.identification.mechanics.result import Identification
     from crane.motion.workspaces import Workspace
-    from crane.ratings import Breakout, Capacity, ToolForce, WorkingRange
+    from crane.ratings import Breakout, Capacity, ToolForce, Torques, WorkingRange
     from crane.simulation.linear import LinearModel
     from crane.simulation.replays import Comparison
     from crane.simulation.sensitivity import Sensitivities
@@ -237,8 +237,12 @@ def write_working_range(folder: Path, found: "WorkingRange", force: bool = True)
     return text
 
 
-def write_capacity(folder: Path, chart: "Capacity", force: bool = True) -> str:
+def write_capacity(
+    folder: Path, chart: "Capacity", torques: "Torques | None" = None, force: bool = True
+) -> str:
     """Write tables, pictures and page of rated loads into a folder, created where there is none.
+
+    What lifting and slewing torques say stands behind the table, if they are given.
 
     Returns:
         The table with what it holds for, Markdown.
@@ -250,7 +254,7 @@ def write_capacity(folder: Path, chart: "Capacity", force: bool = True) -> str:
     from crane.view.plots.capacity import plot_capacity
     from crane.view.plots.capacity_sheet import plot_sheet
 
-    text = chart.to_markdown()
+    text = chart.to_markdown() + (torques.to_markdown() if torques is not None else "")
     with staging(folder, force) as part:
         chart.to_csv(part / "capacity.csv")
         (part / "capacity.md").write_text(text, encoding="utf-8")
