@@ -195,7 +195,8 @@ def test_without_xacro(arm, monkeypatch):
     with pytest.raises(CraneError) as caught:
         load(arm)
     assert str(caught.value) == (
-        "arm.urdf.xacro: is written with xacro, install it: pip install 'crane-dynamics[xacro]'"
+        "arm.urdf.xacro: is written with xacro, install it in the repository's folder: "
+        "pip install '.[xacro]'"
     )
 
 

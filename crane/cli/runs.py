@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from crane.simulation.sensitivity import Sensitivities
     from crane.studies.power import PowerAccount
 
-RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
+RECORDING, RECORDING_NPZ = "recording.csv", "recording.npz"
+SUMMARY, FIGURE, PAGE = "summary.md", "figure.png", "view.html"
 COMPARISON = "comparison.md"
 
 
@@ -65,10 +66,10 @@ def check_free(file: Path, force: bool) -> None:
         raise OutputError(f"{file}: exists already, choose another name or add --force")
 
 
-def write_run(folder: Path, recording: Recording) -> str:
-    """Write a recording and its summary into a folder, created where there is none.
+def write_run(folder: Path, recording: Recording, npz: bool = False) -> str:
+    """Write a recording, as CSV or npz, and its summary into a folder, created if there is none.
 
-    Figure and page of an earlier run in the same folder are removed: they show something else.
+    What else there is of an earlier run in the same folder is removed: it shows something else.
 
     Returns:
         The summary, Markdown.
@@ -79,14 +80,19 @@ def write_run(folder: Path, recording: Recording) -> str:
     heading = title(subject(recording), recording.task)
     text = f"# {heading}\n\n{summarize(recording).to_markdown()}"
     with staging(folder) as part:
-        recording.to_csv(part / RECORDING)
+        if npz:
+            recording.to_npz(part / RECORDING_NPZ)
+        else:
+            recording.to_csv(part / RECORDING)
         (part / SUMMARY).write_text(text, encoding="utf-8")
-        for name in (FIGURE, PAGE):
+        for name in (FIGURE, PAGE, RECORDING if npz else RECORDING_NPZ):
             (folder / name).unlink(missing_ok=True)
     return text
 
 
-def write_comparison(folder: Path, recording: Recording, comparison: Comparison) -> str:
+def write_comparison(
+    folder: Path, recording: Recording, comparison: Comparison, npz: bool = False
+) -> str:
     """Write a replay into a folder: its recording, and how it compares with what was measured.
 
     Returns:
@@ -97,7 +103,7 @@ def write_comparison(folder: Path, recording: Recording, comparison: Comparison)
     """
     from crane.view.plots.comparison import plot_comparison
 
-    write_run(folder, recording)
+    write_run(folder, recording, npz)
     heading = title(subject(recording), recording.task)
     text = f"# {heading}\n\n{comparison.to_markdown()}"
     with staging(folder) as part:
@@ -291,9 +297,10 @@ def read_run(
         DescriptionError: The machine that the file names is not found.
     """
     if path.is_dir():
-        if not (path / RECORDING).is_file():
+        there = [x for x in (RECORDING, RECORDING_NPZ) if (path / x).is_file()]
+        if not there:
             raise RecordingError(f"{path}: no {RECORDING} in this folder, give a run's folder")
-        path = path / RECORDING
+        path = path / there[0]
     if machine is not None:
         return completed(machine, read(path, machine, columns, span), path, needs)
     table = readings(path, columns=columns)
