@@ -107,15 +107,14 @@ def peak(*arguments):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is counted otherwise here")
-@pytest.mark.parametrize("npz", [True, False])
-def test_memory_grows_by_less_than_a_recording(tmp_path, npz):
-    """From three to nine minutes, a recording of 40 columns grows by 320 bytes a sample."""
-    taken, option = {}, ["--npz"] if npz else []
-    for duration in (180, 540):
+def test_memory_grows_by_less_than_a_recording(tmp_path):
+    """Three minutes later a recording of 40 columns has grown by 320 bytes a sample."""
+    taken = {}
+    for duration in (90, 270):
         out = tmp_path / str(duration)
         made = ("simulate", "mini_forwarder", "--task", "lift", "--duration", duration)
         taken[duration] = [
-            peak(*made, "--out", out, *option), peak("view", out, "--no-open"), peak("plot", out),
+            peak(*made, "--out", out), peak("view", out, "--no-open"), peak("plot", out),
         ]  # fmt: skip
-    growth = [(long - short) / 360e3 for short, long in zip(*taken.values(), strict=True)]
-    assert max(growth) < 160, growth
+    growth = [(long - short) / 180e3 for short, long in zip(*taken.values(), strict=True)]
+    assert max(growth) < 160, growth  # half of that: some columns at a time

@@ -17,7 +17,7 @@ import numpy as np
 
 from crane.common.samples import Array
 
-_LARGE = 1 << 22  # numbers, 32 MiB
+_LARGE = 1 << 20  # numbers, 8 MiB
 AT_ONCE = 1 << 16  # samples that are worked on between two releases
 _maps: weakref.WeakSet[mmap.mmap] = weakref.WeakSet()
 
