@@ -216,7 +216,7 @@ def test_a_cluster_needs_dask_and_a_scheduler(monkeypatch):
     with pytest.raises(InputError, match="'nowhere' is no address of a scheduler"):
         crane.study("mini_forwarder", {"payload.mass": [0]}, ["lift"], scheduler="nowhere")
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match=r"pip install 'crane-dynamics\[cluster\]'"):
+    with pytest.raises(InputError, match=r"folder: pip install '\.\[cluster\]'"):
         crane.study("mini_forwarder", {"payload.mass": [0]}, ["lift"], scheduler="nowhere")
 
 
