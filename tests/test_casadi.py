@@ -207,7 +207,7 @@ def test_what_cannot_be_is_one_line(log_crane, slider_crank, five_bar, monkeypat
             crane.casadi_function(machine, quantity, **options)
         assert said in str(error.value) and "\n" not in str(error.value)
     monkeypatch.setitem(sys.modules, "casadi", None)
-    with pytest.raises(CraneError, match="install it: pip install 'crane-dynamics.casadi.'"):
+    with pytest.raises(CraneError, match="repository's folder: pip install '..casadi.'"):
         crane.casadi_function(log_crane, "gravity")
 
 

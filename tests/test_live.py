@@ -325,5 +325,6 @@ def test_without_viser_it_says_how_to_get_it():
     _, err = process.communicate(timeout=300)
     assert (process.returncode, line) == (2, "")
     assert err == (
-        "error: a live view needs viser, install it: pip install 'crane-dynamics[live]'\n"
+        "error: a live view needs viser, install it in the repository's folder: "
+        "pip install '.[live]'\n"
     )

@@ -67,7 +67,7 @@ BAD = {  # arrays, and what is told
     "other length": ({"a": np.zeros(4)}, "'a' has the shape (4,) of float64, give (5,) num"),
     "beyond memory": (
         {"time": declared(1 << 45), "a": declared(1 << 45)},
-        "declares 35184372088832 samples of 2 columns, give at most 134217728 numbers",
+        "declares 35184372088832 samples of 2 columns, give at most 536870912 numbers",
     ),
     "beyond any number": ({"a": declared("9" * 40)}, f"give ({'9' * 40},) numbers per column"),
     "more than there is": (

@@ -23,7 +23,9 @@ FALLS = {
 LARGE = ("digit_like_2legs", "wl16_like")
 EVERY = [pytest.param(x, marks=pytest.mark.slow) if x in LARGE else x for x in FREEDOMS]
 
-pytestmark = pytest.mark.skipif(not ROBOTS.exists(), reason="the robots are not there")
+pytestmark = pytest.mark.skipif(
+    not ROBOTS.exists(), reason="the robots, ../shared/data, are not there"
+)
 
 
 def robot(name):

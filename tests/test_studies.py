@@ -216,7 +216,7 @@ def test_a_cluster_needs_dask_and_a_scheduler(monkeypatch):
     with pytest.raises(InputError, match="'nowhere' is no address of a scheduler"):
         crane.study("mini_forwarder", {"payload.mass": [0]}, ["lift"], scheduler="nowhere")
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match=r"pip install 'crane-dynamics\[cluster\]'"):
+    with pytest.raises(InputError, match=r"folder: pip install '\.\[cluster\]'"):
         crane.study("mini_forwarder", {"payload.mass": [0]}, ["lift"], scheduler="nowhere")
 
 
@@ -261,3 +261,39 @@ def test_a_worker_that_dies_loses_nothing(nanny, tmp_path):
         cluster = crane.study("mini_forwarder", vary, scheduler=address, progress=kill)
     assert killed
     assert text_of(cluster, tmp_path) == text_of(local, tmp_path)
+
+
+def test_expressions_and_measures_of_ones_own_are_columns():
+    """As `crane.design` has them; a variant that fails a requirement says by how much."""
+    vary = {"arm.mass": [600.0, 700.0], "bucket_lip.x": [1.3, 1.47]}
+    measures = ["load(6, 1) / mass", "mass", "double"]
+    own = {"double": lambda machine: 2 * machine.tree.links["arm"].inertial.mass}
+    found = crane.study(
+        "excavator", vary, [], measures, own=own, frame="bucket_lip", require=["reach >= 9.9"]
+    )
+    assert found.measures == tuple(measures)
+    assert "lacks" in found.reasons[0] and found.reasons[1] == ""
+    assert found.columns["double"][1] == 1200.0 and np.isnan(found.columns["double"][0])
+    variant = crane.load("excavator", changes={"arm.mass": 600.0, "bucket_lip.x": 1.47})
+    chart = crane.capacity(variant, "bucket_lip", radii=[6.0], heights=[1.0])
+    mass = sum(x.mass for x in variant.model.inertias)
+    assert found.columns["load(6, 1) / mass"][1] == pytest.approx(chart.loads.min() / mass)
+    with pytest.raises(crane.CraneError, match="function 'loat' is unknown"):
+        crane.study("excavator", vary, [], ["loat(6, 1)"])
+    with pytest.raises(crane.CraneError, match="measure 'mas' is unknown, did you mean 'mass'"):
+        crane.study("excavator", vary, [], ["mas"])
+
+
+def test_tasks_of_levers_are_done_with_their_circuit():
+    """A pump of less pressure does less work in the same levers' time, and may vary."""
+    vary = {"supply.pressure": [3.0e7, 3.5e7]}
+    found = crane.study("excavator", vary, ["dig"], ["pump_work", "duration", "peak_X_boom"])
+    assert found.reasons == ("", "") and (found.columns["duration"] == 16.0).all()
+    less, more = found.columns["pump_work"]
+    run = crane.simulate(
+        (machine := crane.load("excavator")).under(*machine.tasks["dig"].loads),
+        crane.joystick(machine, "dig"), duration=16.0, step=5e-3,
+    )  # fmt: skip
+    assert less < more == pytest.approx(run.channels["pump_work"][-1], rel=1e-9)
+    with pytest.raises(crane.CraneError, match="take a task of levers"):
+        crane.study("excavator", vary, ["grade"], ["peak_X_boom"])

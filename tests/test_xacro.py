@@ -195,7 +195,8 @@ def test_without_xacro(arm, monkeypatch):
     with pytest.raises(CraneError) as caught:
         load(arm)
     assert str(caught.value) == (
-        "arm.urdf.xacro: is written with xacro, install it: pip install 'crane-dynamics[xacro]'"
+        "arm.urdf.xacro: is written with xacro, install it in the repository's folder: "
+        "pip install '.[xacro]'"
     )
 
 
@@ -215,7 +216,7 @@ def test_home_is_written_into_it(arm):
     assert np.abs(load(arm, arguments={"long": True}).home - sought.home).max() < 1e-12
 
 
-@pytest.mark.skipif(not SHARED.is_file(), reason="the excavator's file is not here")
+@pytest.mark.skipif(not SHARED.is_file(), reason="the excavator, ../shared/data, is not there")
 def test_excavator_as_it_comes():
     machine = load(SHARED)
     assert machine.joints[:4] == ("swing_joint", "boom_joint", "arm_joint", "bucket_joint")

@@ -63,6 +63,13 @@ def capacity(
         bool, typer.Option("--friction", help="What raises has to overcome friction.")
     ] = False,
     step: Annotated[float | None, typer.Option(metavar="M", help="Between places.")] = None,
+    torque: Annotated[
+        float | None,
+        typer.Option(
+            metavar="RADIUS",
+            help="Tell the lifting torque, gross and of the load at this radius, and the slewing.",
+        ),
+    ] = None,
     change: Change = None,
     lock: Lock = None,
     active: Active = None,
@@ -77,6 +84,7 @@ def capacity(
     from crane.cli.runs import check_folder, write_capacity
     from crane.common.samples import as_number
     from crane.ratings import capacity as rate
+    from crane.ratings import torques
 
     check_folder(out, force)
     shares = _rule(rule, hydraulic, tipping)
@@ -88,8 +96,11 @@ def capacity(
             loaded, frame, rule=shares, raising=raising or None, slews=slews,
             slope=lean, friction=friction, step=step,
         )  # fmt: skip
+        found = None
+        if torque is not None:
+            found = torques(loaded, frame, radius=torque, rule=shares, friction=friction)
     with status("drawing"):
-        text = write_capacity(out, chart, force)
+        text = write_capacity(out, chart, found, force)
     print(f"{text}\nwritten to {out}")
 
 

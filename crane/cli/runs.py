@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from crane.identification.calibration.result import Calibration
     from crane.identification.mechanics.result import Identification
     from crane.motion.workspaces import Workspace
-    from crane.ratings import Breakout, Capacity, ToolForce, WorkingRange
+    from crane.ratings import Breakout, Capacity, ToolForce, Torques, WorkingRange
     from crane.simulation.linear import LinearModel
     from crane.simulation.replays import Comparison
     from crane.simulation.sensitivity import Sensitivities
@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from crane.studies.power_comparison import PowerComparison
     from crane.studies.table import Study
 
-RECORDING, SUMMARY, FIGURE, PAGE = "recording.csv", "summary.md", "figure.png", "view.html"
+RECORDING, RECORDING_NPZ = "recording.csv", "recording.npz"
+SUMMARY, FIGURE, PAGE = "summary.md", "figure.png", "view.html"
 REPORT, MACHINE = "report.html", "machine"
 COMPARISON, CURVES = "comparison.md", "comparison.png"
 OF_RUNS = (FIGURE, PAGE, COMPARISON, CURVES)  # beside a recording, of an earlier one
@@ -70,15 +71,15 @@ def check_free(file: Path, force: bool) -> None:
         raise OutputError(f"{file}: exists already, choose another name or add --force")
 
 
-def write_run(folder: Path, recording: Recording, force: bool = True) -> str:
-    """Write a recording and its summary into a folder, created where there is none.
+def write_run(folder: Path, recording: Recording, npz: bool = False, force: bool = True) -> str:
+    """Write a recording, as CSV or npz, and its summary into a folder, created if there is none.
 
-    Figure, page and comparison of an earlier run in the same folder are removed: they show
-    something else.
+    What else there is of an earlier run in the same folder is removed: it shows something else.
 
     Args:
         folder: The folder; of all that follow here, too.
         recording: The recording.
+        npz: Whether it is written as npz.
         force: Whether an earlier run is replaced; of all that follow here, too.
 
     Returns:
@@ -87,20 +88,32 @@ def write_run(folder: Path, recording: Recording, force: bool = True) -> str:
     Raises:
         OutputError: The folder or a file cannot be written, or it is filled and `force` is off.
     """
-    with staging(folder, force, OF_RUNS) as part:
-        return _write_run(part, recording)
+    with staging(folder, force, _stale(npz)) as part:
+        return _write_run(part, recording, npz)
 
 
-def _write_run(part: Path, recording: Recording) -> str:
+def _stale(npz: bool) -> tuple[str, ...]:
+    """Files of an earlier run that a new one takes away."""
+    return (*OF_RUNS, RECORDING if npz else RECORDING_NPZ)
+
+
+def _write_run(part: Path, recording: Recording, npz: bool) -> str:
     heading = title(subject(recording), recording.task)
     text = f"# {heading}\n\n{summarize(recording).to_markdown()}"
-    recording.to_csv(part / RECORDING)
+    if npz:
+        recording.to_npz(part / RECORDING_NPZ)
+    else:
+        recording.to_csv(part / RECORDING)
     (part / SUMMARY).write_text(text, encoding="utf-8")
     return text
 
 
 def write_comparison(
-    folder: Path, recording: Recording, comparison: "Comparison", force: bool = True
+    folder: Path,
+    recording: Recording,
+    comparison: "Comparison",
+    npz: bool = False,
+    force: bool = True,
 ) -> str:
     """Write a replay into a folder: its recording, and how it compares with what was measured.
 
@@ -114,8 +127,8 @@ def write_comparison(
 
     heading = title(subject(recording), recording.task)
     text = f"# {heading}\n\n{comparison.to_markdown()}"
-    with staging(folder, force, OF_RUNS) as part:
-        _write_run(part, recording)
+    with staging(folder, force, _stale(npz)) as part:
+        _write_run(part, recording, npz)
         (part / COMPARISON).write_text(text, encoding="utf-8")
         if comparison.channels:
             plot_comparison(comparison, part / CURVES)
@@ -237,8 +250,12 @@ def write_working_range(folder: Path, found: "WorkingRange", force: bool = True)
     return text
 
 
-def write_capacity(folder: Path, chart: "Capacity", force: bool = True) -> str:
+def write_capacity(
+    folder: Path, chart: "Capacity", torques: "Torques | None" = None, force: bool = True
+) -> str:
     """Write tables, pictures and page of rated loads into a folder, created where there is none.
+
+    What lifting and slewing torques say stands behind the table, if they are given.
 
     Returns:
         The table with what it holds for, Markdown.
@@ -250,7 +267,7 @@ def write_capacity(folder: Path, chart: "Capacity", force: bool = True) -> str:
     from crane.view.plots.capacity import plot_capacity
     from crane.view.plots.capacity_sheet import plot_sheet
 
-    text = chart.to_markdown()
+    text = chart.to_markdown() + (torques.to_markdown() if torques is not None else "")
     with staging(folder, force) as part:
         chart.to_csv(part / "capacity.csv")
         (part / "capacity.md").write_text(text, encoding="utf-8")
@@ -439,9 +456,10 @@ def read_run(
         DescriptionError: The machine that the file names is not found.
     """
     if path.is_dir():
-        if not (path / RECORDING).is_file():
+        there = [x for x in (RECORDING, RECORDING_NPZ) if (path / x).is_file()]
+        if not there:
             raise RecordingError(f"{path}: no {RECORDING} in this folder, give a run's folder")
-        path = path / RECORDING
+        path = path / there[0]
     if machine is not None:
         return completed(machine, read(path, machine, columns, span), path, needs)
     table = readings(path, columns=columns)

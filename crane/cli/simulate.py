@@ -77,6 +77,12 @@ def simulate(
         float | None, typer.Option(help="In seconds; that of the task if not given.")
     ] = None,
     step: Annotated[float, typer.Option(help="Between recorded instants in seconds.")] = 1e-3,
+    npz: Annotated[
+        bool,
+        typer.Option(
+            "--npz", help="Record as npz, of a long run: under half of a CSV, and read at once."
+        ),
+    ] = False,
     columns: Columns = None,
     since: From = None,
     until: Until = None,
@@ -120,7 +126,7 @@ def simulate(
         for option, value in {"--method": method, "--tolerance": tolerance}.items():
             if value is not None:
                 raise InputError(f"{option} does not go with --inputs, leave it out")
-        _replay(loaded, inputs, out, step, columns, span_of(since, until), force)
+        _replay(loaded, inputs, out, step, npz, columns, span_of(since, until), force)
         return
     of_inputs = {"--columns": columns, "--from": since, "--until": until}
     for option in [option for option, given in of_inputs.items() if given is not None]:
@@ -144,10 +150,10 @@ def simulate(
                 tolerance=tolerance, progress=progress,
             )  # fmt: skip
     except InterruptedRun as cut:
-        write_run(out, cut.recording, force)
+        write_run(out, cut.recording, npz, force)
         say(f"{cut}: what there is of it is in {out}, whose summary says where it was cut")
         sys.exit(INTERRUPTED)
-    print(write_run(out, recording, force), end="")
+    print(write_run(out, recording, npz, force), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")
 
 
@@ -221,6 +227,7 @@ def _replay(
     inputs: Path,
     out: Path,
     step: float,
+    npz: bool,
     columns: Path | None,
     span: tuple[float, float],
     force: bool,
@@ -230,5 +237,5 @@ def _replay(
 
     with progress_bar("simulating") as progress:
         recording, comparison = replay(machine, inputs, step, progress, columns, span)
-    print(write_comparison(out, recording, comparison, force), end="")
+    print(write_comparison(out, recording, comparison, npz, force), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")

@@ -5,6 +5,7 @@ from typing import Any
 
 from crane.codegen.scalar import Expression, Number, needed
 from crane.common.errors import InputError
+from crane.common.extras import how
 
 _BINARY = {
     "add": lambda a, b: a + b,
@@ -14,7 +15,7 @@ _BINARY = {
 }
 _NAMES = {
     "sin": "sin", "cos": "cos", "exp": "exp", "log": "log", "tanh": "tanh", "sqrt": "sqrt",
-    "abs": "fabs", "maximum": "fmax", "copysign": "copysign",
+    "abs": "fabs", "maximum": "fmax",
 }  # fmt: skip
 
 
@@ -27,9 +28,7 @@ def library() -> Any:
     try:
         import casadi
     except ImportError:
-        raise InputError(
-            "CasADi is not installed, install it: pip install 'crane-dynamics[casadi]'"
-        ) from None
+        raise InputError(f"CasADi is not installed, {how('casadi')}") from None
     return casadi
 
 
@@ -63,6 +62,8 @@ def _operation(ca: Any, kind: str) -> Callable[..., Any]:
         return _BINARY[kind]
     if kind == "negate":
         return lambda x: -x
+    if kind == "copysign":  # CasADi's own had wrong derivatives up to 3.8.0
+        return lambda size, sign: ca.fabs(size) * ca.copysign(1.0, sign)
     if kind == "positive":
         return lambda x, yes, no: ca.if_else(x > 0, yes, no)
     if kind == "dot":

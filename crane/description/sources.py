@@ -82,9 +82,10 @@ def find(name: str | Path) -> Path:
             return path.resolve()
         problem = "is a folder, give a file" if is_folder else "no such file, check the path"
         raise DescriptionError(f"{path}: {problem}")
-    machines, robots = bundled(), examples()
+    machines = bundled()
     if text in machines:
         return machines[text]
+    robots = examples()
     if text in robots:
         return robots[text]
     if is_file or is_folder:

@@ -215,7 +215,8 @@ class Machine:
     def reference(self) -> str:
         """What `load` takes to load it again: the bundled name, or the path."""
         known_as = self.path.stem
-        named = bundled() | examples()
+        bundle = bundled()
+        named = bundle if known_as in bundle else examples()
         return known_as if named.get(known_as) == self.path else str(self.path)
 
     @property

@@ -45,6 +45,20 @@ class Torques(NamedTuple):
     net: float
     slewing: float
 
+    def to_markdown(self) -> str:
+        """A table of the torques, and what each means."""
+        rows = [
+            ("lifting torque, gross", self.gross,
+             f"of {self.raising} about {self.pivot}, at its best stroke of {self.stroke:.4g}"),
+            (f"lifting torque, net at {self.radius:g} m", self.net,
+             f"of {self.load:.0f} kg, the most there, {self.height:.2f} m high"),
+        ]  # fmt: skip
+        if np.isfinite(self.slewing):
+            rows.append(("slewing torque", self.slewing, "of its drive"))
+        lines = ["", "| | kN m | |", "| --- | ---: | --- |"]
+        lines += [f"| {name} | {torque / 1e3:.1f} | {words} |" for name, torque, words in rows]
+        return "\n".join([*lines, ""])
+
 
 def torques(
     machine: Machine,

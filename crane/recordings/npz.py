@@ -1,4 +1,4 @@
-"""Columns of an npz file, read with bounds.
+"""Columns of an npz file, written one after the other, and read with bounds.
 
 An npz is a zip of arrays, each with a header that declares its type and shape. numpy believes the
 headers; here sizes are compared with what is there, and nothing that could run is loaded.
@@ -8,27 +8,48 @@ import lzma
 import math
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, TypeVar
 
 import numpy as np
 
+from crane.common import scratch
 from crane.common.errors import RecordingError
 from crane.common.samples import Array
 
-MOST = 1 << 27  # numbers in a file: 1 GiB
+MOST = 1 << 29  # numbers in a file: 4 GiB, in scratch files
 MOST_COLUMNS = 4096
 NUMBERS = "biuf"  # kinds of numpy's types
 _AT_ONCE = 1 << 20  # numbers
+_COMMENT = 65535  # bytes that a zip has for it
 T = TypeVar("T")
 _DAMAGED = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError,
 )  # fmt: skip
 
 
-def read_columns(path: Path) -> tuple[list[str], Array]:
-    """Names and values (N, columns) of the columns, in the order of the file.
+def write_columns(
+    path: Path, names: Sequence[str], columns: Sequence[Array], comment: str
+) -> None:
+    """Write columns (N,) by name, and a comment on all of them.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.comment = comment.encode()[:_COMMENT]
+        for name, column in zip(names, columns, strict=True):
+            header = {"descr": "<f8", "fortran_order": False, "shape": column.shape}
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array_header_1_0(file, header)
+                for start in range(0, len(column), scratch.AT_ONCE):
+                    file.write(column[start : start + scratch.AT_ONCE].astype("<f8").tobytes())
+            scratch.release()
+
+
+def read_columns(path: Path) -> tuple[list[str], Array, str]:
+    """Names and values (N, columns) of the columns, in the order of the file, and its comment.
 
     Raises:
         OSError: The file cannot be opened.
@@ -77,7 +98,7 @@ def _declared(archive: zipfile.ZipFile) -> dict[str, tuple[tuple[int, ...], np.d
     return types
 
 
-def _columns(archive: zipfile.ZipFile) -> tuple[list[str], Array]:
+def _columns(archive: zipfile.ZipFile) -> tuple[list[str], Array, str]:
     types = _declared(archive)
     count = max((shape[0] for shape, _ in types.values() if len(shape) == 1), default=0)
     for name, (shape, dtype) in types.items():
@@ -93,10 +114,11 @@ def _columns(archive: zipfile.ZipFile) -> tuple[list[str], Array]:
             f"declares {count} samples of {len(types)} columns, give at most {MOST} numbers"
         )
     _check_sizes(archive, types)
-    values = np.empty((count, len(types)))
+    values = scratch.empty(count, len(types))
     for column, entry in enumerate(archive.infolist()):
         _fill(archive, entry, types, values[:, column])
-    return list(types), values
+        scratch.release()
+    return list(types), values, archive.comment.decode(errors="replace")
 
 
 def _arrays(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
@@ -111,7 +133,7 @@ def _arrays(archive: zipfile.ZipFile) -> dict[str, np.ndarray]:
         shape, dtype = types[name]
         found[name] = np.empty(0, dtype)
         if name in numbers:
-            values = np.empty(math.prod(shape))
+            values = scratch.empty(math.prod(shape), 1)[:, 0]
             fortran = _fill(archive, entry, types, values)
             found[name] = values.reshape(shape, order="F" if fortran else "C")
     return found

@@ -194,4 +194,7 @@ def within(table: Table, span: Span, path: str | Path) -> Table:
             f"{path}: no sample lies from {span[0]:g} to {span[1]:g} s, it is recorded from "
             f"{time[0]:g} to {time[-1]:g} s"
         )
-    return table if some.all() else Table(table.units, table.values[some], table.notes)
+    if some.all():
+        return table
+    first, last = np.flatnonzero(some)[[0, -1]]
+    return Table(table.units, table.values[first : last + 1], table.notes)

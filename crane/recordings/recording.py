@@ -14,19 +14,21 @@ derivative of X then. X_velocity and X_force without X is an error. Every other 
 channel, such as the angle q2 of a joint that is not active, with q2_velocity beside it or without.
 The order of the columns is any, the joints come in the order of their displacements. The comment
 lines may be left out where no joint is free. Other units are converted where
-crane.recordings.timeseries knows them. An npz file serves,
-too: one array per column, named like those of the CSV. What a crane's sensors tell instead of
-displacements and forces, crane.recordings.measured turns into them.
+crane.recordings.timeseries knows them. An npz file serves, too: one array per column, named like
+those of the CSV, and the comment lines as the comment of the archive. What a crane's sensors tell
+instead of displacements and forces, crane.recordings.measured turns into them.
 """
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import InitVar, dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.common import scratch
 from crane.common.errors import RecordingError, at, known
 from crane.common.samples import Array
 from crane.description.sensors import FORCE as FORCE
@@ -137,8 +139,10 @@ class Recording:
             if joint in self.free and self.tau[:, i].any():
                 raise RecordingError(driven_all_the_same(joint, self.tau[:, i]))
         arrays = (self.time, self.q, self.v, self.tau, *self.channels.values())
-        if not all(np.isfinite(values).all() for values in arrays):
-            check_finite(self.columns())
+        for values in arrays:
+            scratch.release()
+            if not np.isfinite(values).all():
+                check_finite(self.columns())
         if (back := np.diff(self.time) <= 0).any():
             sample = int(np.argmax(back)) + 1
             before, now = self.time[sample - 1 : sample + 1]
@@ -216,6 +220,19 @@ class Recording:
         Raises:
             OutputError: It cannot be written there.
         """
+        columns = list(self.columns().values())
+        timeseries.write_columns(path, self._units(), columns, self._notes())
+
+    def to_npz(self, path: str | Path) -> None:
+        """Write the recording as npz, whole or not at all: smaller than a CSV, and read faster.
+
+        Raises:
+            OutputError: It cannot be written there.
+        """
+        columns = list(self.columns().values())
+        timeseries.write_npz(path, self._units(), columns, self._notes())
+
+    def _notes(self) -> dict[str, str]:
         notes = {"crane recording": "", "machine": self.machine, "task": self.task}
         if self.controller:
             notes["controller"] = self.controller
@@ -223,7 +240,7 @@ class Recording:
             notes[SENSORS] = IDEAL
         if self.free:
             notes[FREE] = ", ".join(self.free)
-        timeseries.write_columns(path, self._units(), list(self.columns().values()), notes)
+        return notes
 
     @classmethod
     def from_csv(cls, path: str | Path) -> "Recording":
@@ -271,10 +288,14 @@ class Recording:
                 check_unit(joint + FORCE, units[joint + FORCE], [FORCE_UNITS[unit]])
             elif joint in free:
                 column[joint + FORCE] = np.zeros_like(column[TIME])
-        q, v, tau = (
-            np.column_stack([column[x + suffix] for x in joints])
-            for suffix in ("", VELOCITY, FORCE)
-        )
+
+        def stacked(suffix: str) -> Array:
+            columns = [column[x + suffix] for x in joints]
+            return scratch.in_blocks(
+                lambda part: np.column_stack([x[part] for x in columns]), len(column[TIME])
+            )
+
+        q, v, tau = (stacked(suffix) for suffix in ("", VELOCITY, FORCE))
         used = {TIME} | {x + suffix for x in joints for suffix in ("", VELOCITY, FORCE)}
         channels = {x: values for x, values in column.items() if x not in used}
         return cls(
@@ -291,6 +312,7 @@ class Recording:
             controller=table.notes.get("controller", ""),
             ideal=table.notes.get(SENSORS) == IDEAL,
             free=free,
+            copy=False,
         )
 
 
@@ -320,7 +342,8 @@ def _array(
 ) -> Array:
     """A float64 array of that shape: a contiguous copy, or as it lies where none is asked for."""
     try:
-        array = np.array(value, dtype=np.float64, order="C" if copy else "K", copy=copy or None)
+        order: Literal["C", "K"] = "C" if copy or len(shape) == 1 else "K"
+        array = np.array(value, dtype=np.float64, order=order, copy=copy or None)
     except (TypeError, ValueError):
         raise RecordingError(f"{what} is not an array of numbers, give {shape}") from None
     if array.shape != shape:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.samples import Array
+from crane.common.scratch import in_blocks, release
 from crane.common.units import quantity
 from crane.description.sources import unchanged
 from crane.recordings.recording import FORCE_UNITS, Recording
@@ -161,6 +162,7 @@ def summarize(recording: Recording) -> Summary:
     time, channels = recording.time, recording.channels
     joints = []
     for i, name in enumerate(recording.joints):
+        release()
         q, v, tau = recording.q[:, i], recording.v[:, i], recording.tau[:, i]
         reference = channels.get(f"reference_{name}")
         error = None if reference is None else q - reference
@@ -177,10 +179,7 @@ def summarize(recording: Recording) -> Summary:
                 rms_error=None if error is None else rms(time, error),
             )
         )
-    tip, reference_tip = points(recording, "tip"), points(recording, "reference_tip")
-    distance = None
-    if tip is not None and reference_tip is not None:
-        distance = np.linalg.norm(tip - reference_tip, axis=1)
+    distance = tip_error(recording)
     return Summary(
         duration=float(time[-1] - time[0]),
         joints=tuple(joints),
@@ -192,10 +191,21 @@ def summarize(recording: Recording) -> Summary:
 
 def points(recording: Recording, name: str) -> Array | None:
     """The channels <name>_x, <name>_y, <name>_z as (N, 3) [m], None if one is not there."""
-    columns = [recording.channels.get(f"{name}_{axis}") for axis in "xyz"]
-    if any(column is None for column in columns):
+    axes = [f"{name}_{axis}" for axis in "xyz"]
+    if any(axis not in recording.channels for axis in axes):
         return None
-    return np.column_stack([column for column in columns if column is not None])
+    columns = [recording.channels[axis] for axis in axes]
+    return in_blocks(lambda part: np.column_stack([x[part] for x in columns]), len(recording.time))
+
+
+def tip_error(recording: Recording) -> Array | None:
+    """Distance (N,) of the tip from its reference [m], None if one is not there."""
+    tip, wanted = points(recording, "tip"), points(recording, "reference_tip")
+    if tip is None or wanted is None:
+        return None
+    return in_blocks(
+        lambda part: np.linalg.norm(tip[part] - wanted[part], axis=1, keepdims=True), len(tip)
+    )[:, 0]
 
 
 def rms(time: Array, values: Array) -> float:

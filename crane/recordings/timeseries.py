@@ -10,6 +10,7 @@ they are. Numbers are written with the fewest digits that give the same float64 
 
 import csv
 import io
+import itertools
 import os
 import re
 import stat
@@ -21,12 +22,14 @@ from typing import TypeVar
 
 import numpy as np
 
+from crane.common import scratch
 from crane.common.errors import RecordingError, at
 from crane.common.output import replacing
 from crane.common.samples import Array, Brief
 from crane.common.units import TO_SI
 from crane.common.units import spellings as spellings
 from crane.description.sensors import TIME as TIME
+from crane.recordings import npz
 from crane.recordings.npz import MOST, MOST_COLUMNS, read_arrays, read_columns
 
 T = TypeVar("T")
@@ -99,15 +102,34 @@ def write_columns(
     Raises:
         OutputError: It cannot be written there.
     """
-    counted = {**notes, SAMPLES: str(len(columns[0]))}
-    head = [f"# {key}: {value}" if value else f"# {key}" for key, value in counted.items()]
-    head.append(",".join(f"{x} [{unit}]" if unit else x for x, unit in units.items()))
+    head = [*_comments({**notes, SAMPLES: str(len(columns[0]))}), ",".join(_headings(units))]
     with replacing(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(head) + "\n")
         for start in range(0, len(columns[0]), _ROWS_AT_ONCE):
             rows = np.column_stack([x[start : start + _ROWS_AT_ONCE] for x in columns])
+            scratch.release()
             text = "".join([",".join(map(repr, row)) + "\n" for row in rows.tolist()])
             file.write(text.replace("nan", "") if np.isnan(rows).any() else text)
+
+
+def write_npz(
+    path: str | Path, units: Mapping[str, str], columns: Sequence[Array], notes: Mapping[str, str]
+) -> None:
+    """The same as an npz file: arrays named like the columns of a CSV, notes in its comment.
+
+    Raises:
+        OutputError: It cannot be written there.
+    """
+    with replacing(path) as part:
+        npz.write_columns(part, _headings(units), columns, "\n".join(_comments(notes)))
+
+
+def _comments(notes: Mapping[str, str]) -> list[str]:
+    return [f"# {key}: {value}" if value else f"# {key}" for key, value in notes.items()]
+
+
+def _headings(units: Mapping[str, str]) -> list[str]:
+    return [f"{x} [{unit}]" if unit else x for x, unit in units.items()]
 
 
 def read(path: str | Path) -> Table:
@@ -143,7 +165,7 @@ def read_csv(path: str | Path) -> Table:
                 f"holds {lines - line} lines of {len(units)} columns, give at most {MOST} numbers"
             )
         _check_end(path, notes)
-        values = _values(path, line, units)
+        values = _values(path, line, lines, units)
         _check_count(values, notes)
         return _in_si(Table(units, values, {key: x for key, x in notes.items() if key != SAMPLES}))
     except RecordingError as error:
@@ -161,8 +183,9 @@ def read_npz(path: Path) -> Table:
     Raises:
         RecordingError: The file does not exist, or as `crane.recordings.npz.read_columns`.
     """
-    names, values = _npz(path, read_columns)
-    return _table(path, names, values, {})
+    names, values, comment = _npz(path, read_columns)
+    lines = (line.strip() for line in comment.splitlines())
+    return _table(path, names, values, dict(_note(x) for x in lines if x.startswith("#")))
 
 
 def arrays(path: Path) -> dict[str, np.ndarray]:
@@ -288,11 +311,13 @@ def _check_count(values: Array, notes: Mapping[str, str]) -> None:
 def _in_si(table: Table) -> Table:
     units, values = dict(table.units), table.values
     for i, (name, unit) in enumerate(table.units.items()):
+        scratch.release()
         if unit in TO_SI:
             units[name], a, b = TO_SI[unit]
             with np.errstate(over="ignore"):  # infinite values are refused with their name
                 values[:, i] = values[:, i] * a / b
     for i, name in enumerate(table.units):
+        scratch.release()
         column = values[:, i]
         beyond = np.isfinite(column) & (np.abs(column) > _LARGEST)
         if beyond.any():
@@ -313,8 +338,8 @@ def _head(path: Path) -> tuple[dict[str, str], str, int]:
             passed += len(text)
             text = text.strip()
             if text.startswith("#"):
-                key, _, value = text.removeprefix("#").partition(":")
-                notes[key.strip()] = value.strip()
+                key, value = _note(text)
+                notes[key] = value
             elif text:
                 if len(text) > _LONG_HEADING:
                     raise RecordingError(
@@ -327,6 +352,12 @@ def _head(path: Path) -> tuple[dict[str, str], str, int]:
                     f"has no header row within {_BLOCK} characters, name the columns before"
                 )
     raise RecordingError("is empty, write a header row and one row per sample")
+
+
+def _note(text: str) -> tuple[str, str]:
+    """Key and value of a line '# key: value'."""
+    key, _, value = text.removeprefix("#").partition(":")
+    return key.strip(), value.strip()
 
 
 def _units(heading: str) -> dict[str, str]:
@@ -395,19 +426,34 @@ def check_unit(column: str, unit: str, allowed: Iterable[str]) -> None:
         raise RecordingError(f"column '{column}' {found}, give {wanted}")
 
 
-def _values(path: Path, header: int, units: Mapping[str, str]) -> Array:
-    """Numbers (N, columns) below the header row, which is line `header`."""
+def _values(path: Path, header: int, lines: int, units: Mapping[str, str]) -> Array:
+    """Numbers (N, columns) below the header row, which is line `header` of so many."""
+    values, count, sound = scratch.empty(lines - header, len(units)), 0, True
     try:
-        values = _numbers(path, header, ",")
+        with path.open(encoding="utf-8") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about blank lines alone
+            for _ in itertools.islice(file, header):
+                pass
+            for line in file:
+                block = itertools.chain([line], itertools.islice(file, _ROWS_AT_ONCE - 1))
+                rows = np.loadtxt(block, delimiter=",", comments=None, ndmin=2)
+                if not rows.size:
+                    continue
+                if rows.shape[1] != len(units):
+                    sound = False
+                    break
+                sound = sound and bool(np.isfinite(rows).all())
+                values[count : count + len(rows)] = rows
+                count += len(rows)
+                scratch.release()
     except ValueError as error:
         _find_fault(path, header, units)
         reason = " ".join(str(error).split())[:120]
         raise RecordingError(f"{reason}, correct the file") from None
-    if (
-        values.shape[1] != len(units)
-        or not np.isfinite(values).all()
-        or (np.diff(values[:, list(units).index(TIME)]) <= 0).any()
-    ):
+    if sound and not count:
+        raise RecordingError("has a header and no samples, write one row per sample")
+    values = values[:count]
+    if not sound or (np.diff(values[:, list(units).index(TIME)]) <= 0).any():
         _find_fault(path, header, units)
     return values
 

@@ -5,6 +5,7 @@ import numpy as np
 from crane.codegen import Parts
 from crane.common.errors import SimulationError
 from crane.common.samples import FARTHEST, Array
+from crane.common.scratch import release
 from crane.description.ground import Contact
 from crane.dynamics.frames import FrameJacobians
 from crane.dynamics.joint_forces import JointForces
@@ -61,8 +62,12 @@ def limits_passed(machine: Machine, time: Array, q: Array) -> str:
         q: (N, nv) the motion.
     """
     lower, upper = machine.coordinates.lower, machine.coordinates.upper
-    beyond = np.maximum(lower - q, q - upper)
-    farthest = beyond.max(axis=0)
+
+    def beyond(i: int) -> Array:
+        release()
+        return np.asarray(np.maximum(lower[i] - q[:, i], q[:, i] - upper[i]))
+
+    farthest = np.array([beyond(i).max() for i in range(len(lower))])
     stopped = {stop.joint for stop in machine.end_stops}
     slack = limit_slack(machine)
     passed = [i for i in np.flatnonzero(farthest > slack) if machine.joints[i] not in stopped]
@@ -72,7 +77,7 @@ def limits_passed(machine: Machine, time: Array, q: Array) -> str:
     passed.sort(key=lambda i: -farthest[i] / min(upper[i] - lower[i], FARTHEST * units[i]))
     words = []
     for i in passed[:_SHOWN]:
-        joint, first = machine.joints[i], int(np.argmax(beyond[:, i] > slack[i]))
+        joint, first = machine.joints[i], int(np.argmax(beyond(int(i)) > slack[i]))
         limit = lower[i] if q[first, i] < lower[i] else upper[i]
         unit = machine.unit(joint)
         words.append(
@@ -96,6 +101,7 @@ def strokes_passed(machine: Machine, time: Array, q: Array) -> str:
     stopped = {stop.joint for stop in machine.end_stops}
     words = []
     for joint in cylinders:
+        release()
         i = machine.column(joint)
         lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
         depth = np.maximum(lower - q[:, i], q[:, i] - upper)

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from crane.codegen import Parts
+from crane.common import scratch
 from crane.common.samples import Array
 from crane.control import Controller, Free, ValveDrive, reference_of
 from crane.description.external import PARTS
@@ -31,7 +32,8 @@ def recorded(
         rows: See `integrate`.
         task: Name to put into it.
     """
-    q_a = rows.q[:, machine.closure.active]
+    active = machine.closure.active
+    q_a = scratch.in_blocks(lambda part: rows.q[part][:, active], len(time))
     channels: dict[str, Array] = {}
     units: dict[str, str] = {}
     for name, values, unit in _channels(machine, control, time, rows):
@@ -60,7 +62,9 @@ def _channels(machine: Machine, control: Controller, time: Array, rows: Parts) -
         joint = machine.joints[column]
         yield joint, rows.q[:, column], machine.unit(joint)
     if machine.tip is not None:
-        yield from _point("tip", Kinematics(machine).positions(rows.q))
+        tip = Kinematics(machine)
+        places = scratch.in_blocks(lambda part: tip.positions(rows.q[part]), len(time))
+        yield from _point("tip", places)
     reference = reference_of(control, machine)
     if reference is not None:
         yield from _references(machine, reference, time)
@@ -84,7 +88,8 @@ def _channels(machine: Machine, control: Controller, time: Array, rows: Parts) -
         late: dict[str, Array] = {}
         if control.delays.any():  # a log has what was commanded, not what arrives
             spools = (f"voltage_{name}" for name in control.circuit.spools)
-            late = dict(zip(spools, control.commanded(time).T, strict=True))
+            asked = scratch.in_blocks(lambda part: control.commanded(time[part]), len(time))
+            late = dict(zip(spools, asked.T, strict=True))
         for (name, unit), values in zip(units, [*rows.channels.T, *integrals.T], strict=True):
             yield name, late.get(name, values), unit
 
@@ -105,32 +110,44 @@ def _standing(machine: Machine, rows: Parts) -> Iterator[Column]:
     """What supports carry, and how far it is from tipping."""
     if not has_supports(machine):
         return
-    stability, q = Stability(machine), rows.q
-    if stability.stands:
-        v = np.einsum("nij,nj->ni", machine.closure.gamma(q), rows.v_a)
-        ground = stability.ground(q, v, rows.a, rows.outside)
-        for name, values in zip(stability.names, stability.carried(q, ground).T, strict=True):
-            yield f"support_{name}", values, "N"
-    else:
-        ground = stability.pressed(q, rows.outside)
-    still = stability.ground(q, outside=rows.outside)
-    for word, wrench in (("stability", ground), ("static_stability", still)):
-        margins = stability.margins(q, wrench)
-        for line, values in zip(stability.lines, margins.moments.T, strict=True):
-            yield f"{word}_{'_'.join(line)}", values, "N m"
-        yield word, margins.least, ""
+    stability = Stability(machine)
+    titles = [(f"support_{name}", "N") for name in stability.names if stability.stands]
+    for word in ("stability", "static_stability"):
+        titles += [(f"{word}_{'_'.join(line)}", "N m") for line in stability.lines]
+        titles += [(word, "")]
+
+    def stand(part: slice) -> Array:
+        q, outside = rows.q[part], rows.outside[part]
+        columns: list[Array] = []
+        if stability.stands:
+            v = np.einsum("nij,nj->ni", machine.closure.gamma(q), rows.v_a[part])
+            ground = stability.ground(q, v, rows.a[part], outside)
+            columns += [stability.carried(q, ground)]
+        else:
+            ground = stability.pressed(q, outside)
+        for wrench in (ground, stability.ground(q, outside=outside)):
+            margins = stability.margins(q, wrench)
+            columns += [margins.moments, margins.least[:, None]]
+        return np.hstack(columns)
+
+    found = scratch.in_blocks(stand, len(rows.q))
+    for (name, unit), values in zip(titles, found.T, strict=True):
+        yield name, values, unit
 
 
 def _references(machine: Machine, reference: Trajectory, time: Array) -> Iterator[Column]:
     """What a reference asks of the joints, and of the tip where it was given there."""
-    q, v = reference.position(time), reference.velocity(time)
+    q = scratch.in_blocks(lambda part: reference.position(time[part]), len(time))
+    v = scratch.in_blocks(lambda part: reference.velocity(time[part]), len(time))
     for i in np.flatnonzero(machine.driven):
         joint = machine.active[i]
         unit = machine.unit(joint)
         yield f"reference_{joint}", q[:, i], unit
         yield f"reference_velocity_{joint}", v[:, i], unit + "/s"
     if reference.tip is not None:
-        yield from _point("reference_tip", reference.tip.position(time))
+        wanted = reference.tip.position
+        places = scratch.in_blocks(lambda part: wanted(time[part]), len(time))
+        yield from _point("reference_tip", places)
 
 
 def _point(name: str, positions: Array) -> Iterator[Column]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.codegen import Parts, TooLongError
+from crane.common import scratch
 from crane.common.errors import ClosureError, CraneWarning, InputError, SimulationError, known
 from crane.common.samples import Array, as_number, as_sample
 from crane.control import (
@@ -224,9 +225,14 @@ def integrate(
     integration = ChartedSteps(chart, control, len(own), make)
     layout = row_layout(machine, control, len(own))
     times = step * np.arange(steps + 1, dtype=np.float64)
-    rows = np.empty((steps + 1, layout.size), order="F")  # recorded by columns, without a copy
+    rows = scratch.empty(steps + 1, layout.size)  # recorded by columns, without a copy
+    kept = 0  # instants until the last release
 
     def report(done: int) -> None:
+        nonlocal kept
+        if not kept <= done < kept + scratch.AT_ONCE:
+            kept = done
+            scratch.release()
         if progress is not None:
             progress(done / (steps + 1))
         if ends and done and _has_ended(control):

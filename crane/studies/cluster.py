@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from crane.common.errors import CraneWarning, InputError
+from crane.common.extras import how
 
 _PATIENCE = 10.0  # [s] for the scheduler to answer
 
@@ -32,9 +33,7 @@ def by_workers(
     try:
         from distributed import Client, as_completed
     except ImportError:
-        raise InputError(
-            "a scheduler needs Dask, which is not installed: pip install 'crane-dynamics[cluster]'"
-        ) from None
+        raise InputError(f"a scheduler needs Dask, {how('cluster')}") from None
     if not re.fullmatch(r"(\w+://)?[^\s/]+:\d+/?", scheduler):
         raise InputError(
             f"'{scheduler}' is no address of a scheduler, give one such as tcp://HOST:8786"

@@ -10,12 +10,13 @@ import numpy as np
 from lxml import etree
 
 from crane.common.errors import CraneWarning, DescriptionError
+from crane.common.extras import how
 from crane.formats.mjcf.bounds import copies
 from crane.formats.mjcf.missing import MassMissingError, missing_file, without_files
 from crane.formats.xml import XmlFile
 
 _SHOWN = 6  # names in a line
-_INSTALL = "reading MJCF needs MuJoCo, install it: pip install 'crane-dynamics[mjcf]'"
+_INSTALL = f"reading MJCF needs MuJoCo, {how('mjcf')}"
 
 
 class MujocoFile:

@@ -9,12 +9,13 @@ from typing import Any
 from lxml import etree
 
 from crane.common.errors import CraneError, DescriptionError, InputError, known
+from crane.common.extras import how
 from crane.common.packages import given
 from crane.formats.xacro import process
 from crane.formats.xml import Places, XmlFile
 
 _SPACE = "http://www.ros.org/wiki/xacro"
-_INSTALL = "is written with xacro, install it: pip install 'crane-dynamics[xacro]'"
+_INSTALL = f"is written with xacro, {how('xacro')}"
 _ROOT = Path(__file__).resolve().parents[3]
 _PATIENCE = 10 * process.SECONDS  # [s], for systems that do not limit computing
 

@@ -104,8 +104,8 @@ class ChartedSteps:
                 made, halt = self._way.reached, error
             finally:  # also where it is interrupted
                 self.done = i + self._way.done
-                self._recent = np.vstack([self._recent, rows[i : i + made, : len(state)]])
-                self._recent = self._recent[-_RECENT:]
+                last = rows[i + max(made - _RECENT, 0) : i + made, : len(state)]
+                self._recent = np.vstack([self._recent, last])[-_RECENT:]
                 self._seen(times[i : self.done], rows[i : self.done])
             i += made
             if i == len(times) and not self._way.offset < 0:

@@ -10,6 +10,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from crane.common.errors import CraneWarning, InputError, OutputError
+from crane.common.extras import how
 from crane.view.live.door import Door, hear_values_alone
 from crane.view.live.page import Page
 from crane.view.live.playback import Playback
@@ -72,9 +73,7 @@ def start(door: Door, port: int | None) -> Any:
     try:
         import viser
     except ImportError:
-        raise InputError(
-            "a live view needs viser, install it: pip install 'crane-dynamics[live]'"
-        ) from None
+        raise InputError(f"a live view needs viser, {how('live')}") from None
     port = _free_port(door.host, port)
     with redirect_stdout(io.StringIO()), door.kept():
         server: Any = viser.ViserServer(host=door.host, port=port, verbose=False)

@@ -160,9 +160,10 @@ def _actuators(machine: Machine, recording: "Recording", rows: np.ndarray) -> li
     for joint, force in forces.items():
         unit = machine.unit(joint)
         full[unit] = max(full[unit], float(np.percentile(np.abs(force), _FULL)))
+    shown = {joint: force[rows] for joint, force in forces.items()}
     shares = {
         joint: np.where(np.abs(force) > _NOTHING * weight, force, 0.0) / full[machine.unit(joint)]
-        for joint, force in forces.items()
+        for joint, force in shown.items()
     }
     found = []
     for joint in machine.driven_joints:
@@ -173,7 +174,7 @@ def _actuators(machine: Machine, recording: "Recording", rows: np.ndarray) -> li
                 "joint": index,
                 "at": eyes[0]["placement"][12:15] if eyes else [0.0, 0.0, 0.0],
                 "name": joint,
-                "share": packed(shares[joint][rows], "f4"),
+                "share": packed(shares[joint], "f4"),
             }
         )
     return found

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crane.common.samples import Array
+from crane.common.scratch import release
 from crane.common.units import reading
 from crane.machine import Machine
 from crane.recordings.recording import FORCE_UNITS, VELOCITY, VELOCITY_UNITS
@@ -139,10 +140,11 @@ def groups(
     found = []
     for title, unit in sorted(sorted_in, key=lambda key: order.index(key[0])):
         members = sorted_in[title, unit]
-        peak = max(float(np.abs(column.values).max()) for column in members)
+        peak = max(_peak(column.values) for column in members)
         shown, scale = reading(unit, peak)
         lines = []
         for index, (column, hue, shade) in enumerate(_coloured(machine, members)):
+            release()
             line = {
                 "name": column.name,
                 "label": column.label,
@@ -156,6 +158,7 @@ def groups(
                 line["other"] = other[1].series(scale * there.values)
             lines.append(line)
         moves = len(recording.time) == 1 or any(_varies(column.values) for column in members)
+        release()
         found.append(
             {
                 "title": title,
@@ -235,9 +238,14 @@ def _place(machine: Machine, name: str, unit: str) -> tuple[str, str]:
     return _BY_UNIT.get(unit, "Other"), label if unit in _BY_UNIT else name
 
 
+def _peak(values: Array) -> float:
+    release()
+    return float(np.abs(values).max())
+
+
 def _varies(values: Array) -> bool:
     """Whether a column is more than a constant and rounding noise."""
-    return float(np.ptp(values)) > 1e-9 * max(1.0, float(np.abs(values).max()))
+    return float(np.ptp(values)) > 1e-9 * max(1.0, _peak(values))
 
 
 def _coloured(machine: Machine, members: list[Column]) -> Iterator[tuple[Column, int, int]]:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crane.common.samples import Array
+from crane.common.scratch import in_blocks
 from crane.common.units import number, quantity
 from crane.machine import Machine
 from crane.recordings.recording import FORCE_UNITS
@@ -79,7 +80,10 @@ def mechanical_work(recording: "Recording") -> tuple[float, float]:
 
     The integrals of the positive and of the negative part of sum tau v, by the trapezoidal rule.
     """
-    power = (recording.tau * recording.v).sum(axis=1)
+    power = in_blocks(
+        lambda part: (recording.tau[part] * recording.v[part]).sum(axis=1, keepdims=True),
+        len(recording.time),
+    )[:, 0]
     given = np.trapezoid(np.maximum(power, 0), recording.time)
     taken = np.trapezoid(np.maximum(-power, 0), recording.time)
     return float(given), float(taken)

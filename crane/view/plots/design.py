@@ -46,7 +46,7 @@ def design_figure(found: Design) -> Figure:
         numbers.set_ylim(len(rows) - 0.5, -0.5)
         numbers.set_xlim(-0.03, 1.03)
         numbers.set_xlabel("from the lower to the upper end of its range")
-        numbers.legend(loc="upper center", bbox_to_anchor=(0.5, -0.22), ncol=2, frameon=False)
+        numbers.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=2, frameon=False)
         if several:
             front = np.array([x.goals[:2] for x in found.solutions])
             axes[0].plot(*front.T, "o", linestyle=DASHED, color=RECORDED, markersize=5,

@@ -20,9 +20,10 @@ from mpl_toolkits.mplot3d import Axes3D
 from crane.common.errors import OutputError
 from crane.common.output import replacing
 from crane.common.samples import Array
+from crane.common.scratch import release
 from crane.common.units import reading
 from crane.recordings.recording import FORCE_UNITS, Recording
-from crane.recordings.summary import points, subject, title
+from crane.recordings.summary import points, subject, tip_error, title
 from crane.view.plots.text import plain
 from crane.view.plots.thinning import envelope, thinned
 
@@ -185,18 +186,15 @@ def _scales(panels: Sequence[_Panel]) -> dict[str, tuple[str, float]]:
     peaks: dict[str, float] = {}
     for panel in panels:
         for values in panel.lines.values():
+            release()
             peaks[panel.unit] = max(peaks.get(panel.unit, 0.0), float(np.abs(values).max()))
     return {unit: reading(unit, peak) for unit, peak in peaks.items()}
-
-
-def _tip_error(tip: Array, reference: Array) -> _Panel:
-    distance = np.linalg.norm(tip - reference, axis=1)
-    return _Panel("tip to reference", "m", {"recording": distance})
 
 
 def _draw_panel(axes: Axes, time: Array, panel: _Panel, unit: str, scale: float) -> None:
     marker = "o" if len(time) == 1 else None
     for label, values in panel.lines.items():
+        release()
         axes.plot(*envelope(time, scale * values), marker=marker, label=label, **LINES[label])
     axes.set_ylabel(f"{panel.quantity} [{unit}]")
     axes.margins(x=0.0, y=0.08)
@@ -236,15 +234,16 @@ def _draw_tip(
     figure: Figure, grid: GridSpec, recording: Recording, tip: Array, letters: Iterator[str]
 ) -> None:
     """The path of the tip in the last column, and its distance from a reference below it."""
-    reference = points(recording, "reference_tip")
+    reference, distance = points(recording, "reference_tip"), tip_error(recording)
     tall = slice(3) if reference is None else slice(2)
     space = figure.add_subplot(grid[tall, -1], projection="3d")
     _draw_path(space, tip, reference)
     _letter(space, letters)
-    if reference is None:
+    if distance is None:
         return
     axes = figure.add_subplot(grid[2, -1])
-    _draw_panel(axes, recording.time, _tip_error(tip, reference), "mm", 1e3)
+    panel = _Panel("tip to reference", "m", {"recording": distance})
+    _draw_panel(axes, recording.time, panel, "mm", 1e3)
     _letter(axes, letters)
     axes.set_xlabel("time [s]")
 
