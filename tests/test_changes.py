@@ -14,6 +14,7 @@ import crane.cli.entry
 from crane.common.errors import InputError
 from crane.description import bundled, changed, parameters
 from crane.formats import read
+from crane.hydraulics.components import Spool
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 POSE = np.array([0.3, 0.021, 0.012])
@@ -207,6 +208,11 @@ def test_every_name_is_documented(name):
 def test_every_documented_name_is_one():
     every = (*bundled(), DATA / "four_bar.yaml", DATA / "network.yaml")
     names = [x for name in every for x in parameters(read(name))]
+    spec = read("patu655")
+    valves = dict(spec.hydraulics.valves)
+    valves["X_lift"] = dataclasses.replace(valves["X_lift"], spool_b=Spool("X_lift"))
+    two = dataclasses.replace(spec.hydraulics, valves=valves)
+    names += parameters(dataclasses.replace(spec, hydraulics=two))
     for name, pattern in documented().items():
         assert any(re.fullmatch(pattern, x) for x in names), name
 
