@@ -92,6 +92,10 @@ CALLS = {
     "capacity": ["excavator --frame bucket --rule iso10567 --step 1 --out {out}"],
     "convert": ["slider.yaml {out}.urdf", "slider.yaml {out}", "slider.yaml {out}.xml"],
     "study": ["slider.yaml --out {out} --vary crank.mass=0.7:0.9:2 --processes 1"],
+    "design": [
+        "slider.yaml --out {out} --vary crank.mass=0.7~0.9 --minimise crank.mass "
+        "--starts 1 --points 2 --processes 1",
+    ],
     "excite": ["slider.yaml --out {out} --period 4 --harmonics 1 --step 0.05"],
     "import": ["motion.csv columns.txt --out {out}.csv"],
     "identify": ["slider.yaml motion.csv --out {out}"],

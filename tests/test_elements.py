@@ -659,10 +659,10 @@ def test_what_mjcf_has_no_place_for_is_told(tmp_path, mini):
 
 
 def test_operations_of_machines_without_elements_read_none():
-    """Those of a machine end behind its joints': 10, 22 and 1 each, gravity, whether it moves."""
+    """Behind those of joints, 10, 22 and 1 each: gravity, whether it moves, what stands, tip."""
     machine = crane.load("mini_forwarder")
     dynamics = crane.Dynamics(machine)
-    assert len(dynamics.numbers) == 33 * machine.model.nv + 4 and dynamics.form.spans == ()
+    assert len(dynamics.numbers) == 33 * machine.model.nv + 4 + 7 and dynamics.form.spans == ()
     sizes = [
         len(crane.Dynamics(machine.replace(ropes=ropes)).numbers)
         for ropes in ((), (crane.Rope(BOOM, 1, 1),), (crane.Rope(BOOM, 1, 1),) * 2)

@@ -317,7 +317,7 @@ def test_tables_and_files_say_free(machine, tmp_path):
         assert not read.tau[:, 2:].any()
     wrong = tmp_path / "wrong.csv"
     more = {head: ",swing_x_force [N m]"} | {x: ",1.5" for x in lines if x[0].isdigit()}
-    wrong.write_text("\n".join(line + more.get(line, "") for line in lines))
+    wrong.write_text("".join(f"{line}{more.get(line, '')}\n" for line in lines))
     with pytest.raises(CraneError, match="'swing_x' is free and has the force 1.5 at sample 0"):
         crane.read_measured(machine, wrong)
     assert typed("view", out).returncode == typed("plot", out).returncode == 0

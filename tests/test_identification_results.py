@@ -551,10 +551,11 @@ def without(column, text):
     lines = text.splitlines()
     at = next(i for i, line in enumerate(lines) if not line.startswith("#"))
     index = [cell.split(" [")[0] for cell in lines[at].split(",")].index(column)
-    return "\n".join(
+    kept = (
         line if i < at else ",".join(c for k, c in enumerate(line.split(",")) if k != index)
         for i, line in enumerate(lines)
     )
+    return "".join(f"{line}\n" for line in kept)
 
 
 def test_wrong_recordings_and_arguments_are_one_line(run, mini, tmp_path):

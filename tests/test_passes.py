@@ -84,13 +84,13 @@ def test_a_file_is_read_once(mini, recording, tmp_path, monkeypatch):
     monkeypatch.setattr(np, "loadtxt", lambda *a, **k: parsed.append(a) or load(*a, **k))
     plain, named = tmp_path / "plain.csv", tmp_path / "named.csv"
     recording.to_csv(plain)
-    head, *rows = plain.read_text().splitlines()[3:]
+    head, *rows = [x for x in plain.read_text().splitlines() if not x.startswith("#")]
     rows = [f"{head},pressure_pump_a [Pa]", *(f"{row},1e5" for row in rows)]
     named.write_text("\n".join(["# machine: mini_forwarder", *rows]))
     for file, machine in ((plain, mini), (plain, None), (named, mini), (named, None)):
         parsed.clear()
         assert np.array_equal(read_run(file, machine).q, recording.q)
-        assert len(parsed) == 1
+        assert len(parsed) == -(-len(recording.time) // 4096)  # blocks, once each
 
 
 @pytest.mark.parametrize("backend", ["compiled", "pinocchio"])

@@ -168,7 +168,7 @@ def test_a_noisy_start_in_motion_keeps_its_velocity(tmp_path, measured):
     [
         (lambda c, u: c.pop("voltage_x"), "no signal of a valve, give at least one of 'voltage_x"),
         (lambda c, u: c.update(voltage_y=c.pop("voltage_x")), "'voltage_y' is of no valve"),
-        (lambda c, u: c["voltage_x"].__setitem__(3, np.nan), "'nan' is not a finite number"),
+        (lambda c, u: c["voltage_x"].__setitem__(3, np.nan), "'' is not a finite number"),
         (lambda c, u: c["pressure_x_a"].__setitem__(0, -3.0), "count from a vacuum: to gauge"),
         (lambda c, u: c["pressure_x_b"].__setitem__(5, -3.0), "is -300000 Pa at sample 5, but"),
         (lambda c, u: c.update(pressure_tank=c["x"] - 1e3), "'pressure_tank' has no unit"),
