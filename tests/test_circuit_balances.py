@@ -30,7 +30,12 @@ def test_oil_and_energy_balance(whole):
 
 
 @pytest.mark.parametrize(
-    ("method", "backend"), [("Radau", "compiled"), ("DOP853", "compiled"), ("LSODA", "pinocchio")]
+    ("method", "backend"),
+    [
+        pytest.param("Radau", "compiled", marks=pytest.mark.slow),
+        ("DOP853", "compiled"),
+        pytest.param("LSODA", "pinocchio", marks=pytest.mark.slow),
+    ],
 )
 def test_methods_agree_on_two_pumps_and_an_accumulator(tmp_path, method, backend):
     pump = {"control": "load-sensing", "pressure": 2e7, "flow": 6e-4, "margin": 2e6}

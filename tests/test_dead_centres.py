@@ -119,6 +119,7 @@ def test_parallelograms_stay_such_in_line(tmp_path, count, active):
     assert singular.imbalance(found) < 1e-9
 
 
+@pytest.mark.slow
 def test_a_rocker_that_turns_back_everywhere(tmp_path):
     """Each of its joints has dead centres; the motion is the same by all of them."""
     runs = [

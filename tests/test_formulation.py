@@ -110,6 +110,7 @@ def moved(machine, q_a, v_a, a_a):
     return gamma, q, v, gamma @ a_a + machine.closure.drift(q, v)
 
 
+@pytest.mark.slow
 def test_both_paths_agree(mini):
     q_a, v_a, x = draw(mini, 30, seed=5)
     fast, slow = (

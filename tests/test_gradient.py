@@ -126,6 +126,7 @@ def both(machine, controller, initial, duration, by, outputs, accuracy):
     return back, parts.sum(1), np.abs(parts).max(axis=1), len(track.switches)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("made", [forwarder, hydraulic])
 @pytest.mark.parametrize("parted", [False, True])
 def test_it_is_the_transpose_of_sensitivities(made, parted, monkeypatch):
@@ -176,6 +177,7 @@ def test_differences_of_order_8_agree():
         assert found.of(name) == pytest.approx(true, rel=1e-7, abs=noise), name
 
 
+@pytest.mark.slow
 def test_all_numbers_that_matter_are_found():
     machine, controller, initial, _, _, _ = forwarder()
     found = crane.gradient(machine, controller, initial, 0.1, of=last(), outputs=("X1_force",))

@@ -304,6 +304,7 @@ def test_machine_code_and_pinocchio_agree_along_a_motion(smoothing):
     assert rested > 0 or smoothing
 
 
+@pytest.mark.slow
 def test_backends_agree_over_a_motion(tmp_path):
     """Two loads that share a pump, by rosenbrock in machine code and scipy's BDF on Pinocchio."""
     machine = rig(tmp_path, ORIFICE | {"dead_band": 0.05}, joints=("x", "y"),
