@@ -246,3 +246,22 @@ def test_the_command_writes_machine_table_and_picture(four_bar, tmp_path):
     assert (out / "design.png").stat().st_size > 5000
     rows = (out / "solutions.csv").read_text().splitlines()
     assert len([x for x in rows if not x.startswith("#")]) == 3
+
+
+def test_loads_before_and_after_are_drawn(tmp_path):
+    run = typed(
+        "design", "excavator", "--vary", "boom_lift.y=0.64~0.68", "--maximise", "load(4, 0, 0)",
+        "--frame", "bucket", "--starts", "1", "--processes", "1", "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    for name in ("before.png", "after.png"):
+        assert (tmp_path / "out" / name).read_bytes()[:4] == b"\x89PNG"
+
+
+def test_slopes_of_a_chart_are_written(tmp_path):
+    chart = crane.capacity(crane.load("excavator"), "bucket", radii=[5.0, 6.0], heights=[1.0])
+    chart.slopes_to_csv(tmp_path / "slopes.csv", ["arm.mass"])
+    lines = [x for x in (tmp_path / "slopes.csv").read_text().splitlines() if x[0] != "#"]
+    assert lines[0].endswith("load [kg],load_by_arm.mass [kg/SI]") and len(lines) == 5
+    wanted = chart.slopes(["arm.mass"])[0, 0, :, 0]
+    assert [float(x.split(",")[-1]) for x in lines[1:3]] == pytest.approx(wanted)

@@ -70,6 +70,12 @@ def capacity(
             help="Tell the lifting torque, gross and of the load at this radius, and the slewing.",
         ),
     ] = None,
+    by: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME", help="Write how each load changes with this number; may be repeated."
+        ),
+    ] = None,
     change: Change = None,
     lock: Lock = None,
     active: Active = None,
@@ -100,7 +106,7 @@ def capacity(
         if torque is not None:
             found = torques(loaded, frame, radius=torque, rule=shares, friction=friction)
     with status("drawing"):
-        text = write_capacity(out, chart, found, force)
+        text = write_capacity(out, chart, found, by or (), force)
     print(f"{text}\nwritten to {out}")
 
 

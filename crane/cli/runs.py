@@ -164,9 +164,12 @@ def write_design(folder: Path, found: "Design", force: bool = True) -> None:
         OutputError: The folder or a file cannot be written.
     """
     from crane.formats import write_machine
+    from crane.view.plots.capacity import plot_capacity
     from crane.view.plots.design import plot_design
 
-    with staging(folder, force) as part:
+    with staging(folder, force, ("before.png", "after.png")) as part:
+        for name, chart in zip(("before", "after"), found.charts() or (), strict=False):
+            plot_capacity(chart, part / f"{name}.png")
         (part / "design.md").write_text(found.to_markdown(), encoding="utf-8")
         found.to_csv(part / "solutions.csv")
         plot_design(found, part / "design.png")
@@ -251,11 +254,16 @@ def write_working_range(folder: Path, found: "WorkingRange", force: bool = True)
 
 
 def write_capacity(
-    folder: Path, chart: "Capacity", torques: "Torques | None" = None, force: bool = True
+    folder: Path,
+    chart: "Capacity",
+    torques: "Torques | None" = None,
+    by: "Sequence[str]" = (),
+    force: bool = True,
 ) -> str:
     """Write tables, pictures and page of rated loads into a folder, created where there is none.
 
-    What lifting and slewing torques say stands behind the table, if they are given.
+    What lifting and slewing torques say stands behind the table, if they are given; how the loads
+    change with numbers of the machine in a file of its own.
 
     Returns:
         The table with what it holds for, Markdown.
@@ -268,10 +276,12 @@ def write_capacity(
     from crane.view.plots.capacity_sheet import plot_sheet
 
     text = chart.to_markdown() + (torques.to_markdown() if torques is not None else "")
-    with staging(folder, force) as part:
+    with staging(folder, force, ("slopes.csv",)) as part:
         chart.to_csv(part / "capacity.csv")
         (part / "capacity.md").write_text(text, encoding="utf-8")
         plot_capacity(chart, part / "capacity.png")
+        if by:
+            chart.slopes_to_csv(part / "slopes.csv", by)
         plot_sheet(chart, part / "sheet.pdf")
         write_capacity_page(chart, part / "capacity.html")
     return text

@@ -114,6 +114,24 @@ class Field(Brief):
         notes |= {f"cause {k}": str(cause) for k, cause in enumerate(self.causes)}
         write(path, Table(units, rows, notes))
 
+    def slopes_to_csv(self, path: str | Path, names: Sequence[str]) -> None:
+        """Write a row per place: slew, place, value, its derivatives by numbers; empty for none.
+
+        Raises:
+            InputError: See `slopes`.
+            OutputError: The file cannot be written.
+        """
+        name, unit = self.quantity
+        units = {"slew": "rad", "radius": "m", "height": "m", name: unit}
+        units |= {f"{name}_by_{number}": f"{unit}/SI" for number in names}
+        s, b, a = np.nonzero(np.isfinite(self.values))
+        rows = np.column_stack(
+            [self.slews[s], self.radii[a], self.heights[b], self.values[s, b, a],
+             self.slopes(names)[s, b, a]]
+        )  # fmt: skip
+        notes = {"machine": self.machine.call, "frame": self.frame, **self.notes()}
+        write(path, Table(units, rows, notes))
+
     def notes(self) -> dict[str, str]:
         """What else a file of it says above its table."""
         return {}

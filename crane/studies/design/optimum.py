@@ -15,6 +15,7 @@ from crane.common.samples import Array, Brief, as_count, as_seed
 from crane.formats import load
 from crane.formats.loading import Variants
 from crane.machine import Machine
+from crane.ratings import Capacity, capacity
 from crane.ratings.rules import rule_of
 from crane.studies.computing import computed
 from crane.studies.design.dual import Dual
@@ -133,6 +134,16 @@ class Design:
     def variant(self, k: int = 0) -> Machine:
         """The machine of a solution."""
         return Variants(self.machine).machine(self.changes(k))
+
+    def charts(self, k: int = 0) -> tuple[Capacity, Capacity] | None:
+        """Lifting capacity before and with a solution; None where no load is asked for."""
+        if not any("load(" in text for text in (*self.goals, *self.requires)):
+            return None
+        before, after = (
+            capacity(machine, self.terms.frame, rule=self.terms.rule)
+            for machine in (self.machine, self.variant(k))
+        )
+        return before, after
 
     def to_markdown(self) -> str:
         """Numbers and goals before and after, starts or front, ends that were reached."""
