@@ -6,9 +6,11 @@ from free_bodies import balance, moment, places
 from scipy.optimize import root
 
 import crane
+from crane.dynamics.statics import Statics
 from crane.formats.loading import Variants
 from crane.ratings.cones import largest
 from crane.ratings.moments import torques
+from crane.ratings.places import Places
 
 G = np.array([0.0, 0.0, -9.81])
 PUMP = 3.5e7  # of the excavator [Pa]
@@ -287,3 +289,65 @@ def test_the_rule_for_timber_cranes_leans_the_ground(excavator):
     )
     assert by_rule.loads[0, 0, 0] == by_hand.loads[0, 0, 0]
     assert by_rule.causes[by_rule.cause[0, 0, 0]].why == "tips"
+
+
+def test_what_moves_straight_up_ends_on_a_slope_too(tmp_path):
+    """A mast: its lift holds effort / (g cos slope) less what it carries, whatever rounds."""
+    inertia = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    joint = (
+        '<joint name="{}" type="prismatic"><parent link="{}"/><child link="{}"/>'
+        '<axis xyz="{}"/><limit lower="0" upper="2" effort="{}" velocity="1"/></joint>'
+    )
+    (tmp_path / "mast.urdf").write_text(
+        '<robot name="mast"><link name="ground"/>'
+        + "".join(
+            f'<link name="{name}"><inertial><mass value="{mass}"/>{inertia}</inertial></link>'
+            for name, mass in (("car", 37.0), ("fork", 11.0))
+        )
+        + joint.format("lift", "ground", "car", "0 0 1", 3333.3)
+        + joint.format("out", "car", "fork", "1 0 0", 1e6)
+        + "</robot>"
+    )
+    machine = crane.load(tmp_path / "mast.urdf")
+    for slope in np.linspace(0.01, 0.4, 40):
+        chart = crane.capacity(machine, "fork", radii=[1.0], heights=[0.5], slope=slope)
+        wanted = 3333.3 / (9.81 * np.cos(slope)) - 48.0
+        assert chart.loads.item() == pytest.approx(wanted, rel=1e-9), slope
+
+
+@pytest.mark.parametrize(
+    "given",
+    [{"radii": ["a"]}, {"slews": ["x"]}, {"rule": None}, {"radii": [[1, 2], [3]]}],
+)
+def test_odd_arguments_are_said_in_one_line(excavator, given):
+    with pytest.raises(crane.CraneError):
+        crane.capacity(excavator, "bucket", **given)
+
+
+@pytest.mark.parametrize("share", [-1.0, 0.0, 1.5, np.nan])
+def test_rules_have_shares(share):
+    with pytest.raises(crane.CraneError, match="the tipping share of rule 'own'"):
+        crane.Rule("own", "", tipping=share)
+
+
+def test_a_column_behind_the_axis_has_a_table():
+    chart = crane.capacity(crane.load("patu655"), radii=[-0.7], heights=[-0.4])
+    assert np.isfinite(chart.loads).all() and "-0.4" in chart.to_markdown()
+
+
+def test_places_at_folds_are_found():
+    """Of a robot whose elbow goes through straight: each posture is among those of its place."""
+    machine = crane.load("kr300", lock={"q4": 0.0, "q5": 0.0, "q6": 0.0})
+    places_ = Places(Statics(machine))
+    random, closure = np.random.default_rng(0), machine.closure
+    drawn = np.tile(closure.home[closure.active], (300, 1))
+    for i in places_.pair:
+        drawn[:, i] = random.uniform(places_.low[i], places_.high[i], 300)
+    q = closure.solve(drawn)
+    where = places_.section.coordinates(places_.statics.at(q).tip)
+    lost = 0
+    for k in range(300):
+        found = places_.all((where[k, :1], where[k, 1:]))
+        gaps = np.abs(found.q[:, closure.active] - drawn[k]).max(axis=1)
+        lost += not len(gaps) or gaps.min() > 1e-6
+    assert lost <= 3

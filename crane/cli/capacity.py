@@ -104,7 +104,10 @@ def capacity(
         )  # fmt: skip
         found = None
         if torque is not None:
-            found = torques(loaded, frame, radius=torque, rule=shares, friction=friction)
+            found = torques(
+                loaded, frame, radius=torque, rule=shares, raising=raising or None, slews=slews,
+                slope=lean, friction=friction,
+            )  # fmt: skip
     with status("drawing"):
         text = write_capacity(out, chart, found, by or (), force)
     print(f"{text}\nwritten to {out}")

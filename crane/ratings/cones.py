@@ -12,12 +12,13 @@ def largest(a: Array, b: Array, c: Array | None = None, d: Array | None = None) 
 
         (b^2 - |d|^2) x^2 + 2 (a b - c.d) x + a^2 - |c|^2 = 0
 
-    at which a + b x is not above 0. Its two solutions are taken in the form that does not cancel.
+    at which a + b x is not above 0. Its two solutions and its discriminant,
+    |a d - b c|^2 - |c x d|^2, are taken in forms that do not cancel.
 
     Args:
         a: Below 0 where there is room [.], any shape.
         b: The same shape.
-        c: That shape and one more axis; nothing if not given.
+        c: That shape and one more axis (3,); nothing if not given.
         d: Likewise.
 
     Returns:
@@ -30,8 +31,10 @@ def largest(a: Array, b: Array, c: Array | None = None, d: Array | None = None) 
     square = b * b - (d * d).sum(axis=-1)
     half = a * b - (c * d).sum(axis=-1)
     rest = a * a - (c * c).sum(axis=-1)
-    root = np.sqrt(np.maximum(half * half - square * rest, 0.0))
-    real = half * half >= square * rest
+    # its discriminant in the form that does not cancel, by Lagrange's identity
+    mixed = a[..., None] * d - b[..., None] * c
+    disc = (mixed * mixed).sum(axis=-1) - (np.cross(c, d) ** 2).sum(axis=-1)
+    root, real = np.sqrt(np.maximum(disc, 0.0)), disc >= 0
     larger = -(half + np.copysign(root, half))
     with np.errstate(divide="ignore", invalid="ignore"):
         roots = np.stack([rest / larger, larger / square])

@@ -198,9 +198,12 @@ def _starts(
     low, high = places.low, places.high
     own = np.linspace(low[i], high[i], _OWN)
     found, near = [], []
-    for k in strokes:
-        if k == i:
-            continue
+    others = [k for k in strokes if k != i]
+    if not others:  # the one stroke, along a line
+        patch = fill(places.machine, base, (i, i), (own, base[[i]]))
+        if patch is not None:
+            found = near = [patch.q[patch.closed]]
+    for k in others:
         here = np.r_[base[k], np.linspace(low[k], high[k], _OTHER)]
         order = np.argsort(here)
         patch = fill(places.machine, base, (i, k), (own, here[order]))

@@ -16,6 +16,7 @@ from crane.motion.workspaces.section import slewing
 from crane.ratings.seeking import Measured, Seeker, difference
 
 _BELOW = 1e-6  # [m] that is no depth
+_TRIED = 13  # radii between which a level bottom is sought to begin
 _ALONG = 9  # places of a wall or a bottom at which it is looked whether the lip gets there
 _SAME = 1e-9  # [m]
 _DIGITS = 12  # behind the point: what is below is rounding
@@ -128,10 +129,12 @@ class Dimensions:
             one, two = self._bottom(radius), self._bottom(radius + level)
             return np.nan if one is None or two is None else one[0] - two[0]
 
-        ends = steeper(low), steeper(high)
-        if not (ends[0] <= 0 <= ends[1]):
+        tried = np.linspace(low, high, _TRIED)
+        ends = [steeper(x) for x in tried.tolist()]
+        turn = next((k for k in range(_TRIED - 1) if ends[k] <= 0 <= ends[k + 1]), None)
+        if turn is None:
             return None
-        radius = float(brentq(steeper, low, high, xtol=_SAME))
+        radius = float(brentq(steeper, tried[turn], tried[turn + 1], xtol=_SAME))
         found = self._bottom(radius)
         between = np.linspace(radius, radius + level, _ALONG)[1:-1]
         lower = [self._bottom(x) for x in between.tolist()]

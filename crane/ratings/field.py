@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crane.common.errors import InputError
-from crane.common.samples import Array, Brief, as_number
+from crane.common.samples import Array, Brief, as_number, as_sample
 from crane.dynamics.statics import AtRest, Statics
 from crane.machine import Machine
 from crane.motion.workspaces.section import Section
@@ -254,7 +254,7 @@ def _axes(
         if given is None:
             out.append(step * np.arange(np.floor(one / step), np.ceil(two / step) + 1))
             continue
-        values = np.array(given, dtype=float).ravel()
+        values = as_sample(given, len(given), name)
         if not len(values) or not np.isfinite(values).all() or (np.diff(values) <= 0).any():
             raise InputError(f"{name} must be numbers that rise [m]")
         out.append(values)
@@ -271,7 +271,7 @@ def _slews(machine: Machine, places: Places, slews: Sequence[float] | None, tips
         return np.array([home, quarter] if fits else [home])
     if slew is None:
         raise InputError(f"nothing slews '{machine.name}', leave slews out")
-    turns = np.array(slews, dtype=float).ravel()
+    turns = as_sample(slews, len(slews), "slews")
     if not len(turns) or not np.isfinite(turns).all():
         raise InputError("slews must be angles [rad]")
     for turn in turns:

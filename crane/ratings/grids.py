@@ -16,7 +16,7 @@ def within(
     """Points of a grid within a patch, and postures close to them.
 
     A cell is two triangles, between whose corners postures are interpolated. Those of cells at the
-    border reach beyond it, where the patch ends in a curve.
+    border, and at folds, reach beyond it, where the patch ends or turns back in a curve.
 
     Args:
         patch: The patch.
@@ -31,12 +31,23 @@ def within(
     full = np.stack([patch.closed[x] for x in around]).all(axis=0)
     padded = np.pad(full, 1)
     inner = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
+    inner &= _alike(nodes)
     corners = np.stack([nodes[x] for x in around], axis=2)[full]
     postures = np.stack([patch.q[x] for x in around], axis=2)[full]
     beyond = np.where(inner[full], _TOUCHES, _BEYOND)
     three = [[0, 1, 2], [0, 2, 3]]
     corners, postures = (x[:, three].reshape(-1, 3, x.shape[-1]) for x in (corners, postures))
     return _within(corners, postures, np.repeat(beyond, 2), axes)
+
+
+def _alike(nodes: Array) -> NDArray[np.bool_]:
+    """Which cells (a - 1, b - 1) are turned the same way as those beside them: not at a fold."""
+    along, across = nodes[1:] - nodes[:-1], nodes[:, 1:] - nodes[:, :-1]
+    one, two = along[:, :-1], across[:-1]
+    turned = np.sign(one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0])
+    far = np.pad(turned, 1, mode="edge")
+    beside = (far[:-2, 1:-1], far[2:, 1:-1], far[1:-1, :-2], far[1:-1, 2:])
+    return np.all([turned == x for x in beside], axis=0)
 
 
 def _within(

@@ -127,7 +127,7 @@ def capacity(
             ground that leans, or a frame that two to four strokes do not move in a plane through
             the slewing axis.
     """
-    rule = rule_of(rule) if isinstance(rule, str) else rule
+    rule = rule_of(rule)
     slope = max(abs(as_number(slope, "the slope", "rad", most=_STEEPEST)), rule.slope)
     places = places_of(machine, frame)
     if raising is None:

@@ -1,6 +1,7 @@
 """Lifting and slewing torque, as makers of loader and forestry cranes print them."""
 
-from typing import NamedTuple
+from collections.abc import Collection, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -13,7 +14,7 @@ from crane.motion.workspaces.section import slewing
 from crane.ratings.lifting import capacity, raiser
 from crane.ratings.pivots import pivot
 from crane.ratings.places import Places
-from crane.ratings.rules import Rule, rule_of
+from crane.ratings.rules import Rule
 from crane.ratings.strength import strengths
 
 _STEPS = 200  # of the stroke, between which the largest lever is sought
@@ -66,6 +67,9 @@ def torques(
     *,
     radius: float = 4.0,
     rule: str | Rule = "none",
+    raising: Collection[str] | None = None,
+    slews: Sequence[float] | None = None,
+    slope: float = 0.0,
     friction: bool = False,
 ) -> Torques:
     """Gross and net lifting torque, and slewing torque.
@@ -79,6 +83,9 @@ def torques(
         frame: Where the load hangs; the tip if not given.
         radius: Of the net torque [m].
         rule: By which the load is rated, see `capacity`.
+        raising: Joints whose drives raise the load, see `capacity`.
+        slews: Angles of the slewing joint [rad], likewise.
+        slope: Of the ground [rad], likewise.
         friction: Whether drives overcome friction.
 
     Raises:
@@ -88,7 +95,10 @@ def torques(
     statics = Statics(machine, frame)
     places = Places(statics)
     joint = raiser(places)
-    found = {x.joint: x for x in strengths(machine, machine.driven_joints, friction)}
+    every = machine.driven_joints
+    found = {
+        x.joint: x for x in strengths(machine, every if raising is None else raising, friction)
+    }
     if joint not in found:
         raise InputError(f"nothing limits '{joint}', give it a cylinder, or an effort in <limit>")
     i = machine.active.index(joint)
@@ -117,16 +127,22 @@ def torques(
     if slew is not None and machine.active[slew[0]] in found:
         drive = found[machine.active[slew[0]]]
         turns = min(drive.most, -drive.least)
-    load, height = _at(machine, statics.frame, radius, rule, friction, places.reach)
+    given = {
+        "rule": rule,
+        "raising": raising,
+        "slews": slews,
+        "slope": slope,
+        "friction": friction,
+    }
+    load, height = _at(machine, statics.frame, radius, given, places.reach)
     weight = float(np.linalg.norm(machine.model.gravity.linear))
     return Torques(joint, pin, gross, stroke, radius, load, height, load * weight * radius, turns)
 
 
 def _at(
-    machine: Machine, frame: str, radius: float, rule: str | Rule, friction: bool, reach: Array
+    machine: Machine, frame: str, radius: float, given: dict[str, Any], reach: Array
 ) -> tuple[float, float]:
     """The largest load at a radius, and the height where it hangs."""
-    rule = rule_of(rule) if isinstance(rule, str) else rule
     low, high = reach.min(axis=0), reach.max(axis=0)
     if not low[0] <= radius <= high[0]:
         raise InputError(
@@ -134,8 +150,7 @@ def _at(
         )
     heights = np.linspace(low[1], high[1], 61)
     for _ in range(3):  # finer and finer about the best
-        chart = capacity(machine, frame, rule=rule, friction=friction, slews=None,
-                         radii=[radius], heights=heights.tolist())  # fmt: skip
+        chart = capacity(machine, frame, radii=[radius], heights=heights.tolist(), **given)
         least = np.nanmin(np.where(np.isnan(chart.loads), np.inf, chart.loads), axis=0)[:, 0]
         loads = np.where(np.isfinite(least), least, -np.inf)
         best = int(loads.argmax())

@@ -113,8 +113,9 @@ def working_range(
             "drawn in one: name another frame"
         )
     joint = pin = None
+    places = places_of(machine, frame)
     try:
-        i = digging(places_of(machine, frame), bucket)[0]
+        i = digging(places, bucket)[0]
         joint, pin = machine.active[i], pivot(machine, space.frame, i)
     except InputError:
         if bucket is not None:

@@ -5,6 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.errors import InputError, known
+from crane.common.samples import as_number
+
+_STEEPEST = np.deg2rad(45.0)  # of the ground
 
 
 @dataclass(frozen=True)
@@ -30,11 +33,17 @@ class Rule:
     raises: bool = False
     slope: float = 0.0
 
+    def __post_init__(self) -> None:
+        for name in ("hydraulic", "tipping", "structural"):
+            as_number(getattr(self, name), f"the {name} share of rule '{self.name}'", "",
+                      above=0.0, most=1.0)  # fmt: skip
+        as_number(self.slope, f"the slope of rule '{self.name}'", "rad", most=_STEEPEST)
+
 
 RULES = {
     rule.name: rule
     for rule in (
-        Rule("none", "what is possible: all drives work at their pump's pressure, no reserve"),
+        Rule("none", "what is possible, without a reserve"),
         Rule(
             "iso10567",
             "ISO 10567 (excavators), as makers' manuals give it: the less of 87 % of what the "
@@ -63,12 +72,14 @@ RULES = {
 }  # fmt: skip
 
 
-def rule_of(name: str) -> Rule:
-    """A rule by its name.
+def rule_of(name: str | Rule) -> Rule:
+    """A rule by its name, or as it is.
 
     Raises:
         InputError: There is none.
     """
-    if name not in RULES:
-        raise InputError(f"rule '{name}' is unknown, {known(RULES, name)}")
+    if isinstance(name, Rule):
+        return name
+    if not isinstance(name, str) or name not in RULES:
+        raise InputError(f"rule '{name}' is unknown, {known(RULES, str(name))}")
     return RULES[name]

@@ -66,7 +66,7 @@ def strengths(
             most = both[0] * cylinder.area_a - tank * cylinder.area_b
             least = tank * cylinder.area_a - both[1] * cylinder.area_b
             seals = cylinder.seal_friction
-            grip = seals * (np.array(both) + tank)
+            grip = seals * (np.array(both) - tank)
             why = RAISES if works else HOLDS
         else:
             effort = float(machine.model.effortLimit[machine.column(joint)])

@@ -71,11 +71,13 @@ class LoadTable(NamedTuple):
 def load_table(chart: "Capacity") -> LoadTable:
     """The table of a chart: places at round steps, and the largest radius at each height.
 
-    Of a machine that slews, radii before the axis only.
+    Of a machine that slews, radii before the axis only, if there are any.
     """
     columns = max(_COLUMNS // len(chart.slews), 4)
     forward = chart.radii > 0 if chart.section.slew is not None else np.isfinite(chart.radii)
-    reached = ~np.isnan(chart.loads).all(axis=0) & forward
+    reached: NDArray[np.bool_] = np.any(~np.isnan(chart.loads), axis=0)
+    if np.any(reached & forward):
+        reached = reached & forward
     across, up = np.flatnonzero(reached.any(axis=0)), np.flatnonzero(reached.any(axis=1))
     step = _step(chart.radii[across], chart.heights[up], columns)
     a = across[_spread(chart.radii[across], step, columns)]

@@ -75,7 +75,13 @@ class ToolForce(Field):
         angles = slewed(self.machine, self.frame, self.section, self.slews[s])
         at = Statics(self.machine, self.frame).at(self.machine.closure.solve(self.q_a[s, b, a]))
         unit = -turned(self.action.unit(at, angles), upwards(self.machine), -angles)
-        out[s, b, a] = np.column_stack([unit @ self.section.first, unit @ self.section.second])
+        first = np.broadcast_to(self.section.first, unit.shape)
+        if self.section.around:  # outwards from the axis, wherever the frame is
+            first = at.tip - self.section.origin
+            first = first - (first @ self.section.second)[:, None] * self.section.second
+            first = turned(first, upwards(self.machine), -angles)
+            first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
+        out[s, b, a] = np.column_stack([(unit * first).sum(axis=1), unit @ self.section.second])
         return out
 
 

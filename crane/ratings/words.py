@@ -21,7 +21,9 @@ ASTERISK = "* ended by drives, all others by tipping"
 def facts(chart: "Capacity") -> list[tuple[str, str]]:
     """What the loads hold for: names, and what is said of each."""
     others = [joint for joint in chart.machine.driven_joints if joint not in chart.raising]
-    raised = ", ".join(chart.raising) + (f" ({', '.join(others)} held)" if others else "")
+    raised = (", ".join(chart.raising) or "nothing") + (
+        f" ({', '.join(others)} held)" if others else ""
+    )
     rows = [
         ("load", f"at '{chart.frame}', in kg; what is there already is no part of it"),
         ("rule", chart.rule.says),
