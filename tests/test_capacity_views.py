@@ -207,7 +207,7 @@ def test_the_command_writes_tables_pictures_and_page(tmp_path):
         (["--hydraulic", "0"], "--hydraulic is 0.0, give a number above 0"),
         (["--slew", "front"], "--slew is 'front', write degrees, as 0,45,90"),
         (["--slew", "0,1,2,3,4,5,6,7,8"], "--slew has 9 angles, a page has room for 8"),
-        (["--slew", "0,nan"], "slews must be angles"),
+        (["--slew", "0,nan"], "slews is nan"),
         (["--slope", "60"], "--slope is 60.0 degrees, give a number from -45 to 45"),
         (["--step", "0"], "the step is 0.0 m"),
         (["--raising", "X_bom"], "did you mean 'X_boom'"),
