@@ -265,3 +265,69 @@ def test_slopes_of_a_chart_are_written(tmp_path):
     assert lines[0].endswith("load [kg],load_by_arm.mass [kg/SI]") and len(lines) == 5
     wanted = chart.slopes(["arm.mass"])[0, 0, :, 0]
     assert [float(x.split(",")[-1]) for x in lines[1:3]] == pytest.approx(wanted)
+
+
+def test_a_wall_does_not_take_what_was_found(tmp_path):
+    """A measure that cannot be had on one side: the best of the other side stays."""
+
+    def wall(machine):
+        x, y = (machine.tree.links[name].inertial.mass for name in ("link7", "link3"))
+        if x + y < 0.8:
+            raise ValueError("wall")
+        return x + y * y
+
+    vary = {"link7.mass": (0.05, 1.0), "link3.mass": (0.05, 1.0)}
+    found = crane.design(
+        "mini_forwarder", vary, minimise=["wall"], measures={"wall": wall}, starts=4
+    )
+    assert all(np.isfinite(x.goals).all() and x.fits for x in found.solutions)
+    assert found.solutions[0].goals[0] == pytest.approx(0.55, abs=0.08)  # x = 0.3, y = 0.5
+    assert len({x.start.tobytes() for x in found.solutions}) == 4
+
+
+def test_measures_that_are_no_number_do_not_fit():
+    def odd(machine):
+        mass = machine.tree.links["link7"].inertial.mass
+        return np.nan if mass > 0.5 else mass
+
+    vary = {"link7.mass": (0.05, 1.0)}
+    found = crane.design("mini_forwarder", vary, maximise=["odd"], measures={"odd": odd}, starts=3)
+    assert 0.2 < found.solutions[0].goals[0] <= 0.5
+
+
+def test_a_machine_that_is_not_its_files_is_refused():
+    machine = crane.load("mini_forwarder", active=["q1", "q2", "q3"])
+    with pytest.raises(crane.CraneError, match="is not what its files describe"):
+        crane.design(machine, {"link7.mass": (0.1, 0.2)}, minimise=["mass"])
+    loaded = crane.load("excavator", changes={"arm.mass": 700.0})
+    found = crane.study(loaded, {"bucket_lip.x": [1.3, 1.4]}, [], ["mass"])
+    assert found.columns["mass"] == pytest.approx(sum(x.mass for x in loaded.model.inertias))
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("load", r"'load' is a function, write load\(...\)"),
+        ("'abc'", "no number"),
+        ("degrees('a')", "takes numbers, not 'a'"),
+        ("sqrt(1, 2)", "takes one argument"),
+        ("(mass - 1e6)**0.5", "no value|no finite number"),
+        ("mass) + (reach", "is no expression"),
+        ("1" + "+1" * 3000, "characters"),
+        ("+".join(["1"] * 999), "is no expression|no value"),
+    ],
+)
+def test_expressions_end_in_one_line(text, told):
+    with pytest.raises(crane.CraneError, match=told) as error:
+        crane.design("mini_forwarder", {"link7.mass": (0.1, 0.2)}, maximise=[text], starts=1)
+    assert "\n" not in str(error.value)
+
+
+def test_own_measures_have_names_of_their_own_and_stay_here_if_they_must():
+    vary, own = {"link7.mass": (0.1, 0.2)}, {"mass": lambda machine: 1.0}
+    with pytest.raises(crane.CraneError, match="a measure 'mass' is there already"):
+        crane.design("mini_forwarder", vary, minimise=["mass"], measures=own)
+    with pytest.raises(crane.CraneError, match="stay in one process"):
+        crane.design(
+            "mini_forwarder", vary, minimise=["mine"], measures={"mine": own["mass"]}, processes=2
+        )

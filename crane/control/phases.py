@@ -173,7 +173,8 @@ class Phases(Command, threading.local):
     def references(self, times: Array) -> Array:
         """See `Command`: signals, and the clock."""
         first = max(bisect_right(self._looks, float(times.min())) - 1, 0)
-        looks, rows = self._looks[first:], np.array(self._rows[first:])
+        last = bisect_right(self._looks, float(times.max())) + 1
+        looks, rows = self._looks[first:last], np.array(self._rows[first:last])
         return np.column_stack([np.interp(times, looks, column) for column in rows.T])
 
     def signals(self, at: At) -> Sequence[Number]:

@@ -2,17 +2,68 @@
 
 import multiprocessing
 import os
+import pickle
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
+from pathlib import Path
 from typing import TypeVar
 
 from crane.common.errors import InputError
+from crane.common.samples import as_count
+from crane.formats import load
+from crane.machine import Machine
 from crane.studies.cluster import by_workers
+
+_PER_CORE = 8  # processes: more would wait for each other, and each has the machine in memory
+# What of a machine its files describe.
+_DESCRIBED = (
+    "tree", "active", "free", "friction", "forces", "gas_springs", "ropes", "end_stops",
+    "hydraulics",
+)  # fmt: skip
 
 J = TypeVar("J")
 R = TypeVar("R")
+
+
+def described(machine: Machine | str | Path) -> tuple[Machine, str]:
+    """The machine as its files and the changes given to `load` describe it, and what loads it.
+
+    Raises:
+        InputError: It is another one: variants are loaded from files.
+    """
+    if not isinstance(machine, Machine):
+        found = load(machine)
+        known_as = found.reference == str(machine)
+        return found, found.reference if known_as else str(found.path.resolve())
+    again = load(machine.path, machine.changes, machine.locks)
+    same = all(getattr(machine, name) == getattr(again, name) for name in _DESCRIBED)
+    if not same or _tasks(machine) != _tasks(again):
+        raise InputError(
+            f"'{machine.name}' is not what its files describe, variants are loaded from them: "
+            "write it with write_machine, and load that"
+        )
+    bundled = machine.reference != str(machine.path)
+    return again, machine.reference if bundled else str(machine.path.resolve())
+
+
+def _tasks(machine: Machine) -> dict[str, tuple[object, int]]:
+    """Its tasks but for their loads, which are counted."""
+    return {
+        name: (replace(task, loads=()), len(task.loads)) for name, task in machine.tasks.items()
+    }
+
+
+def processes_of(count: int) -> int:
+    """How many processes compute, at most eight per core.
+
+    Raises:
+        InputError: It is no such number.
+    """
+    most = _PER_CORE * (os.cpu_count() or 1)
+    return as_count(count, "the number of processes", 1, most)
 
 
 def computed(
@@ -51,6 +102,13 @@ def _by_processes(
     function: Callable[[J], R], jobs: Sequence[J], processes: int
 ) -> Iterator[tuple[int, R]]:
     # threads would wait for each other: most of a variant is computed in Python
+    try:
+        pickle.dumps(jobs[0])
+    except (AttributeError, TypeError, pickle.PicklingError) as error:
+        raise InputError(
+            "measures that are lambdas or local functions stay in one process: give a Python "
+            f"file, functions of a module, or processes=1 ({error})"
+        ) from None
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(processes, context, initializer=_end_with_parent)
     try:

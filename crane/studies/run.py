@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -19,10 +18,10 @@ from crane.formats import load, read
 from crane.formats.loading import Variants
 from crane.machine import Machine
 from crane.ratings.rules import rule_of
-from crane.studies.computing import computed
+from crane.studies.computing import computed, described, processes_of
 from crane.studies.design.expressions import Expression, requirement
-from crane.studies.design.own import Measure, own_measures
-from crane.studies.design.quantities import PLAIN, Point, Terms, places_in
+from crane.studies.design.own import Measure, kept, own_measures
+from crane.studies.design.quantities import PLAIN, Point, Terms, places_in, refuse_taken
 from crane.studies.measures import (
     notes,
     of_strokes,
@@ -35,15 +34,8 @@ from crane.studies.table import Study
 
 _MOST = 100_000  # variants
 _SLACK = 1e-9  # by which a requirement may fail
-_PER_CORE = 8  # processes: more would wait for each other, and each has the machine in memory
 # Parameters that inverse dynamics does not know, by their first word.
 _IDLE = ("control", "supply", "oil", "cylinder", "valve", "valve_control")
-# What of a machine its files describe.
-_DESCRIBED = (
-    "tree", "active", "free", "friction", "forces", "gas_springs", "ropes", "end_stops", "tasks",
-    "hydraulics",
-)  # fmt: skip
-
 Progress = Callable[[float], None]
 
 # One machine per set of formulas: as long as it lives, variants share its machine code.
@@ -64,6 +56,7 @@ class Job(NamedTuple):
         own: A Python file of a user's own measures, or these.
         frame: Where loads hang.
         rule: By which they are rated.
+        asked: Tasks that expressions are measured with.
     """
 
     machine: str
@@ -76,6 +69,7 @@ class Job(NamedTuple):
     own: str | Mapping[str, Measure] | None = None
     frame: str | None = None
     rule: str = "none"
+    asked: tuple[str, ...] = ()
 
 
 def study(
@@ -124,16 +118,16 @@ def study(
         InputError: Unknown names, values that do not go together, no variant can be measured, or a
             machine that was changed after it was loaded.
     """
-    as_count(processes, "the number of processes", 1, _PER_CORE * (os.cpu_count() or 1))
+    processes_of(processes)
     seed = as_seed(seed)
-    base = _base(machine)
-    name = base.reference if base.reference == str(machine) else str(base.path.resolve())
+    base, name = described(machine)
     values, grid = _variants(vary, draws, seed)
     tasks = _chosen("task", base.tasks, tasks)
     levers = any(base.tasks[task].space == "joystick" for task in tasks)
     of_tasks = task_measures(base) if tasks else {}
     available = of_tasks | stroke_measures(base)
     functions = own_measures(own)
+    refuse_taken(functions, available)
     expressions = tuple(x for x in measures or () if _composed(x, available, functions))
     for text in require:
         requirement(text)
@@ -148,13 +142,14 @@ def study(
             name,
             {**base.changes, **dict(zip(vary, row.tolist(), strict=True))},
             dict(base.locks),
-            asked if expressions or require else tasks,
+            tasks,
             not set(chosen) <= set(of_tasks),
             expressions,
             tuple(require),
-            own if own is None or isinstance(own, Mapping) else str(own),
+            kept(own),
             frame,
             rule_of(rule).name,
+            asked,
         )
         for row in values
     ]
@@ -165,7 +160,7 @@ def study(
             progress(len(rows) / len(jobs))
     columns = dict(zip(vary, values.T, strict=True))
     measures = tuple(dict.fromkeys((*(measures or ()), *chosen)))
-    available |= dict.fromkeys(expressions, "")
+    available |= {x: PLAIN.get(x, "") for x in expressions}
     for measure in measures:
         names = [measure]
         if measure in of_tasks and len(tasks) > 1:
@@ -179,19 +174,6 @@ def study(
     return Study(
         name, tuple(vary), measures, tasks, units, columns, reasons, grid, notes(base, measures)
     )
-
-
-def _base(machine: Machine | str | Path) -> Machine:
-    """The machine that is varied, as its files and the changes given to `load` describe it."""
-    if not isinstance(machine, Machine):
-        return load(machine)
-    again = load(machine.path, machine.changes, machine.locks)
-    if any(getattr(machine, name) != getattr(again, name) for name in _DESCRIBED):
-        raise InputError(
-            f"'{machine.name}' is not what its files describe, variants are loaded from them: "
-            "write it with write_machine, and load that"
-        )
-    return again
 
 
 def variant(job: Job) -> tuple[dict[str, float], str]:
@@ -251,7 +233,7 @@ def _expressed(machine: Machine, job: Job) -> dict[str, float]:
         CraneError: One has no value, or a requirement fails.
     """
     texts = [*map(Expression, job.expressions), *(requirement(x)[0] for x in job.require)]
-    terms = Terms(job.frame, job.rule, job.tasks, own_measures(job.own))
+    terms = Terms(job.frame, job.rule, job.asked, own_measures(job.own))
     none = np.zeros(0)
     point = Point(Variants(machine), (), none, none, terms, places_in(texts))
     values = [point.value(x) for x in texts]

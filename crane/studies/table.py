@@ -11,7 +11,7 @@ from crane.common.errors import InputError, known
 from crane.common.output import replacing
 from crane.common.samples import Array
 
-_MORE_IS_BETTER = ("reach", "range", "upper_")
+_MORE_IS_BETTER = ("reach", "range", "highest")
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,8 @@ class Study:
     def order(self, measure: str) -> list[int]:
         """Variants from best to worst, without those that could not be measured.
 
-        The least is best, of reach, range and upper strokes the largest.
+        The least is best, of reach, range, highest and upper strokes the largest; of expressions
+        the least comes first.
 
         Raises:
             InputError: There is no such measure.
@@ -72,7 +73,10 @@ class Study:
             names = [name for name in self.columns if name not in self.parameters]
             raise InputError(f"measure '{measure}' is not in the study, {known(names, measure)}")
         values = self.columns[measure]
-        keys = -values if measure.startswith(_MORE_IS_BETTER) else values
+        more = measure in _MORE_IS_BETTER or (
+            measure.isidentifier() and measure.startswith("upper_")
+        )
+        keys = -values if more else values
         able = [i for i in range(len(self)) if np.isfinite(values[i])]
         return sorted(able, key=lambda i: keys[i])
 

@@ -66,9 +66,15 @@ class Expression:
             InputError: What it asks for is not a number: a root of something negative.
         """
         try:
-            return self._value(self._tree, named, called, constant)
-        except (ArithmeticError, ValueError) as error:
+            found = self._value(self._tree, named, called, constant)
+        except (ArithmeticError, ValueError, TypeError, RecursionError) as error:
+            if isinstance(error, InputError):
+                raise
             raise InputError(f"'{self.text}' has no value: {error}") from None
+        value = getattr(found, "value", found)
+        if isinstance(value, complex | str):
+            raise InputError(f"'{self.text}' has no value: it is {value!r}, no number")
+        return found
 
     def _value(self, node: ast.AST, named: Any, called: Any, constant: Any) -> Any:
         match node:

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
+from zlib import crc32
 
 import numpy as np
 from scipy.optimize import minimize
@@ -17,11 +18,12 @@ from crane.formats.loading import Variants
 from crane.machine import Machine
 from crane.ratings import Capacity, capacity
 from crane.ratings.rules import rule_of
-from crane.studies.computing import computed
+from crane.studies.computing import computed, described, processes_of
 from crane.studies.design.dual import Dual
 from crane.studies.design.expressions import Expression, requirement
-from crane.studies.design.own import Measure, own_measures
-from crane.studies.design.quantities import Point, Terms, places_in
+from crane.studies.design.own import Measure, kept, own_measures
+from crane.studies.design.quantities import Point, Terms, available, places_in, refuse_taken
+from crane.studies.measures import stroke_measures, task_measures
 
 _ACCURACY = 1e-10  # of a goal, as a share of its size
 _ITERATIONS = 200
@@ -245,7 +247,8 @@ def design(
     Raises:
         InputError: Unknown names, no goal, ranges that are none, or no solution.
     """
-    base = machine if isinstance(machine, Machine) else load(machine)
+    base, name = described(machine)
+    processes = processes_of(processes)
     starts = as_count(starts, "the number of starts", 1, 10_000)
     goals = [("minimise", x) for x in minimise] + [("maximise", x) for x in maximise]
     if not goals:
@@ -256,15 +259,17 @@ def design(
     for task in chosen:
         if task not in base.tasks:
             raise InputError(f"task '{task}' is unknown, {known(base.tasks, task)}")
-    path = measures if measures is None or isinstance(measures, Mapping) else str(measures)
+    parsed = [Expression(x) for _, x in goals]
     texts = tuple(x if way == "minimise" else f"-({x})" for way, x in goals)
     needs = [requirement(x) for x in require]
     terms = Terms(frame, told, chosen, own_measures(measures))
-    name = base.reference if base.reference == str(machine) else str(base.path.resolve())
+    known_measures = task_measures(base) | stroke_measures(base)
+    refuse_taken(terms.own, known_measures)
+    _check_names(base, [*parsed, *(x for x, _ in needs)], terms)
     blank = Job(
         name, dict(base.changes), dict(base.locks), names, low, high, texts,
         tuple(x.text for x, _ in needs), tuple(equal for _, equal in needs), frame, told, chosen,
-        path, np.zeros(len(names)),
+        kept(measures), np.zeros(len(names)),
     )  # fmt: skip
     own = np.array([Variants(base).values[x] for x in names])
     before = _judged(Searched(blank), own, own, "as it is")
@@ -281,7 +286,8 @@ def design(
     if len(texts) > 1:
         front = _front(blank, found, as_count(points, "the number of points", 2, 1000))
         more = _done(computed(searched, front, processes, scheduler), told_of, len(singles))
-        found = [Searched(blank).whole(x) for x in (*found, *more)]
+        problem = Searched(blank)
+        found = [problem.whole(x) for x in (*found, *more)]
     fitting = [x for x in found if x.fits]
     if not fitting:
         first = found[0]
@@ -326,13 +332,16 @@ class Searched:
         if self._last[0] != values.tobytes():
             job = self.job
             try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", CraneWarning)
+                with warnings.catch_warnings(), np.errstate(all="ignore"):
+                    warnings.simplefilter("ignore")  # own measures' among them
                     point = Point(
                         self._variants, job.names, values, job.high - job.low, self._terms,
                         self._places,
                     )  # fmt: skip
                     found = [point.dual(x) for x in (*self.goals, *self.requires)]
+                for text, x in zip((*self.goals, *self.requires), found, strict=True):
+                    if not (np.isfinite(x.value) and np.isfinite(x.slopes).all()):
+                        raise InputError(f"'{text.text}' is no finite number there")
                 self._kept = point  # and its machine code, for the next variant
                 self._last = values.tobytes(), found
             except CraneError as error:
@@ -350,7 +359,7 @@ class Searched:
 def searched(job: Job) -> Solution:
     """Do one search."""
     problem = Searched(job)
-    span, random = job.high - job.low, np.random.default_rng(0)
+    span, random = job.high - job.low, np.random.default_rng(crc32(job.start.tobytes()))
     start = job.start
     for _ in range(_TRIES):
         try:
@@ -371,6 +380,8 @@ def searched(job: Job) -> Solution:
              for x in first[count:]]  # fmt: skip
     worst = 1.0 + abs(first[0].value) / sizes[0]
 
+    best: list[tuple[tuple[float, float], Array]] = []  # the best of all that can be made
+
     def shares(x: Array) -> tuple[Array, Array] | None:
         """Goals, then requirements, each over its size, and their slopes by x."""
         values = np.clip(job.low + x[: len(span)] * span, job.low, job.high)
@@ -384,8 +395,11 @@ def searched(job: Job) -> Solution:
         slopes[:count] *= (weights / sizes)[:, None]
         value[count:] /= needs
         slopes[count:] /= np.array(needs).reshape(-1, 1)
-        ok = np.isfinite(value).all() and np.isfinite(slopes).all()
-        return (value, slopes) if ok else None
+        short = max(0.0, -_short(value[count:], job.equal))
+        merit = short if short > _SLACK else 0.0, float(value[:count].max() if many else value[0])
+        if not best or merit < best[0][0]:
+            best[:] = [(merit, values)]
+        return value, slopes
 
     def cost(x: Array) -> tuple[float, Array]:
         if many:  # the last variable bounds all goals
@@ -430,7 +444,19 @@ def searched(job: Job) -> Solution:
         options={"ftol": _ACCURACY, "maxiter": _ITERATIONS},
     )  # fmt: skip
     values = np.clip(job.low + ended.x[: len(span)] * span, job.low, job.high)
-    return _judged(problem, job.start, values, str(ended.message).lower())
+    says, found = str(ended.message).lower(), shares(ended.x)
+    if best and (found is None or not np.array_equal(best[0][1], values)):
+        short = max(0.0, -_short(found[0][count:], job.equal)) if found is not None else np.inf
+        if short > _SLACK and best[0][0][0] < short:
+            values = best[0][1]
+    return _judged(problem, start, values, says)
+
+
+def _short(left: Array, equal: Sequence[bool]) -> float:
+    """The least of what is left of requirements, over their sizes; 0 where there are none."""
+    if not len(left):
+        return 0.0
+    return float(np.where(np.array(equal, dtype=bool), -np.abs(left), left).min())
 
 
 def _judged(problem: Searched, start: Array, values: Array, says: str) -> Solution:
@@ -452,6 +478,21 @@ def _judged(problem: Searched, start: Array, values: Array, says: str) -> Soluti
     return Solution(start, values, np.array([x.value for x in found[:count]]), slacks, fits, says)
 
 
+def _check_names(machine: Machine, expressions: Sequence[Expression], terms: Terms) -> None:
+    """Refuse what is no measure, before anything is searched."""
+    every = available(machine, terms.own)
+    values = Variants(machine).values
+
+    def named(name: str) -> float:
+        if name not in every and name not in values:
+            raise InputError(f"measure '{name}' is unknown, {known(every, name)}")
+        return 1.0
+
+    places_in(expressions)
+    for expression in expressions:
+        expression(named, lambda name, arguments: 1.0)
+
+
 def _ranges(
     machine: Machine, vary: Mapping[str, tuple[float, float]]
 ) -> tuple[tuple[str, ...], Array, Array]:
@@ -462,10 +503,13 @@ def _ranges(
     for name, ends in vary.items():
         if name not in values:
             raise InputError(f"number '{name}' is unknown, {known(values, name)}")
-        both = np.array(ends, dtype=float).ravel()
+        try:
+            both = np.array(ends, dtype=float).ravel()
+        except (TypeError, ValueError):
+            both = np.zeros(0)
         if len(both) != 2 or not np.isfinite(both).all() or not both[0] < both[1]:
             raise InputError(f"'{name}' has no range, give its lower and upper end")
-    low, high = np.array([list(ends) for ends in vary.values()], dtype=float).T
+    low, high = np.array([np.ravel(ends) for ends in vary.values()], dtype=float).T
     return tuple(vary), low, high
 
 
@@ -506,7 +550,7 @@ def _simplex(goals: int, points: int) -> Array:
     if goals == 2:
         share = np.linspace(0.0, 1.0, points + 2)[1:-1]
         return np.column_stack([share, 1.0 - share])
-    drawn = qmc.Sobol(goals, rng=0).random(points)
+    drawn = qmc.Sobol(goals, rng=0).random(1 << (points - 1).bit_length())[:points]
     drawn = -np.log(np.clip(drawn, 1e-9, 1.0))
     return np.asarray(drawn / drawn.sum(axis=1, keepdims=True))
 

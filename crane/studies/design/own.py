@@ -49,6 +49,13 @@ def own_measures(given: str | Path | Mapping[str, Measure] | None) -> dict[str, 
     return found
 
 
+def kept(
+    given: str | Path | Mapping[str, Measure] | None,
+) -> str | Mapping[str, Measure] | None:
+    """The same for another process, which may stand in another folder."""
+    return given if given is None or isinstance(given, Mapping) else str(Path(given).resolve())
+
+
 def measured(name: str, function: Measure, machine: Machine) -> float:
     """What a user's function says of a machine.
 

@@ -13,6 +13,7 @@ from crane.common.samples import Array
 from crane.dynamics import Dynamics
 from crane.dynamics.statics import Statics
 from crane.formats.loading import Variants
+from crane.machine import Machine
 from crane.motion.workspaces.section import upwards
 from crane.ratings import capacity, torques
 from crane.ratings.places import Places
@@ -78,7 +79,7 @@ class Point:
         self._ranges, self._terms, self._places = ranges, terms, list(places)
         self.machine = variants.machine(dict(zip(names, values.tolist(), strict=True)))
         self._known: dict[tuple[Any, ...], float] = {}
-        self._loads: dict[tuple[float, ...], Dual] = {}
+        self._loads: dict[tuple[bool, tuple[float, ...]], Dual] = {}
 
     def value(self, expression: Expression) -> float:
         """Of an expression."""
@@ -166,7 +167,7 @@ class Point:
     def _measured(self, name: str, arguments: tuple[Any, ...]) -> float:
         machine = self.machine
         if name == "load":
-            return self._load(arguments).value
+            return self._load(arguments, False).value
         if name in ("reach", "highest", "lowest", "nearest"):
             return self._extreme(name, arguments)[0]
         if name == "net_torque":
@@ -197,7 +198,9 @@ class Point:
             return float(self._values[self._names.index(name)])
         if name in self._variants.values:
             return float(self._variants.values[name])
-        raise InputError(f"measure '{name}' is unknown, {known(available(self), name)}")
+        raise InputError(
+            f"measure '{name}' is unknown, {known(available(self.machine, self._terms.own), name)}"
+        )
 
     @cached_property
     def _statics(self) -> Statics:
@@ -230,18 +233,20 @@ class Point:
     def _of_strokes(self) -> dict[str, float]:
         return of_strokes(self.machine)
 
-    def _load(self, place: tuple[float, ...]) -> Dual:
-        """The rated load at a place, 0 where it is out of reach."""
-        if place not in self._loads:
-            every = [place, *(x for x in self._places if x not in self._loads)]
+    def _load(self, place: tuple[float, ...], sloped: bool = True) -> Dual:
+        """The rated load at a place, 0 where it is out of reach; with its slopes if asked for."""
+        if (sloped, place) not in self._loads:
+            every = [place, *(x for x in self._places if (sloped, x) not in self._loads)]
             slews = sorted({x[2] for x in every if len(x) == 3})
             for slew in [None, *slews]:
                 here = [x for x in every if (x[2] if len(x) == 3 else None) == slew]
                 if here:
-                    self._charted(here, slew)
-        return self._loads[place]
+                    self._charted(here, slew, sloped)
+        return self._loads[sloped, place]
 
-    def _charted(self, places: Sequence[tuple[float, ...]], slew: float | None) -> None:
+    def _charted(
+        self, places: Sequence[tuple[float, ...]], slew: float | None, sloped: bool
+    ) -> None:
         radii, heights = (sorted({x[i] for x in places}) for i in (0, 1))
         nothing = constant(0.0, len(self._names))
         try:
@@ -252,17 +257,21 @@ class Point:
         except InputError as error:
             if "reaches none" not in str(error):
                 raise
-            self._loads |= dict.fromkeys(places, nothing)
+            self._loads |= {(sloped, place): nothing for place in places}
             return
-        slopes = chart.slopes(self._names)
+        slopes = chart.slopes(self._names) if sloped else None
         for place in places:
             a, b = radii.index(place[0]), heights.index(place[1])
             loads = np.nan_to_num(chart.loads[:, b, a], nan=0.0)
             s = int(loads.argmin())
             if not np.isfinite(loads[s]):
                 raise InputError(f"nothing ends the load at {place}, ask for another place")
-            slope = np.nan_to_num(slopes[s, b, a], nan=0.0)
-            self._loads[place] = Dual(float(loads[s]), slope)
+            slope = nothing.slopes
+            if slopes is not None and loads[s] > 0:
+                slope = slopes[s, b, a]
+                if np.isnan(slope).any():  # where a pin ends it
+                    slope = self._differences("load", place)
+            self._loads[sloped, place] = Dual(float(loads[s]), slope)
 
     def _extreme(self, name: str, arguments: tuple[Any, ...]) -> tuple[float, Array]:
         """Largest reach or height, lowest depth, or distance to a point, and its posture."""
@@ -334,18 +343,33 @@ class Point:
         return np.asarray(sign * slope[0] @ by)
 
 
-def available(point: Point) -> dict[str, str]:
+def available(machine: Machine, own: Mapping[str, Measure]) -> dict[str, str]:
     """All measures and functions of a machine, and their units."""
-    machine = point.machine
     return {
         **task_measures(machine), **stroke_measures(machine), **PLAIN, **_CHART_UNITS,
-        **dict.fromkeys(point._terms.own, ""),
+        **dict.fromkeys(own, ""),
     }  # fmt: skip
+
+
+def refuse_taken(own: Mapping[str, Measure], available: Mapping[str, str]) -> None:
+    """Refuse functions of a user's own that are called like a measure.
+
+    Raises:
+        InputError: One is.
+    """
+    for name in own:
+        if name in available or name in PLAIN or name in _CHARTS or name in FUNCTIONS:
+            raise InputError(f"a measure '{name}' is there already, call your own otherwise")
 
 
 def places_in(expressions: Sequence[Expression]) -> list[tuple[float, ...]]:
     """All arguments of `load` that are plain numbers."""
     found: list[tuple[float, ...]] = []
+
+    def named(name: str) -> float:
+        if name in _CHARTS or name in FUNCTIONS:
+            raise InputError(f"'{name}' is a function, write {name}(...)")
+        return 1.0
 
     def called(name: str, arguments: tuple[Any, ...]) -> float:
         _check(name, arguments)
@@ -354,15 +378,19 @@ def places_in(expressions: Sequence[Expression]) -> list[tuple[float, ...]]:
         return 1.0
 
     for expression in expressions:
-        expression(lambda name: 1.0, called)
+        expression(named, called)
     return list(dict.fromkeys(found))
 
 
 def _check(name: str, arguments: tuple[Any, ...]) -> None:
     """Refuse functions that are not there, or with other arguments."""
+    words = [x for x in arguments if isinstance(x, str)]
+    if words and name != "number":
+        raise InputError(f"'{name}' takes numbers, not '{words[0]}'")
     if name in FUNCTIONS:
-        if not arguments:
-            raise InputError(f"'{name}' has no argument")
+        if not arguments or (len(arguments) > 1 and name not in ("min", "max")):
+            count = "arguments" if name in ("min", "max") else "one argument"
+            raise InputError(f"'{name}' takes {count}, not {len(arguments)}")
         return
     if name not in _CHARTS:
         raise InputError(f"function '{name}' is unknown, {known([*_CHARTS, *FUNCTIONS], name)}")
