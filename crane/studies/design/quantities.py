@@ -384,6 +384,8 @@ def places_in(expressions: Sequence[Expression]) -> list[tuple[float, ...]]:
 
 def _check(name: str, arguments: tuple[Any, ...]) -> None:
     """Refuse functions that are not there, or with other arguments."""
+    if name not in FUNCTIONS and name not in _CHARTS:
+        raise InputError(f"function '{name}' is unknown, {known([*_CHARTS, *FUNCTIONS], name)}")
     words = [x for x in arguments if isinstance(x, str)]
     if words and name != "number":
         raise InputError(f"'{name}' takes numbers, not '{words[0]}'")
@@ -392,8 +394,6 @@ def _check(name: str, arguments: tuple[Any, ...]) -> None:
             count = "arguments" if name in ("min", "max") else "one argument"
             raise InputError(f"'{name}' takes {count}, not {len(arguments)}")
         return
-    if name not in _CHARTS:
-        raise InputError(f"function '{name}' is unknown, {known([*_CHARTS, *FUNCTIONS], name)}")
     least, most = _CHARTS[name]
     if not least <= len(arguments) <= most:
         count = f"{least}" if least == most else f"{least} or {most}"
