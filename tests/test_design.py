@@ -112,34 +112,34 @@ def test_the_classical_transmission_angle_problem(four_bar):
 
 @pytest.mark.slow
 def test_a_front_of_two_goals_is_that_of_a_grid():
-    """Bucket linkage: the more swing of the bucket, the less its force; 9 by 9 variants beside.
+    """Bucket linkage: the more swing of the bucket, the less its force; 7 by 7 variants beside.
 
     The rocker's length and where it stands on the arm; two goals of our own, exact by the closure.
     """
     vary = {"arm_rocker.x": (2.40, 2.55), "bucket_link.y": (0.42, 0.56)}
     goals = ["force", "swing"]
 
-    def along(machine):
-        """Angle of the bucket per stroke all over the stroke of its cylinder."""
-        q_a = np.tile(machine.home[machine.closure.active], (60, 1))
-        q_a[:, 3] = np.linspace(0.02, 1.08, 60)
+    def at(machine, *strokes):
+        """Angle of the bucket, and its slope by the stroke of its cylinder."""
+        q_a = np.tile(machine.home[machine.closure.active], (len(strokes), 1))
+        q_a[:, 3] = strokes
         q = machine.closure.solve(q_a)
         column = machine.column("bucket")
         return q[:, column], machine.closure.gamma(q)[:, column, 3]
 
     own = {
-        "force": lambda machine: 391.0 / np.abs(along(machine)[1]).max(),  # the least, kN m
-        "swing": lambda machine: np.degrees(np.ptp(along(machine)[0])),
+        "force": lambda machine: 391.0 / abs(at(machine, 0.5)[1][0]),  # kN m
+        "swing": lambda machine: np.degrees(np.ptp(at(machine, 0.1, 1.0)[0])),
     }
-    found = crane.design("excavator", vary, maximise=goals, measures=own, starts=2, points=6)
+    found = crane.design("excavator", vary, maximise=goals, measures=own, starts=1, points=5)
     front = np.array([x.goals for x in found.solutions])
-    assert len(front) >= 5 and (np.ptp(front, axis=0) > 0.01 * front.mean(axis=0)).all()
+    assert len(front) >= 3 and (np.ptp(front, axis=0) > 0.01 * front.mean(axis=0)).all()
     variants = Variants(crane.load("excavator"))
     low, high = np.array(list(vary.values())).T
     expressions = [Expression(goal) for goal in goals]
     grid = []
-    for a in np.linspace(low[0], high[0], 9):
-        for b in np.linspace(low[1], high[1], 9):
+    for a in np.linspace(low[0], high[0], 7):
+        for b in np.linspace(low[1], high[1], 7):
             values = np.array([a, b])
             try:
                 point = Point(variants, list(vary), values, high - low, Terms(own=own))
@@ -147,12 +147,12 @@ def test_a_front_of_two_goals_is_that_of_a_grid():
             except crane.CraneError:
                 continue
     grid = np.array(grid)
-    assert len(grid) > 40
+    assert len(grid) > 25
     for solution in front:  # nothing of the grid is better in both
         assert not (grid > solution * (1 + 1e-5)).all(axis=1).any()
     best = grid[[not (grid > row).all(axis=1).any() for row in grid]]
     for row in best:  # and none of its best is far beyond all of the front
-        assert (front >= row - 0.05 * np.ptp(best, axis=0)).all(axis=1).any()
+        assert (front >= row - np.ptp(best, axis=0) / len(front)).all(axis=1).any()
 
 
 @pytest.mark.parametrize(
@@ -170,12 +170,12 @@ def test_slopes_are_those_of_variants_beside(text):
     terms, expression = Terms(tasks=("grade",)), Expression(text)
 
     def at(values):
-        return Point(variants, names, values, ranges, terms).dual(expression)
+        return Point(variants, names, values, ranges, terms)
 
-    found = at(here)
+    found = at(here).dual(expression)
     for i, step in enumerate(1e-3 * ranges):
         more, less = (here + sign * step * np.eye(4)[i] for sign in (1, -1))
-        difference = (at(more).value - at(less).value) / (2 * step)
+        difference = (at(more).value(expression) - at(less).value(expression)) / (2 * step)
         scale = max(abs(difference), abs(found.value) * 1e-2 / ranges[i])
         assert found.slopes[i] == pytest.approx(difference, abs=2e-4 * scale)
 
