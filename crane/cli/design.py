@@ -1,7 +1,6 @@
 """The command that finds numbers of a machine: design."""
 
 import os
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -9,9 +8,15 @@ import typer
 from crane.cli.shared import (
     Change,
     Force,
+    LoadFrame,
+    LoadRule,
     Lock,
     MachineName,
     Out,
+    OwnMeasures,
+    Processes,
+    Require,
+    Scheduler,
     app,
     load,
     progress_bar,
@@ -31,29 +36,18 @@ def design(
     maximise: Annotated[
         list[str] | None, typer.Option(metavar="EXPRESSION", help="What shall be the largest.")
     ] = None,
-    require: Annotated[
-        list[str] | None, typer.Option(metavar="A>=B", help="What has to hold, or A<=B.")
-    ] = None,
-    measures: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.py", help="Measures of your own: functions of a machine."),
-    ] = None,
-    frame: Annotated[
-        str | None, typer.Option(metavar="LINK", help="Where loads hang; the tip if not given.")
-    ] = None,
-    rule: Annotated[str, typer.Option(help="By which loads are rated.")] = "none",
+    require: Require = None,
+    measures: OwnMeasures = None,
+    frame: LoadFrame = None,
+    rule: LoadRule = "none",
     task: Annotated[
         list[str] | None, typer.Option(help="A task for forces and energy; all if not given.")
     ] = None,
     starts: Annotated[int, typer.Option(help="Number of searches.")] = 10,
     points: Annotated[int, typer.Option(help="Of the front, with several goals.")] = 15,
     seed: Annotated[int, typer.Option(help="Of the starts.")] = 0,
-    processes: Annotated[
-        int | None, typer.Option(help="To compute with; one per core if not given.")
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster to compute on.")
-    ] = None,
+    processes: Processes = None,
+    scheduler: Scheduler = None,
     change: Change = None,
     lock: Lock = None,
     force: Force = False,

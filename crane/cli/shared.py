@@ -58,6 +58,23 @@ Columns = Annotated[
         "--columns", metavar="FILE", help="Which columns of a raw log are which, as for import."
     ),
 ]
+Require = Annotated[
+    list[str] | None, typer.Option(metavar="A>=B", help="What has to hold, or A<=B, or A==B.")
+]
+OwnMeasures = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.py", help="Measures of your own: functions of a machine."),
+]
+LoadFrame = Annotated[
+    str | None, typer.Option(metavar="LINK", help="Where loads hang; the tip if not given.")
+]
+LoadRule = Annotated[
+    str, typer.Option(help="By which loads are rated: none, iso10567, en12999 or sfs4677.")
+]
+Processes = Annotated[int | None, typer.Option(help="To compute with; one per core if not given.")]
+Scheduler = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster to compute on.")
+]
 From = Annotated[
     float | None,
     typer.Option("--from", metavar="SECONDS", help="Read from here on, by the recording's clock."),

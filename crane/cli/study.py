@@ -1,7 +1,6 @@
 """The command that changes parameters: study."""
 
 import os
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -9,9 +8,15 @@ import typer
 from crane.cli.shared import (
     Change,
     Force,
+    LoadFrame,
+    LoadRule,
     Lock,
     MachineName,
     Out,
+    OwnMeasures,
+    Processes,
+    Require,
+    Scheduler,
     app,
     load,
     progress_bar,
@@ -36,25 +41,14 @@ def study(
         list[str] | None,
         typer.Option(help="What to report: peak_X2, load(4, 0) / mass; all if not given."),
     ] = None,
-    require: Annotated[
-        list[str] | None, typer.Option(metavar="A>=B", help="What has to hold, or A<=B.")
-    ] = None,
-    measures: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.py", help="Measures of your own: functions of a machine."),
-    ] = None,
-    frame: Annotated[
-        str | None, typer.Option(metavar="LINK", help="Where loads hang; the tip if not given.")
-    ] = None,
-    rule: Annotated[str, typer.Option(help="By which loads are rated.")] = "none",
+    require: Require = None,
+    measures: OwnMeasures = None,
+    frame: LoadFrame = None,
+    rule: LoadRule = "none",
     draws: Annotated[int | None, typer.Option(help="Number of random variants.")] = None,
     seed: Annotated[int, typer.Option(help="Of the random variants.")] = 0,
-    processes: Annotated[
-        int | None, typer.Option(help="To compute with; one per core if not given.")
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Of a Dask cluster to compute on.")
-    ] = None,
+    processes: Processes = None,
+    scheduler: Scheduler = None,
     change: Change = None,
     lock: Lock = None,
     force: Force = False,

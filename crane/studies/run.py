@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneError, CraneWarning, InputError, at, known
 from crane.common.samples import Array, as_count, as_samples, as_seed
-from crane.description import parameters
+from crane.description.number_units import number_unit
 from crane.dynamics import Dynamics
-from crane.formats import load, read
+from crane.formats import load
 from crane.formats.loading import Variants
 from crane.machine import Machine
-from crane.ratings.rules import rule_of
+from crane.ratings.rules import Rule, rule_of
 from crane.studies.computing import computed, described, processes_of
 from crane.studies.design.expressions import Expression, requirement
 from crane.studies.design.own import Measure, kept, own_measures
@@ -68,7 +68,7 @@ class Job(NamedTuple):
     require: tuple[str, ...] = ()
     own: str | Mapping[str, Measure] | None = None
     frame: str | None = None
-    rule: str = "none"
+    rule: str | Rule = "none"
     asked: tuple[str, ...] = ()
 
 
@@ -81,7 +81,7 @@ def study(
     require: Sequence[str] = (),
     own: str | Path | Mapping[str, Measure] | None = None,
     frame: str | None = None,
-    rule: str = "none",
+    rule: str | Rule = "none",
     draws: int | None = None,
     seed: int = 0,
     processes: int = 1,
@@ -148,7 +148,7 @@ def study(
             tuple(require),
             kept(own),
             frame,
-            rule_of(rule).name,
+            rule_of(rule),
             asked,
         )
         for row in values
@@ -285,7 +285,7 @@ def _parameter_units(machine: Machine, vary: Mapping[str, object], driven: bool)
         vary: By name.
         driven: Whether something is measured that circuits and controllers change.
     """
-    names = parameters(read(machine.path))
+    names = Variants(machine).values
     units = {}
     for wanted in vary:
         if wanted not in names:
@@ -296,24 +296,5 @@ def _parameter_units(machine: Machine, vary: Mapping[str, object], driven: bool)
                 f"'{wanted}' changes nothing: the forces are those of the reference motion, "
                 "without controller and hydraulics; take a task of levers, or a load"
             )
-        units[wanted] = _unit(machine, head, rest)
+        units[wanted] = number_unit(machine.tree, wanted)
     return units
-
-
-def _unit(machine: Machine, head: str, rest: list[str]) -> str:
-    last = rest[-1]
-    if head == "friction":
-        length = machine.unit(".".join(rest[:-1]))
-        force = "N" if length == "m" else "N m"
-        if last in ("smoothing", "stribeck"):
-            return f"{length}/s"
-        return f"{force} s/{length}" if last.startswith("viscous") else force
-    if head in ("spring", "gas_spring", "rope", "end_stop"):
-        return ""
-    if last in ("lower", "upper"):
-        return machine.unit(".".join([head, *rest[:-1]]))
-    if last == "rotor_inertia":
-        return "kg" if machine.unit(".".join([head, *rest[:-1]])) == "m" else "kg m2"
-    if "inertia" in rest:
-        return "kg m2"
-    return {"mass": "kg", "x": "m", "y": "m", "z": "m"}.get(last, "rad")

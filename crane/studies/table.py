@@ -107,21 +107,24 @@ class Study:
                 writer.writerow(["" if value != value else value for value in row.values()])
 
     def to_text(self, most: int = 10) -> str:
-        """The best rows by the first measure, for reading; the best one is marked."""
+        """The best rows by the first measure, for reading; the best one is marked.
+
+        Of an expression the least comes first, unmarked: nobody knows which is best.
+        """
         shown = [*self.parameters, *self.measures[:5]]
         titles = [f"{name} [{unit}]" if (unit := self.units[name]) else name for name in shown]
-        order = self.order(self.measures[0])
+        order, known = self.order(self.measures[0]), self.measures[0].isidentifier()
         lines = [titles]
         for i in order[:most]:
             lines.append([f"{self.columns[name][i]:.6g}" for name in shown])
         widths = [max(len(line[k]) for line in lines) for k in range(len(shown))]
         text = [
-            ("* " if row == 1 else "  ")
+            ("* " if row == 1 and known else "  ")
             + "  ".join(word.rjust(width) for word, width in zip(line, widths, strict=True))
             for row, line in enumerate(lines)
         ]
         failed = [reason for reason in self.reasons if reason]
-        summary = f"{len(self)} variants, best {self.measures[0]} first"
+        summary = f"{len(self)} variants, {'best' if known else 'least'} {self.measures[0]} first"
         if failed:
             summary += f"; {len(failed)} cannot be measured, the first: {failed[0]}"
         return "\n".join([*(text if order else []), summary, *self.notes])

@@ -17,7 +17,7 @@ from crane.formats import load
 from crane.formats.loading import Variants
 from crane.machine import Machine
 from crane.ratings import Capacity, capacity
-from crane.ratings.rules import rule_of
+from crane.ratings.rules import Rule, rule_of
 from crane.studies.computing import computed, described, processes_of
 from crane.studies.design.dual import Dual
 from crane.studies.design.expressions import Expression, requirement
@@ -65,7 +65,7 @@ class Job(NamedTuple):
     requires: tuple[str, ...]
     equal: tuple[bool, ...]
     frame: str | None
-    rule: str
+    rule: str | Rule
     tasks: tuple[str, ...]
     own: Any
     start: Array
@@ -207,7 +207,7 @@ def design(
     require: Sequence[str] = (),
     measures: str | Path | Mapping[str, Measure] | None = None,
     frame: str | None = None,
-    rule: str = "none",
+    rule: str | Rule = "none",
     tasks: Sequence[str] | None = None,
     starts: int = 10,
     points: int = 15,
@@ -254,7 +254,7 @@ def design(
     if not goals:
         raise InputError("nothing is sought, name what to minimise or to maximise")
     names, low, high = _ranges(base, vary)
-    told = rule_of(rule).name
+    told = rule_of(rule)
     chosen = tuple(base.tasks if tasks is None else tasks)
     for task in chosen:
         if task not in base.tasks:

@@ -17,6 +17,7 @@ from crane.machine import Machine
 from crane.motion.workspaces.section import upwards
 from crane.ratings import capacity, torques
 from crane.ratings.places import Places
+from crane.ratings.rules import Rule
 from crane.studies.design.dual import FUNCTIONS, Dual, constant
 from crane.studies.design.expressions import Expression
 from crane.studies.design.own import Measure, measured
@@ -43,7 +44,7 @@ class Terms:
     """
 
     frame: str | None = None
-    rule: str = "none"
+    rule: str | Rule = "none"
     tasks: tuple[str, ...] = ()
     own: Mapping[str, Measure] = field(default_factory=dict)
 
