@@ -380,13 +380,16 @@ def as_driven(machine: Machine, control: Controller) -> Machine:
 def count_steps(control: Controller, duration: float | None, step: float) -> int:
     """Steps [s] in a duration [s], that of the controller's reference or levers if not given.
 
+    Levers last to the end of a step.
+
     Raises:
         InputError: There is no duration, there are too many steps, or no whole number of them.
     """
+    levers = False
     if duration is None:
         known_by = getattr(control, "reference", None)
         if known_by is None and isinstance(control, ValveDrive) and control.command.duration:
-            known_by = control.command
+            known_by, levers = control.command, True
         if known_by is None:
             raise InputError("no duration and no reference to take it from, give a duration")
         duration = known_by.duration
@@ -397,8 +400,8 @@ def count_steps(control: Controller, duration: float | None, step: float) -> int
             f"{duration:g} s are {duration / step:.3g} steps of {step:g} s, at most {_MOST}: "
             "simulate less, or go on from the last sample of a first part"
         )
-    steps = round(duration / step)
-    if steps < 1 or abs(steps * step - duration) > 1e-9 * duration:
+    steps = int(np.ceil(duration / step - 1e-9)) if levers else round(duration / step)
+    if steps < 1 or not levers and abs(steps * step - duration) > 1e-9 * duration:
         raise InputError(
             f"the duration {duration:g} s is no whole number of steps of {step:g} s, change one"
         )
