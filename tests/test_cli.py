@@ -322,9 +322,10 @@ def test_demo(tmp_path):
     result = typed("demo", "--out", tmp_path / "demo", "--force")
     assert result.returncode == 0, result.stderr
     names = {path.name for path in (tmp_path / "demo").iterdir()}
-    assert names == {"loading", "return", "lift", "dig", "grade", "summary.md", "notes.txt"}
+    tasks = {"loading", "return", "lift", "dig", "load_truck", "grade"}
+    assert names == tasks | {"summary.md", "notes.txt"}
     assert (tmp_path / "demo" / "lift" / "view.html").stat().st_size > 1000
-    for task in ("loading", "return", "lift", "dig", "grade"):
+    for task in tasks:
         names = {path.name for path in (tmp_path / "demo" / task).iterdir()}
         assert names == {"recording.csv", "summary.md", "figure.png", "view.html"}
     text = Path(tmp_path / "demo" / "summary.md").read_text()

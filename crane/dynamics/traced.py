@@ -377,8 +377,8 @@ class Sweep:
     def statics(self) -> list[Number]:
         """What loads at rest depend on, a number of `crane.dynamics.statics.layout` each.
 
-        First moment s = sum m c of all masses and ds/dq_A, mass, gamma^T f at rest; tip and
-        dtip/dq_A if there is one; in the world. With what joint j carries, m_j and s_j,
+        First moment s = sum m c of all masses and ds/dq_A, mass, gamma^T f (at rest where v_A is
+        0); tip and dtip/dq_A if there is one; in the world. With what joint j carries, m_j, s_j,
 
             ds/dq_k = sum_j gamma_jk (m_j l_j + a_j x s_j),
 

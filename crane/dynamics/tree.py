@@ -177,19 +177,20 @@ class TreeDynamics:
                 parts = self._mass(motion), gamma[here], motion.drift[here], net
                 return np.concatenate([np.ravel(part) for part in parts])
             case "statics":
-                return self._statics(q, gamma)
+                return self._statics(motion)
             case "regressor":
                 return (gamma.T @ self._regressor(q, v, gamma @ x + motion.drift)).ravel()
         raise AssertionError(quantity)
 
-    def _statics(self, q: Array, gamma: Array) -> Array:
+    def _statics(self, motion: ClosedState) -> Array:
         """See `Sweep.statics`."""
+        q, gamma = motion.q, motion.gamma
         model, data = self._model, self._memory.own.data
         jacobian = pin.jacobianCenterOfMass(model, data, self._coordinates.configuration(q), False)
         still, moving = model.inertias[0], data.mass[0]
         moment = moving * data.com[0] + still.mass * still.lever
         out = [moment, moving * jacobian @ gamma, [moving + still.mass]]
-        out.append(gamma.T @ self._forces.passive(q, np.zeros(model.nv)))
+        out.append(gamma.T @ self._forces.passive(q, motion.v))
         if self._tip is not None:
             joint, place = self._tip
             pin.computeJointJacobians(model, data, self._coordinates.configuration(q))

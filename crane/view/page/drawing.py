@@ -10,6 +10,7 @@ from crane.common.samples import Array
 from crane.formats.visuals.visuals import Box, Cylinder, Mesh, Sphere, Visual
 
 _SKY, _HAZE, _GRID = [0.80, 0.87, 0.93], [0.97, 0.97, 0.95], 0xB4BAC0
+_PARTS = ("geometry", "material", "map", "image")  # that meshcat identifies, too
 _UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 
 
@@ -22,27 +23,19 @@ class Recorder:
     """
 
     commands: list[dict[str, Any]] = field(default_factory=list)
-    _numbers: dict[str, str] = field(default_factory=dict)
+    _count: int = 0
 
     def send(self, command: Any) -> None:
         """Keep a command."""
-        lowered = command.lower()
-        self._number(lowered)
-        self.commands.append(self._numbered(lowered))
+        if hasattr(command, "object"):
+            self._number(command.object)
+        self.commands.append(command.lower())
 
-    def _number(self, part: Any) -> None:
-        for key, value in part.items() if isinstance(part, dict) else enumerate(part):
-            if key == "uuid":
-                self._numbers.setdefault(value, str(len(self._numbers)))
-            elif isinstance(value, dict | list):
-                self._number(value)
-
-    def _numbered(self, part: Any) -> Any:
-        if isinstance(part, dict):
-            return {key: self._numbered(value) for key, value in part.items()}
-        if isinstance(part, list):
-            return [self._numbered(value) for value in part]
-        return self._numbers.get(part, part) if isinstance(part, str) else part
+    def _number(self, element: Any) -> None:
+        """Number an object of meshcat and what it is made of."""
+        element.uuid, self._count = str(self._count), self._count + 1
+        for part in filter(None, map(vars(element).get, _PARTS)):
+            self._number(part)
 
 
 def draw_visuals(viewer: Any, visuals: Sequence[Visual]) -> None:
