@@ -118,6 +118,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 LOADED = time.time()  # before any other file of the package was read
 
+from crane.common import shown as _shown  # noqa: E402
+
 _HOMES = {
     "crane.closure": "Closure",
     "crane.common.errors": "CraneError CraneWarning",
@@ -191,6 +193,15 @@ def __getattr__(name: str) -> Any:
         if name in names.split():
             return getattr(import_module(module), name)
     raise AttributeError(f"module 'crane' has no attribute '{name}'")
+
+
+def _to_html(what: Any) -> str | None:
+    from crane.view.notebook import html
+
+    return html(what)
+
+
+_shown.to_html = _to_html
 
 
 def __dir__() -> list[str]:

@@ -6,7 +6,8 @@ import pytest
 import crane
 from crane.cli.shared import by_joint
 from crane.common.errors import CraneError, InputError, RecordingError, at, one_line
-from crane.common.samples import FARTHEST, LARGEST, SMALLEST, Brief, as_count, as_number, as_seed
+from crane.common.samples import FARTHEST, LARGEST, SMALLEST, as_count, as_number, as_seed
+from crane.common.shown import Brief
 from crane.common.units import number, quantity, reading
 from crane.recordings.summary import subject, title
 from crane.studies.run import Job, variant

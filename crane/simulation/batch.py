@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneError, InputError
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief, counted
 from crane.control import Controller
 from crane.dynamics import Dynamics
 from crane.machine import Machine
@@ -48,6 +49,13 @@ class Batch(Brief):
     energy: Array
     failures: dict[int, str]
     warnings: dict[int, str]
+
+    def _line(self) -> str:
+        """How many, how long, and how many failed."""
+        return (
+            f"Batch of {counted(len(self.q), 'simulation')}, {self.time[-1]:.6g} s in "
+            f"{counted(len(self.time), 'sample')}: {len(self.failures)} failed"
+        )
 
 
 def simulate_batch(

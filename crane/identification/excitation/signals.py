@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.errors import InputError, known
-from crane.common.samples import Array, Brief, as_count, as_number, as_seed
+from crane.common.samples import Array, as_count, as_number, as_seed
+from crane.common.shown import Brief, counted
 from crane.common.tables import aligned
 from crane.common.units import quantity
 from crane.control.valves import circuit_of
@@ -65,6 +66,13 @@ class SignalExcitation(Brief):
     rate: Array
     criterion: str
     seed: int
+
+    def _line(self) -> str:
+        """For what, how long, and what it tells."""
+        return (
+            f"SignalExcitation of '{self.machine.name}', {self.run.time[-1]:.6g} s: "
+            f"{len(self.fit) - len(self.vague)} of {counted(len(self.fit), 'number')} told"
+        )
 
     @property
     def signals(self) -> dict[str, Array]:

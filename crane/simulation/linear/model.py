@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from crane.common.errors import InputError, OutputError
 from crane.common.output import replacing
 from crane.common.samples import Array, as_sample
+from crane.common.shown import Brief
 from crane.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -43,8 +44,8 @@ class Mode(NamedTuple):
         return self.pole.imag > _PAIRED * abs(self.pole)
 
 
-@dataclass(frozen=True, eq=False)
-class LinearModel:
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearModel(Brief):
     """x' = A x + B u, y = C x + D u, deviations from an operating point.
 
     Attributes:
