@@ -76,7 +76,7 @@ def _joint(machine: Machine, i: int) -> tuple[str, ...]:
     joint = machine.joints[i]
     unit, effort = machine.unit(joint), machine.model.effortLimit[i]
     driven = joint in machine.active
-    most = f"{effort:.5g} {FORCE_UNITS[unit]}" if driven and isfinite(effort) and effort else ""
+    most = quantity(effort, FORCE_UNITS[unit], 4) if driven and isfinite(effort) and effort else ""
     role = "passive" if not driven else "free" if joint in machine.free else "driven"
     limits = (float(x[i]) for x in (machine.coordinates.lower, machine.coordinates.upper))
     return joint, _limits(*limits, unit), f"{machine.home[i]:.5g} {unit}", most, role
