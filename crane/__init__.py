@@ -1,5 +1,6 @@
 """crane: machines with closed kinematic chains, computed in their actuators."""
 
+import sys
 import time
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -201,7 +202,17 @@ def _to_html(what: Any) -> str | None:
     return html(what)
 
 
+def _watch_cells() -> None:
+    """In a notebook, tell what goes on in cells that take long."""
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    if hasattr(shell, "kernel"):
+        from crane.view.cells import watch_cells
+
+        watch_cells(shell)
+
+
 _shown.to_html = _to_html
+_watch_cells()
 
 
 def __dir__() -> list[str]:

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from crane.common import shown
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number
-from crane.common.shown import Brief
 from crane.common.units import quantity
 from crane.dynamics.statics import Statics
 from crane.machine import Machine
@@ -56,7 +56,9 @@ class Torques(NamedTuple):
             words.append(f"slewing {quantity(self.slewing, 'N m', 4)}")
         return f"Torques({', '.join(words)})"
 
-    _repr_html_ = Brief._repr_html_
+    def _repr_html_(self) -> str | None:
+        """What notebooks show."""
+        return shown.to_html(self)
 
     def to_markdown(self) -> str:
         """A table of the torques, and what each means."""

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
 from crane.common.shown import Brief, counted
+from crane.common.waiting import telling
 from crane.control import Controller
 from crane.dynamics import Dynamics
 from crane.machine import Machine
@@ -89,6 +90,7 @@ def simulate_batch(
     Raises:
         InputError: Lengths or active joints that do not go together.
     """
+    progress = telling(progress)
     if isinstance(machines, Machine):
         machines = [machines] * (1 if initial is None else len(initial))
     if not machines:

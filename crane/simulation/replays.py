@@ -10,6 +10,7 @@ import numpy as np
 from crane.common.errors import CraneWarning, InputError, RecordingError, at, known
 from crane.common.samples import Array, as_number
 from crane.common.shown import Brief
+from crane.common.waiting import telling
 from crane.control import Signals, ValveDrive
 from crane.description.sensors import SIGNAL, SUPPLY, TANK
 from crane.machine import Machine
@@ -130,6 +131,7 @@ def replay(
         RecordingError: The file is malformed, or has no signals.
         InputError: The machine has no valves.
     """
+    progress = telling(progress)
     step = as_number(step, "the step", "s", above=0)
     table = read(path, machine, columns, span)
     try:

@@ -10,6 +10,7 @@ from crane.common.errors import InputError
 from crane.common.samples import Array, as_number
 from crane.common.shown import Brief, counted
 from crane.common.tables import aligned
+from crane.common.waiting import telling
 from crane.control import ValveFeedforward, fastest
 from crane.formats import load
 from crane.machine import Machine
@@ -111,6 +112,7 @@ def sway_study(
     Raises:
         CraneError: As `load`, `fastest` and `simulate`.
     """
+    progress = telling(progress)
     if not payloads:
         raise InputError("no payloads, give some masses [kg]")
     rows: list[SwayRow] = []

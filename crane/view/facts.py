@@ -78,8 +78,8 @@ def _joint(machine: Machine, i: int) -> tuple[str, ...]:
     driven = joint in machine.active
     most = quantity(effort, FORCE_UNITS[unit], 4) if driven and isfinite(effort) and effort else ""
     role = "passive" if not driven else "free" if joint in machine.free else "driven"
-    limits = (float(x[i]) for x in (machine.coordinates.lower, machine.coordinates.upper))
-    return joint, _limits(*limits, unit), f"{machine.home[i]:.5g} {unit}", most, role
+    lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
+    return joint, _limits(lower, upper, unit), f"{machine.home[i]:.5g} {unit}", most, role
 
 
 def _loops(machine: Machine) -> Iterator[Fact]:

@@ -26,7 +26,7 @@ from crane.view.plots.recording import STYLE
 from crane.view.plots.tags import drawing_tag, image_tag
 from crane.view.sketch.draw import sketch_figure
 
-_SHARE = 0.1  # of the frames and spans of a page: a notebook keeps all its outputs in one file
+_SHARE = 0.06  # of the frames and spans of a page: a notebook keeps all its outputs in one file
 _MOST_FIGURES = 8
 _FIGURES: Mapping[str, tuple[str, ...]] = {  # by class, in `crane.view.plots`
     "Calibration": ("calibration.calibration_figure",),

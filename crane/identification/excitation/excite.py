@@ -13,6 +13,7 @@ from crane.common.output import replacing
 from crane.common.samples import Array, as_count, as_number, as_seed
 from crane.common.shown import Brief
 from crane.common.tables import aligned
+from crane.common.waiting import telling
 from crane.dynamics import Dynamics
 from crane.identification.excitation.fourier import Fourier
 from crane.identification.excitation.information import CRITERIA, Information, Quality
@@ -204,6 +205,7 @@ def excite(
     Raises:
         InputError: Arguments out of range, or no reference within the limits.
     """
+    progress = telling(progress)
     if criterion not in CRITERIA:
         raise InputError(f"criterion '{criterion}' is unknown, {known(CRITERIA, criterion)}")
     for what, value in (("starts", starts), ("harmonics", harmonics), ("periods", periods)):

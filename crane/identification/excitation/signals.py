@@ -12,6 +12,7 @@ from crane.common.samples import Array, as_count, as_number, as_seed
 from crane.common.shown import Brief, counted
 from crane.common.tables import aligned
 from crane.common.units import quantity
+from crane.common.waiting import telling
 from crane.control.valves import circuit_of
 from crane.description.sensors import SIGNAL
 from crane.identification.calibration.unknowns import Unknown
@@ -175,6 +176,7 @@ def excite_valves(
     Source: Goodwin, Payne 1977, Dynamic System Identification, chapter 6; Meyer, Nachtsheim
     1995, Technometrics 37(1).
     """
+    progress = telling(progress)
     circuit_of(machine)
     if criterion not in CRITERIA:
         raise InputError(f"criterion '{criterion}' is unknown, {known(CRITERIA, criterion)}")

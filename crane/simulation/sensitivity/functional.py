@@ -12,6 +12,7 @@ from crane.codegen import Parts
 from crane.common.errors import CraneWarning, InputError, known
 from crane.common.samples import Array
 from crane.common.shown import Brief
+from crane.common.waiting import telling
 from crane.control import Command, Controller
 from crane.description.sensors import VELOCITY
 from crane.machine import Machine
@@ -124,6 +125,7 @@ def gradient(
         InputError: As `sensitivities`, or weights of another shape.
         SimulationError: As `sensitivities`.
     """
+    progress = telling(progress)
     asked = Asked.of(machine, controller, initial, duration, step, outputs, method, tolerance)
     directions = asked.directions
     by = None if by is None else list(dict.fromkeys(by))

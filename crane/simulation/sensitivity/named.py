@@ -12,6 +12,7 @@ from crane.common.errors import CraneWarning, InputError, known
 from crane.common.samples import Array
 from crane.common.shown import Brief
 from crane.common.units import reading
+from crane.common.waiting import telling
 from crane.control import Command, Controller
 from crane.description.sensors import (
     FORCE,
@@ -161,6 +162,7 @@ def sensitivities(
         InputError: Unknown names, a machine that floats, or one without formulas.
         SimulationError: The motion comes to a dead centre; else as `simulate`.
     """
+    progress = telling(progress)
     if not by:
         raise InputError("no number is named, give `by` such as ['payload.mass']")
     asked = Asked.of(machine, controller, initial, duration, step, outputs, method, tolerance)

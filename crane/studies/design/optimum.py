@@ -14,6 +14,7 @@ from scipy.stats import qmc
 from crane.common.errors import CraneError, CraneWarning, InputError, known
 from crane.common.samples import Array, as_count, as_seed
 from crane.common.shown import Brief
+from crane.common.waiting import telling
 from crane.formats import load
 from crane.formats.loading import Variants
 from crane.machine import Machine
@@ -248,6 +249,7 @@ def design(
     Raises:
         InputError: Unknown names, no goal, ranges that are none, or no solution.
     """
+    progress = telling(progress)
     base, name = described(machine)
     processes = processes_of(processes)
     starts = as_count(starts, "the number of starts", 1, 10_000)
