@@ -57,7 +57,7 @@ _CSS = """
 .crane-shown p { margin: .4em 0; overflow-wrap: anywhere; }
 .crane-shown .crane-line { font-weight: 600; }
 .crane-shown .crane-note { opacity: .75; }
-.crane-shown .scroll { overflow-x: auto; margin: .5em 0; }
+.crane-shown .scroll, .crane-shown pre { overflow: auto; max-height: 30rem; margin: .5em 0; }
 .crane-shown table { border-collapse: collapse; margin: 0; font-size: inherit;
   font-variant-numeric: tabular-nums; color: inherit; border: 0; }
 .crane-shown tr { background: none !important; }
@@ -67,7 +67,7 @@ _CSS = """
 .crane-shown th { font-weight: 600; }
 .crane-shown .n, .crane-shown [style*="right"] { text-align: right !important; }
 .crane-shown td.crane-words { white-space: normal; min-width: 16rem; overflow-wrap: anywhere; }
-.crane-shown pre { overflow-x: auto; margin: .5em 0; padding: 0; font-size: 12px;
+.crane-shown pre { padding: 0; font-size: 12px;
   background: none; color: inherit; white-space: pre; }
 .crane-shown img { max-width: 100%; height: auto; display: block; margin: .5em 0;
   background: #fff; border-radius: 6px; }
