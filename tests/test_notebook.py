@@ -185,7 +185,7 @@ def results(mini, run):
     yield crane.PowerComparison({"one": account, "two": account})
     yield crane.linearize(patu)
     yield crane.sensitivities(mini, lift, by=by, duration=0.1)
-    yield crane.gradient(mini, lift, lambda y: y[-1, 0], by=by, duration=0.1)
+    yield crane.gradient(mini, lift, duration=0.1, of=np.ones((101, 3)), by=by)
     yield crane.Comparison(values[0], (Channel("q1", "rad", values[1], values[1]),))
     yield crane.excite(mini, starts=1, harmonics=2, period=4.0)
     yield crane.design("mini_forwarder", {by[0]: (0.1, 0.3)}, minimise=["mass"], starts=1)
