@@ -17,6 +17,7 @@ import pytest
 import crane
 from crane.common import shown, waiting
 from crane.common.waiting import SHARES, telling
+from crane.identification.calibration.result import Channel as Sensed
 from crane.identification.calibration.result import Fitted
 from crane.simulation.replays import Channel
 from crane.studies.sway import SwayRow
@@ -187,6 +188,10 @@ def results(mini, run):
     yield crane.sensitivities(mini, lift, by=by, duration=0.1)
     yield crane.gradient(mini, lift, duration=0.1, of=np.ones((101, 3)), by=by)
     yield crane.Comparison(values[0], (Channel("q1", "rad", values[1], values[1]),))
+    channel = (run.time < 7.0, values[1], 1.1 * values[1], values[1])
+    fitted = Fitted("link7.mass", 0.2, 0.21, 0.01, False, False, "kg")
+    sensor = Sensed("a.csv", "q1", "rad", run.time, *channel)
+    yield crane.Calibration(mini, (fitted,), (sensor,), {by[0]: 0.21}, (), 7)
     yield crane.excite(mini, starts=1, harmonics=2, period=4.0)
     yield crane.design("mini_forwarder", {by[0]: (0.1, 0.3)}, minimise=["mass"], starts=1)
 
@@ -202,7 +207,7 @@ def test_every_result_has_its_line_its_figure_and_its_table(mini, run):
         assert bool(found.addresses) == (name in notebook._FIGURES), name
         assert "no picture" not in found.text and bool(found.inner) == (name == "LinearModel")
         seen.add(name)
-    others = {"Recording", "Calibration", "SignalExcitation"}  # looked at where they are tested
+    others = {"Recording", "SignalExcitation"}  # looked at above, and in test_excite_valves
     assert set(notebook._FIGURES) <= seen | others
 
 
