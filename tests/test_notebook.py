@@ -159,6 +159,12 @@ def test_names_stay_text(mini, run):
                                             )._repr_html_()  # fmt: skip
 
 
+def test_a_comparison_of_nothing_says_so():
+    found = looked_at(crane.Comparison(np.array([0.0, 1.0]), ()))
+    assert not found.addresses
+    assert "no picture: the file has no channel that the simulation has too" in found.text
+
+
 def test_markdown_makes_tables_and_no_addresses():
     text = f"# title\n\nof `a_b` and {EVIL} <http://x.y>\n\n- one\n\n| a | b |\n| --- | ---: |\n"
     found = Parsed("".join(notebook._blocks(text + "| **x** | 2 |\n", notebook._markdown)))
