@@ -1,5 +1,6 @@
 """crane: machines with closed kinematic chains, computed in their actuators."""
 
+import sys
 import time
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -118,6 +119,8 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 LOADED = time.time()  # before any other file of the package was read
 
+from crane.common import shown as _shown  # noqa: E402
+
 _HOMES = {
     "crane.closure": "Closure",
     "crane.common.errors": "CraneError CraneWarning",
@@ -191,6 +194,25 @@ def __getattr__(name: str) -> Any:
         if name in names.split():
             return getattr(import_module(module), name)
     raise AttributeError(f"module 'crane' has no attribute '{name}'")
+
+
+def _to_html(what: Any) -> str | None:
+    from crane.view.notebook import html
+
+    return html(what)
+
+
+def _watch_cells() -> None:
+    """In a notebook, tell what goes on in cells that take long."""
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    if hasattr(shell, "kernel"):
+        from crane.view.cells import watch_cells
+
+        watch_cells(shell)
+
+
+_shown.to_html = _to_html
+_watch_cells()
 
 
 def __dir__() -> list[str]:

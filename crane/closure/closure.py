@@ -22,6 +22,7 @@ from crane.closure.traced import geometry_of
 from crane.codegen import TooLongError, carefully
 from crane.common.errors import BranchEdgeError, InputError, MechanismError, WrongBranchError
 from crane.common.samples import Array, as_samples, per_sample, solve
+from crane.common.shown import Brief
 from crane.description import Coupling, LoopSpec
 
 _FEW, _FAR = 100, 0.1  # samples worth sorting: how many, how far apart as a share of the range
@@ -29,7 +30,7 @@ _SAME = 1e-6  # rad, machine's size, between a posture and what Newton's method 
 _STEPS = 8  # from home to a target that is far from the one before it
 
 
-class Closure:
+class Closure(Brief):
     """The loops of a machine as functions of its active coordinates.
 
     Park, Choi, Ploen (1999); equations (3) and (4) of the reduced-scale forwarder paper, for any
@@ -123,7 +124,7 @@ class Closure:
         self.home = self._branch.home.q.copy()
         self.home.flags.writeable = False
 
-    def __repr__(self) -> str:
+    def _line(self) -> str:
         """Its loops, and what drives them."""
         loops = ", ".join(loop.name for loop in self.equations.loops) or "no loops"
         return (

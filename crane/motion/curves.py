@@ -9,6 +9,7 @@ from scipy.interpolate import PPoly
 
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number, as_samples
+from crane.common.shown import Brief, counted
 from crane.motion.splines import least_jerk, quintics
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 _JUMP = 1e-9  # of the largest value, what no jump is
 
 
-class Trajectory:
+class Trajectory(Brief):
     """A motion with two derivatives; before its start and after its end it stands still.
 
     Args:
@@ -45,6 +46,12 @@ class Trajectory:
         self.duration = float(curve.x[-1])
         self.tip, self.attitude = tip, attitude
         self._curves = (curve, curve.derivative(), curve.derivative(2))
+
+    def _line(self) -> str:
+        """How long, and of how many coordinates."""
+        count = np.size(self.position(0.0))
+        words = f"{self.duration:.6g} s of {counted(count, 'coordinate')}"
+        return f"{type(self).__name__}({words}{', by its tip' * (self.tip is not None)})"
 
     def position(self, time: ArrayLike) -> Array:
         """Coordinates alone, (n,) or (N, n) at times () or (N,) [s]."""

@@ -13,6 +13,7 @@ from crane.codegen import Number, Program, Tape, TooLongError
 from crane.codegen.scalar import add, cross, dot, scale, subtract, times
 from crane.common.errors import ClosureError, InputError, UnreachableTipError, known
 from crane.common.samples import Array, as_sample, as_samples, per_sample
+from crane.common.shown import Brief
 from crane.common.threads import PerThread
 from crane.machine import Machine
 from crane.motion.attitude import INCLINATION, Attitude, Inclination, Rotation, roll_pitch_yaw
@@ -37,7 +38,7 @@ def norm(vector: Array) -> float:
     return float(np.linalg.norm(vector))
 
 
-class Kinematics:
+class Kinematics(Brief):
     """Position of one frame as a function of q_A.
 
         x = p(f(q_A)),    x' = J gamma v_A,    x'' = J gamma a_A + bias.
@@ -70,7 +71,7 @@ class Kinematics:
         self._turned: dict[str, Attitude] = {}
         self._memory = PerThread(self._model.createData)
 
-    def __repr__(self) -> str:
+    def _line(self) -> str:
         """What moves, of what."""
         return f"Kinematics of '{self.frame}' of '{self.machine.name}'"
 

@@ -19,6 +19,7 @@ from scipy.linalg import eigh
 
 from crane.common.errors import ClosureError, InputError, LimitError, known
 from crane.common.samples import Array, as_number
+from crane.common.shown import Brief
 from crane.dynamics import Dynamics
 from crane.machine import Machine
 from crane.motion.curves import Trajectory
@@ -38,7 +39,7 @@ _DIFFERENCE = 1e-6  # step of difference quotients [rad], [machine's size]
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
-class Sway:
+class Sway(Brief):
     """What hangs on the free joints of a machine: where it hangs, how it sways, what moves it.
 
     Args:

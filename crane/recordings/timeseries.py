@@ -25,7 +25,8 @@ import numpy as np
 from crane.common import scratch
 from crane.common.errors import RecordingError, at
 from crane.common.output import replacing
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.common.units import TO_SI
 from crane.common.units import spellings as spellings
 from crane.description.sensors import TIME as TIME

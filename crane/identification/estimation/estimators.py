@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.errors import InputError
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.identification.estimation.jackknife import Jackknife
 from crane.identification.estimation.noise import Noise, between
 from crane.identification.estimation.regressor import Regressor, Stored, factors, triangular

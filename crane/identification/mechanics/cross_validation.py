@@ -11,6 +11,7 @@ import numpy as np
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.samples import Array, as_number
 from crane.common.tables import aligned
+from crane.common.waiting import telling
 from crane.identification.mechanics.equations import Equations, Progress
 from crane.identification.mechanics.identify import Recorded, identify, motions_of
 from crane.identification.mechanics.model import Model
@@ -68,6 +69,7 @@ def cross_validate(
         InputError: Nothing is tried or what cannot be, or a recording is too short for its parts.
         RecordingError: A recording cannot serve.
     """
+    progress = telling(progress)
     if not tried or not all(tried.values()):
         raise InputError("nothing is tried, give values such as bandwidth=2,5,10")
     motions = motions_of(machine, recording, options.get("trust", False), None)

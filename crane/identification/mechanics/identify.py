@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, RecordingError, known
 from crane.common.samples import Array, as_number, as_sample
+from crane.common.waiting import telling
 from crane.identification.estimation.estimators import (
     Estimate,
     Prior,
@@ -112,6 +113,7 @@ def identify(
         InputError: Arguments that do not fit.
         RecordingError: A recording that cannot serve, and why; one that determines nothing.
     """
+    progress = telling(progress)
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
     model = Model(machine, terms)
