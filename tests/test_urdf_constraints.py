@@ -1,4 +1,4 @@
-"""`<constraint>` of URDF, as proposed: the same machine as with `<loop>`, where it is asked for."""
+"""`<constraint>`, as proposed for URDF: where it is asked for, the same as `<loop>`."""
 
 import numpy as np
 import pytest
