@@ -18,8 +18,6 @@ that are left out are the identity, an axis is 1 0 0, and `child_axis` counts fo
 As long as that is not accepted it may change, so it is read only where that is asked for.
 """
 
-from collections.abc import Mapping
-
 import numpy as np
 from lxml import etree
 
@@ -74,21 +72,18 @@ def _translate(xml: XmlFile, element: etree._Element) -> None:
         raise xml.fail(element, 'a constraint has no name, add name="..."')
     what = f"constraint '{name}'"
     xml.check(element, _CHILDREN, _ATTRIBUTES, set(_ATTRIBUTES) - {"constraint"})
-    parts = {tag: xml.only(element, tag, what) for tag in sorted(_CHILDREN["constraint"])}
     element.set("type", _type(xml, element, what))
-    for end in _ENDS:
-        if parts[end] is None or not parts[end].get("link", "").strip():
-            raise xml.fail(element, f'{what} has no {end}, add <{end} link="..."/>')
-    _check_axes(xml, parts, what)
+    _check_axes(xml, element, what)
     for end, tag in _ENDS.items():
-        parts[end].tag = tag
-        if (origin := parts[f"{end}_origin"]) is not None:
+        link = xml.only(element, end, what)
+        if link is None or not link.get("link", "").strip():
+            raise xml.fail(element, f'{what} has no {end}, add <{end} link="..."/>')
+        if (origin := xml.only(element, f"{end}_origin", what)) is not None:
             origin.tag = "origin"
-            parts[end].append(origin)
-    if (axis := parts["parent_axis"]) is not None:
+            link.append(origin)
+        link.tag = tag
+    for axis in element.findall("parent_axis"):
         axis.tag = "axis"
-    if (axis := parts["child_axis"]) is not None:
-        element.remove(axis)
     element.tag = "loop"
 
 
@@ -108,18 +103,20 @@ def _type(xml: XmlFile, element: etree._Element, what: str) -> str:
     return _LOOPS[plain]
 
 
-def _check_axes(xml: XmlFile, parts: Mapping[str, etree._Element | None], what: str) -> None:
+def _check_axes(xml: XmlFile, element: etree._Element, what: str) -> None:
     """A loop has one axis in both frames, so that of the child has to be that of the parent."""
-    if (tag := parts["child_axis"]) is None:
+    parent, child = (xml.only(element, f"{end}_axis", what) for end in _ENDS)
+    if child is None:
         return
     one, two = (
-        _X if part is None else xml.vector(part, "xyz", f"the {part.tag} of {what}", 3)
-        for part in (parts["parent_axis"], tag)
+        _X if axis is None else xml.vector(axis, "xyz", f"an axis of {what}", 3)
+        for axis in (parent, child)
     )
     across = np.linalg.norm(np.cross(one, two))
     if not across <= _PARALLEL * np.linalg.norm(one) * np.linalg.norm(two):
         raise xml.fail(
-            tag,
+            child,
             f"the child_axis of {what} is another than parent_axis, turn the child's frame by "
             "the rpy of child_origin and leave child_axis out",
         )
+    element.remove(child)
