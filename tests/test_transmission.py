@@ -20,7 +20,8 @@ from crane.common.errors import InputError, OutOfReachError
 
 ROOT = Path(__file__).parents[1]
 OTHERS = ROOT.parent / "shared" / "data" / "third_party" / "parallel_robots"
-BUNDLED = ["mini_forwarder", "patu655_grapple", "excavator", DATA / "stewart.urdf"]
+BUNDLED = ["mini_forwarder", "patu655_grapple", "excavator", DATA / "stewart.urdf", DATA / "delta"]
+FLOATING = "excavator that floats"
 THEIRS = ["5bar_linkage_iso6d", "digit_like_2legs", "robot_delta", "wl16_like"]
 EPS = np.finfo(float).eps
 
@@ -28,13 +29,16 @@ EPS = np.finfo(float).eps
 def loaded(name):
     if name in THEIRS and not OTHERS.is_dir():
         pytest.skip(f"{OTHERS} with robots of others is not there")
+    if name == FLOATING:
+        return crane.load("excavator", floating=True)
     return crane.load(OTHERS / name if name in THEIRS else name)
 
 
 def near_home(machine, rng, share=1e-3):
     units = machine.closure.units[machine.closure.active]
     home = machine.home[machine.closure.active]
-    return home + share * units * rng.uniform(-1, 1, len(home))
+    moved = [not joint.startswith("base_") for joint in machine.active]
+    return home + share * units * rng.uniform(-1, 1, len(home)) * moved
 
 
 def by_pinocchio(text, state):
@@ -50,7 +54,7 @@ def by_pinocchio(text, state):
 
 
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
-@pytest.mark.parametrize("name", [*BUNDLED, *THEIRS], ids=lambda name: Path(name).stem)
+@pytest.mark.parametrize("name", [*BUNDLED, FLOATING, *THEIRS], ids=lambda name: Path(name).stem)
 def test_other_readers_place_every_link_of_the_tree_where_the_machine_has_it(name, tmp_path):
     machine, rng = loaded(name), np.random.default_rng(5)
     path = tmp_path / "tree.urdf"
@@ -58,12 +62,13 @@ def test_other_readers_place_every_link_of_the_tree_where_the_machine_has_it(nam
     transmission = crane.Transmission(machine)
     own = crane.Kinematics(machine, machine.tip or machine.closure.equations.loops[0].successor)
     tree = yourdfpy.URDF.load(path, load_meshes=False)
-    assert set(tree.actuated_joint_names) == set(machine.joints)
+    names = {x for x in machine.joints if not x.startswith("base_")}
+    assert set(tree.actuated_joint_names) - {"base"} == names
     for _ in range(5):
         q_a = near_home(machine, rng)
         state = transmission.update(machine.active, q_a)
         model, data, _ = by_pinocchio(path.read_text(), state)
-        assert set(model.names[1:]) == set(machine.joints)
+        assert set(model.names[1:]) - {"base"} == names == set(state.name)
         tree.update_cfg(dict(zip(state.name, state.position.tolist(), strict=True)))
         tolerance = 100 * EPS * machine.closure.size
         ends = [(loop.predecessor, loop.successor) for loop in machine.closure.equations.loops]
@@ -127,21 +132,29 @@ def test_velocities_are_derivatives_and_power_is_the_same_on_both_sides():
     assert np.allclose(list(f_a.values()), applied, rtol=1e-12)
 
 
-def test_forces_of_cylinders_are_moments_at_the_booms_and_back():
-    machine = loaded("patu655")
-    booms = ("slew", "q2", "q3", "X_ext")
+@pytest.mark.parametrize(
+    ("name", "joints"),
+    [
+        ("patu655", ("slew", "q2", "q3", "X_ext")),  # booms for their cylinders
+        (DATA / "stewart.urdf", ("a1", "b1", "s1", "c1", "d1", "e1")),  # one leg for all six
+    ],
+)
+def test_forces_of_actuators_are_forces_at_other_joints_and_back(name, joints):
+    machine, rng = loaded(name), np.random.default_rng(2)
     transmission = crane.Transmission(machine)
-    q_a = near_home(machine, np.random.default_rng(2), 0.02)
+    q_a = near_home(machine, rng, 0.02)
     state = transmission.update(machine.active, q_a)
-    forces = dict(zip(machine.active, (2e3, -6e4, 3e4, 1e3), strict=True))
-    moments = transmission.actuator_to_joint(forces, booms)
-    back = transmission.joint_to_actuator(moments)
-    assert np.allclose([back[x] for x in forces], list(forces.values()), rtol=1e-12)
-    seen = machine.driven_by(booms)  # whose own gravity is the same machine's
+    forces = dict(zip(machine.active, rng.normal(size=len(q_a)).tolist(), strict=True))
+    there = transmission.actuator_to_joint(forces, joints)
+    back = transmission.joint_to_actuator(there)
+    assert tuple(there) == joints
+    assert np.allclose([back[x] for x in forces], list(forces.values()), rtol=1e-10, atol=1e-10)
+    seen = machine.driven_by(joints)  # whose own gravity is the same machine's
     held = crane.Dynamics(machine).gravity(q_a)
-    moments = transmission.actuator_to_joint(dict(zip(machine.active, held, strict=True)), booms)
+    there = transmission.actuator_to_joint(dict(zip(machine.active, held, strict=True)), joints)
     expected = crane.Dynamics(seen).gravity(state.position[seen.closure.active])
-    assert np.allclose(list(moments.values()), expected, rtol=1e-10, atol=1e-9 * max(expected))
+    tolerance = 1e-9 * np.abs(expected).max()
+    assert np.abs(np.array(list(there.values())) - expected).max() < tolerance
 
 
 def test_messages_name_some_joints_in_any_order_and_others_too():
@@ -168,6 +181,24 @@ def test_messages_name_some_joints_in_any_order_and_others_too():
     state = transmission.update(["X_lift"], [home["X_lift"] + 0.01])  # its velocity is old now
     assert len(state.velocity) == len(state.effort) == 0
     assert np.array_equal(state.position[machine.column("X_tilt")], home["X_tilt"])
+
+
+def test_a_vehicle_that_floats_is_placed_by_others_and_its_crane_is_as_on_the_ground():
+    machine, same = loaded(FLOATING), loaded("excavator")
+    transmission, other = crane.Transmission(machine), crane.Transmission(same)
+    assert transmission.actuators == transmission.unheard == same.active
+    assert transmission.update(["base_x", "slew"], [3.0, 0.4], [1.0, 0.1]) is None
+    strokes = near_home(same, np.random.default_rng(6), 0.02)
+    states = [x.update(same.active, strokes, strokes, strokes) for x in (transmission, other)]
+    assert states[0].name == states[1].name
+    for field in ("position", "velocity", "effort"):
+        one, two = (getattr(state, field) for state in states)
+        assert np.allclose(one, two, rtol=1e-12, atol=1e-13)
+    wrench = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    there = [list(x.wrench_to_actuator(wrench).values()) for x in (transmission, other)]
+    assert np.allclose(*there, rtol=1e-11)
+    with pytest.raises(InputError, match="joint 'base_x' is unknown, known: X_arm, "):
+        transmission.joint_to_actuator({"base_x": 1.0})
 
 
 def test_what_is_out_of_reach_is_an_error_and_the_state_stays():

@@ -131,3 +131,17 @@ def test_a_constraint_needs_a_name_and_the_argument_is_true_or_false(tmp_path):
         crane.load(path, arguments=ASKED)
     with pytest.raises(InputError, match="argument urdf_constraint is 'yes', give true or false"):
         crane.load(path, arguments={"urdf_constraint": "yes"})
+
+
+def test_a_xacro_need_not_declare_the_argument(tmp_path):
+    pytest.importorskip("xacro")
+    path = written(tmp_path)
+    text = path.read_text().replace(
+        "<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ', 1
+    )
+    path = tmp_path / "four_bar.xacro"
+    path.write_text(text.replace('"0.3 0 0"', '"${0.1 * 3} 0 0"'))
+    machine = crane.load(path, arguments=ASKED)
+    assert np.allclose(machine.home, crane.load(DATA / LOOPED).home, atol=1e-14)
+    with pytest.raises(InputError, match="four_bar.xacro has no argument 'urdf_constrain'"):
+        crane.load(path, arguments={"urdf_constrain": True})

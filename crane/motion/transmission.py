@@ -21,10 +21,10 @@ class JointState:
     """Joints of a tree, with the fields of `sensor_msgs/JointState`.
 
     Attributes:
-        name: Names of all nv joints.
-        position: (nv,) [m], [rad].
-        velocity: (nv,) [m/s], [rad/s]; empty where that of an actuator is not known.
-        effort: (nv,) [N], [N m], of actuators at their own joints, of the others zero; empty
+        name: Names of all k joints.
+        position: (k,) [m], [rad].
+        velocity: (k,) [m/s], [rad/s]; empty where that of an actuator is not known.
+        effort: (k,) [N], [N m], of actuators at their own joints, of the others zero; empty
             where that of an actuator is not known.
     """
 
@@ -44,28 +44,36 @@ class Transmission:
         q = f(q_A),    v = gamma v_A,    f_A = gamma^T tau = gamma^T J^T w,
 
     so that f_A^T v_A = tau^T v. `update` takes the state of actuators and closes the loops, on
-    the branch of home; forces are mapped in the posture that it left.
+    the branch of home; forces are mapped in the posture that it left. The six freedoms of a
+    vehicle that floats are no joints here: it is where it is at home, and does not move.
 
     Args:
         machine: The machine.
 
     Attributes:
         machine: The machine.
+        actuators: Names of the n active joints.
+        joints: Names of the k joints of the tree.
         state: The last state of all joints, None until each active joint has been heard of.
     """
 
     def __init__(self, machine: Machine):
         self.machine = machine
         self.state: JointState | None = None
-        self._at = {joint: i for i, joint in enumerate(machine.active)}
-        self._heard = np.full((3, len(machine.active)), np.nan)  # a row per field
+        flown = {x for i in machine.coordinates.floating for x in machine.joints[i : i + 6]}
+        self.actuators = tuple(joint for joint in machine.active if joint not in flown)
+        self.joints = tuple(joint for joint in machine.joints if joint not in flown)
+        self._at = {joint: i for i, joint in enumerate(self.actuators)}
+        self._columns = np.array([machine.column(joint) for joint in self.joints], dtype=np.intp)
+        self._own = np.array([machine.active.index(x) for x in self.actuators], dtype=np.intp)
+        self._heard = np.full((3, len(self.actuators)), np.nan)  # a row per field
         self._gamma: Array | None = None
         self._jacobians = FrameJacobians(machine)
 
     def __repr__(self) -> str:
         """From where to where, of what."""
-        actuators, joints = ", ".join(self.machine.active), len(self.machine.joints)
-        return f"Transmission of '{self.machine.name}': {actuators} to {joints} joints"
+        actuators = ", ".join(self.actuators)
+        return f"Transmission of '{self.machine.name}': {actuators} to {len(self.joints)} joints"
 
     @property
     def unheard(self) -> tuple[str, ...]:
@@ -117,12 +125,15 @@ class Transmission:
 
     def _closed(self, q_a: Array, v_a: Array, f_a: Array) -> JointState:
         closure = self.machine.closure
-        q = closure.solve(q_a)
-        gamma = closure.gamma(q)
+        stroke = closure.home[closure.active]
+        stroke[self._own] = q_a
+        q = closure.solve(stroke)
+        gamma = closure.gamma(q)[np.ix_(self._columns, self._own)]
         effort = np.zeros(len(q))
-        effort[closure.active] = f_a
-        self._gamma = gamma
-        self.state = JointState(self.machine.joints, q, _whole(gamma @ v_a), _whole(effort))
+        effort[closure.active[self._own]] = f_a
+        position, effort = q[self._columns], effort[self._columns]
+        self._gamma, self._posture = gamma, q
+        self.state = JointState(self.joints, position, _whole(gamma @ v_a), _whole(effort))
         return self.state
 
     def joint_to_actuator(self, effort: Mapping[str, float]) -> dict[str, float]:
@@ -139,9 +150,9 @@ class Transmission:
         Raises:
             InputError: There is no such joint, or no state yet.
         """
-        gamma, tau = self._ratios(), np.zeros(len(self.machine.joints))
+        gamma, tau = self._ratios(), np.zeros(len(self.joints))
         for joint, value in effort.items():
-            tau[self.machine.column(joint)] = as_number(value, f"effort of {joint}", "")
+            tau[self._row(joint)] = as_number(value, f"effort of {joint}", "")
         return self._named(gamma.T @ tau)
 
     def actuator_to_joint(
@@ -168,12 +179,12 @@ class Transmission:
             if joint not in self._at:
                 raise InputError(f"'{joint}' is not active, {known(self._at, joint)}")
             f_a[self._at[joint]] = as_number(value, f"effort of {joint}", "")
-        columns = [self.machine.column(joint) for joint in joints]
-        units = self.machine.closure.units
-        own, active = units[columns], units[self.machine.closure.active]
-        rows = gamma[columns] / own[:, None] * active
+        found = [self._row(joint) for joint in joints]
+        units, active = self.machine.closure.units, self.machine.closure.active[self._own]
+        own, active = units[self._columns[found]], units[active]
+        rows = gamma[found] / own[:, None] * active
         sizes = np.linalg.svd(rows, compute_uv=False)
-        if len(columns) != len(f_a) or not sizes[-1] > _SINGULAR * sizes[0]:
+        if len(found) != len(f_a) or not sizes[-1] > _SINGULAR * sizes[0]:
             raise InputError(
                 f"{', '.join(joints) or 'no joint'} do not determine how the machine moves here, "
                 f"give {len(f_a)} independent joints"
@@ -202,15 +213,19 @@ class Transmission:
             raise InputError(f"machine '{self.machine.name}' has no tip, name a link")
         self.machine.frame(frame)
         given = as_sample(wrench, 6, f"the wrench on '{frame}'", PARTS)
-        assert self.state is not None, "its ratios are known"
-        self._jacobians.place(self.state.position)
-        return self._named(gamma.T @ (self._jacobians.of(frame).T @ given))
+        self._jacobians.place(self._posture)
+        return self._named(gamma.T @ (self._jacobians.of(frame).T @ given)[self._columns])
 
     def _ratios(self) -> Array:
         if self._gamma is None:
             unheard = ", ".join(self.unheard)
             raise InputError(f"the posture is not known yet, update it with {unheard}")
         return self._gamma
+
+    def _row(self, joint: str) -> int:
+        if joint not in self.joints:
+            raise InputError(f"joint '{joint}' is unknown, {known(self.joints, joint)}")
+        return self.joints.index(joint)
 
     def _named(self, f_a: Array) -> dict[str, float]:
         return dict(zip(self._at, f_a.tolist(), strict=True))
