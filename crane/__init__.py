@@ -40,7 +40,13 @@ if TYPE_CHECKING:
     from crane.dynamics import Dynamics
     from crane.dynamics.buckling import Buckling
     from crane.dynamics.reactions import Reactions
-    from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
+    from crane.formats import (
+        load,
+        robot_description,
+        write_machine,
+        write_mjcf,
+        write_urdf_plus,
+    )
     from crane.formats.adding import add_cylinder, add_loops
     from crane.formats.check import check
     from crane.hydraulics import PDGains
@@ -60,6 +66,7 @@ if TYPE_CHECKING:
         Kinematics,
         Sway,
         Trajectory,
+        Transmission,
         Turning,
         point_to_point,
         polynomial,
@@ -134,7 +141,7 @@ _HOMES = {
     "crane.dynamics": "Dynamics",
     "crane.dynamics.buckling": "Buckling",
     "crane.dynamics.reactions": "Reactions",
-    "crane.formats": "load write_machine write_mjcf write_urdf_plus",
+    "crane.formats": "load robot_description write_machine write_mjcf write_urdf_plus",
     "crane.formats.adding": "add_cylinder add_loops",
     "crane.formats.check": "check",
     "crane.hydraulics": "PDGains",
@@ -150,8 +157,8 @@ _HOMES = {
     "crane.identification.mechanics.payload": "identify_payload",
     "crane.identification.mechanics.result": "Identification",
     "crane.machine": "Machine Payload",
-    "crane.motion": "Kinematics Sway Trajectory Turning point_to_point polynomial read_path "
-    "retimed task_trajectory tip_trajectory via_attitudes via_points without_sway",
+    "crane.motion": "Kinematics Sway Trajectory Transmission Turning point_to_point polynomial "
+    "read_path retimed task_trajectory tip_trajectory via_attitudes via_points without_sway",
     "crane.motion.workspaces": "Workspace workspace",
     "crane.ratings": "Breakout Capacity Rule ToolForce Torques WorkingRange breakout capacity "
     "tool_force torques working_range",
@@ -167,24 +174,24 @@ _HOMES = {
 }
 
 __all__ = [
-    "Batch", "Breakout", "Buckling", "Calibration", "Capacity", "Closure", "Command",
-    "Comparison", "ComputedTorque", "Contact", "Controller", "CraneError", "CraneWarning",
-    "Cutting", "Design", "Dynamics", "EndStop", "Excitation", "ExternalForce", "ForceElement",
-    "Friction", "GasSpring", "Gradient", "Ground", "Identification", "InterruptedRun",
-    "Kinematics", "Law", "LinearModel", "Machine", "PDGains", "PI", "PIGains", "Payload", "Phase",
-    "PhasedWrench", "Phases", "PowerAccount", "PowerComparison", "Pushing", "Reactions",
-    "Recording", "Rope", "Rule", "SOILS", "Sampled", "Sensitivities", "Sensor",
-    "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy", "TipVelocity",
-    "ToolForce", "Torques", "Trajectory", "Turning", "ValveDrive", "ValveFeedforward", "ValvePD",
-    "WorkingRange", "Workspace", "Wrench", "add_cylinder", "add_loops", "breakout", "calibrate",
-    "capacity", "casadi_function", "check", "cross_validate", "design", "excite", "excite_valves",
-    "fastest", "gradient", "identify", "identify_cylinder_friction", "identify_orifices",
-    "identify_payload", "identify_valve", "joystick", "linear_models", "linearize", "load",
-    "point_to_point", "polynomial", "power_account", "read_measured", "read_path", "replay",
-    "report", "retimed", "sensitivities", "simulate", "simulate_batch", "sketch",
-    "sketch_circuit", "study", "sway_study", "task_trajectory", "tip_trajectory", "tool_force",
-    "torques", "via_attitudes", "via_points", "without_sway", "working_range", "workspace",
-    "write_machine", "write_mjcf", "write_urdf_plus",
+    "Batch", "Breakout", "Buckling", "Calibration", "Capacity", "Closure", "Command", "Comparison",
+    "ComputedTorque", "Contact", "Controller", "CraneError", "CraneWarning", "Cutting", "Design",
+    "Dynamics", "EndStop", "Excitation", "ExternalForce", "ForceElement", "Friction", "GasSpring",
+    "Gradient", "Ground", "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel",
+    "Machine", "PDGains", "PI", "PIGains", "Payload", "Phase", "PhasedWrench", "Phases",
+    "PowerAccount", "PowerComparison", "Pushing", "Reactions", "Recording", "Rope", "Rule",
+    "SOILS", "Sampled", "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study",
+    "Sway", "SwayStudy", "TipVelocity", "ToolForce", "Torques", "Trajectory", "Transmission",
+    "Turning", "ValveDrive", "ValveFeedforward", "ValvePD", "WorkingRange", "Workspace", "Wrench",
+    "add_cylinder", "add_loops", "breakout", "calibrate", "capacity", "casadi_function", "check",
+    "cross_validate", "design", "excite", "excite_valves", "fastest", "gradient", "identify",
+    "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
+    "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
+    "power_account", "read_measured", "read_path", "replay", "report", "retimed",
+    "robot_description", "sensitivities", "simulate", "simulate_batch", "sketch", "sketch_circuit",
+    "study", "sway_study", "task_trajectory", "tip_trajectory", "tool_force", "torques",
+    "via_attitudes", "via_points", "without_sway", "working_range", "workspace", "write_machine",
+    "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 
