@@ -123,7 +123,7 @@ if TYPE_CHECKING:
     from crane.view.page import report
     from crane.view.sketch import sketch, sketch_circuit
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 LOADED = time.time()  # before any other file of the package was read
 
 from crane.common import shown as _shown  # noqa: E402

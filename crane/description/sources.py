@@ -1,5 +1,6 @@
 """Where machines are found: bundled by name, example-robot-data by name, or a path."""
 
+import sys
 from functools import cache
 from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
@@ -27,8 +28,9 @@ def example_root() -> Path | None:
     """Folder `robots` of example-robot-data, or None where that is not installed."""
     try:
         listed = files("example-robot-data") or []
-    except PackageNotFoundError:
-        return None
+    except PackageNotFoundError:  # as where conda installed it, which keeps no list of Python's
+        shared = Path(sys.prefix, "share", "example-robot-data", "robots")
+        return shared if shared.is_dir() else None
     for item in listed:
         parts = item.parts
         if "robots" in parts:

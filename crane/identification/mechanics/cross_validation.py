@@ -13,6 +13,7 @@ from crane.common.samples import Array, as_number
 from crane.common.tables import aligned
 from crane.common.waiting import telling
 from crane.identification.mechanics.equations import Equations, Progress
+from crane.identification.mechanics.feasible import convex
 from crane.identification.mechanics.identify import Recorded, identify, motions_of
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.priors import by_name, stated
@@ -129,8 +130,10 @@ def _check(
     """See that settings are such as an identification takes, whatever is recorded.
 
     Raises:
-        InputError: One is not.
+        InputError: One is not, or what they need is not installed.
     """
+    if options.get("feasible"):
+        convex()
     model = Model(machine, options.get("terms"))
     for settings in grid:
         for name, value in settings.items():

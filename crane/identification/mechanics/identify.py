@@ -30,6 +30,7 @@ from crane.identification.mechanics.checks import doubt
 from crane.identification.mechanics.delays import delays
 from crane.identification.mechanics.determined import advice, magnitudes, sizes_of
 from crane.identification.mechanics.equations import Equations, Progress, long_enough
+from crane.identification.mechanics.feasible import convex
 from crane.identification.mechanics.inertias import body_names
 from crane.identification.mechanics.laws import Frictional
 from crane.identification.mechanics.model import Model
@@ -110,7 +111,7 @@ def identify(
         Parameters, their confidence, and how well they predict both recordings.
 
     Raises:
-        InputError: Arguments that do not fit.
+        InputError: Arguments that do not fit, or no CVXPY for feasible bodies.
         RecordingError: A recording that cannot serve, and why; one that determines nothing.
     """
     progress = telling(progress)
@@ -119,6 +120,8 @@ def identify(
     model = Model(machine, terms)
     if feasible and not model.bodies:
         raise InputError("the model has no bodies, so nothing has to be feasible")
+    if feasible:
+        convex()  # before all the work
     finished, progress = progress, in_parts(progress)
     tell_shared(_several(recording), _several(validation), trust)
     motions = motions_of(machine, recording, trust, progress)

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import InputError, OutputError
+from crane.common.errors import OutputError
+from crane.common.extras import library
 from crane.common.output import replacing
 from crane.common.samples import Array, as_sample
 from crane.common.shown import Brief, counted
@@ -230,15 +231,10 @@ class LinearModel(Brief):
         Raises:
             InputError: python-control is not installed.
         """
-        try:
-            from control import StateSpace  # type: ignore[import-untyped, unused-ignore]
-        except ImportError:
-            raise InputError(
-                "python-control is not installed, install it: pip install control"
-            ) from None
+        control = library("control", "to_control")
         names = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
         lists = {key: list(value) for key, value in names.items()}
-        return StateSpace(self.A, self.B, self.C, self.D, **lists)
+        return control.StateSpace(self.A, self.B, self.C, self.D, **lists)
 
     def save(self, path: str | Path) -> Path:
         """Write matrices, names and operating point as .mat (MATLAB, Octave) or .npz.
