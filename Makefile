@@ -5,11 +5,12 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.installed
 READY_DEV := .venv/.installed-dev
+READY_DOCS := .venv/.installed-docs
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test slow lint bench reproduce clean
+.PHONY: help setup demo test slow lint docs bench reproduce clean
 
 help:
 	@echo "make setup   create .venv and install the package with its extras and development tools"
@@ -17,6 +18,7 @@ help:
 	@echo "make test    fast tests"
 	@echo "make slow    slow tests: browser, MuJoCo, long simulations"
 	@echo "make lint    ruff and mypy"
+	@echo "make docs    the site, its tutorials executed and its links followed; build/site/index.html"
 	@echo "make bench   measure speed; results in docs/performance.md"
 	@echo "make reproduce   both forwarder papers again; docs/validation/"
 	@echo "make clean   remove .venv, caches and results"
@@ -40,6 +42,11 @@ $(READY_DEV): $(READY)
 	@$(INSTALL) --editable '.[dev]'
 	@touch $@
 
+$(READY_DOCS): $(READY)
+	@echo "Installing what builds the site into .venv: 0.2 GB of downloads, one to five minutes"
+	@$(INSTALL) --editable '.[docs]'
+	@touch $@
+
 demo: $(READY)
 	$(BIN)/crane demo --out demo-output --force
 
@@ -54,6 +61,11 @@ lint: $(READY_DEV)
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
 
+docs: $(READY_DOCS)
+	rm -rf build/site
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/site
+	$(BIN)/linkchecker --no-status build/site/index.html
+
 bench: $(READY_DEV)
 	$(BIN)/python scripts/benchmark.py --write docs/performance.md
 	$(BIN)/python scripts/large_machines.py --write docs/performance.md
@@ -63,5 +75,5 @@ reproduce: $(READY)
 	$(BIN)/python scripts/reproduce_hydraulic_forwarder.py --write docs/validation/hydraulic_forwarder.md
 
 clean:
-	rm -rf .venv .hypothesis .mypy_cache .pytest_cache .ruff_cache build dist demo-output
+	rm -rf .venv .hypothesis .mypy_cache .pytest_cache .ruff_cache build dist demo-output docs/generated
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

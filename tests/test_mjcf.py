@@ -395,9 +395,7 @@ def test_copies_of_other_files_are_counted(tmp_path, monkeypatch):
 
 def test_without_mujoco_the_error_says_how_to_install_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(
-        CraneError, match=r"stewart\.xml: reading MJCF needs MuJoCo, install it"
-    ):
+    with pytest.raises(CraneError, match=r"stewart\.xml: reading MJCF needs MuJoCo, install it"):
         crane.load(DATA / "stewart.xml")
 
 
