@@ -32,8 +32,8 @@ class Entry(NamedTuple):
 PAGES = (
     Entry(
         "A log crane of laboratory size",
-        "The published trajectory that picks up a log and places it into the bunk. Press play, turn "
-        "it with the mouse or a finger, and switch forces on.",
+        "The published trajectory that picks up a log and places it into the bunk. Press play, "
+        "turn it with the mouse or a finger, and switch forces on.",
         "simulate mini_forwarder --task loading --out loading\nview loading --no-open",
         "loading/view.html",
     ),
