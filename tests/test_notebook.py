@@ -250,6 +250,7 @@ def instances(mini, run):
         crane.Sampled(lambda t, *state: np.zeros(4), patu), crane.Sensor(),
         crane.Signals(patu, [0, 1], {x: zeros for x in patu.hydraulics.joints}),
         crane.Sway(grapple), crane.TipVelocity(patu, lambda t: np.zeros(3)),
+        crane.Transmission(mini),
         crane.Torques("X", "q", 1e4, 0.1, 5.0, 300.0, 1.0, 1.5e4, 1e4),
         crane.ValveDrive(patu, pd), crane.ValveFeedforward(patu, swing),
         crane.via_attitudes([0, 1], [[0, 0, 0], [0, 0, 1.0]]), crane.Wrench("tip", (0, 0, 1.0)),

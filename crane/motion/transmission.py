@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError, known
 from crane.common.samples import Array, as_number, as_sample
+from crane.common.shown import Brief
 from crane.description.external import PARTS
 from crane.dynamics.frames import FrameJacobians
 from crane.machine import Machine
@@ -34,7 +35,7 @@ class JointState:
     effort: Array
 
 
-class Transmission:
+class Transmission(Brief):
     """Positions, velocities and forces between the actuators and the joints of the tree.
 
     What ros2_control calls a transmission, with ratios that the loops determine. With q_A the
@@ -70,7 +71,7 @@ class Transmission:
         self._gamma: Array | None = None
         self._jacobians = FrameJacobians(machine)
 
-    def __repr__(self) -> str:
+    def _line(self) -> str:
         """From where to where, of what."""
         actuators = ", ".join(self.actuators)
         return f"Transmission of '{self.machine.name}': {actuators} to {len(self.joints)} joints"
