@@ -13,9 +13,10 @@ sys.path[:0] = [str(HERE), str(HERE.parent)]
 import crane  # noqa: E402
 
 project = "crane"
-author = "The crane authors"
+author = copyright = "The crane authors"
 version = release = crane.__version__
 language = "en"
+smartquotes = False  # they make a dash of the two before an option
 extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
