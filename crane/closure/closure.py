@@ -5,6 +5,7 @@ import dataclasses
 import threading
 from collections.abc import Collection, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -19,7 +20,7 @@ from crane.closure.following import followed
 from crane.closure.home import Sought, settle
 from crane.closure.structure import Structure
 from crane.closure.traced import geometry_of
-from crane.codegen import TooLongError, carefully
+from crane.codegen import TooLongError, carefully, kept_result
 from crane.common.errors import BranchEdgeError, InputError, MechanismError, WrongBranchError
 from crane.common.samples import Array, as_samples, per_sample, solve
 from crane.description import Coupling, LoopSpec
@@ -101,14 +102,8 @@ class Closure:
 
         self.guess = guess
         self.said = np.array(sorted(columns(said or ())), dtype=np.intp)
-        self.structure, self.sought = settle(
-            self.equations,
-            self.active,
-            self.passive,
-            guess,
-            None if said is None else columns(said),
-            columns(loose),
-        )
+        where = None if said is None else columns(said), columns(loose)
+        self.structure, self.sought = self._settled(*where)
         if wound:
             turns = np.round((guess - self.structure.home) / (2 * np.pi))
             turns[coordinates.slides] = 0.0
@@ -122,6 +117,23 @@ class Closure:
         )
         self.home = self._branch.home.q.copy()
         self.home.flags.writeable = False
+
+    def _settled(
+        self, said: list[int] | None, loose: list[int]
+    ) -> tuple[Structure, Sought | None]:
+        def find() -> tuple[Structure, Sought | None]:
+            return settle(self.equations, self.active, self.passive, self.guess, said, loose)
+
+        if not self.equations.names:
+            return find()
+        told = None if said is None else tuple(said)
+        depends = (self.parts, self.active, self.guess, told, tuple(loose))
+        return kept_result(("home", depends), find, "scipy.linalg")
+
+    @property
+    def parts(self) -> tuple[Any, ...]:
+        """All that its equations are made of, for `crane.codegen.kept_result`."""
+        return self.model.saveToString(), self.equations.loops, self.equations.couplings
 
     def __repr__(self) -> str:
         """Its loops, and what drives them."""

@@ -1,7 +1,6 @@
 """Where machines are found: bundled by name, example-robot-data by name, or a path."""
 
 from functools import cache
-from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
 from crane.common.errors import DescriptionError, known
@@ -25,6 +24,8 @@ def bundled() -> dict[str, Path]:
 @cache
 def example_root() -> Path | None:
     """Folder `robots` of example-robot-data, or None where that is not installed."""
+    from importlib.metadata import PackageNotFoundError, files  # slow to import
+
     try:
         listed = files("example-robot-data") or []
     except PackageNotFoundError:
