@@ -132,8 +132,15 @@ class Closure:
 
     @property
     def parts(self) -> tuple[Any, ...]:
-        """All that its equations are made of, for `crane.codegen.kept_result`."""
-        return self.model.saveToString(), self.equations.loops, self.equations.couplings
+        """All that its equations are made of, see `crane.codegen.kept_result`."""
+        loops = tuple(
+            (x.name, x.type, x.predecessor, x.successor, *map(float, x.axis))
+            for x in self.equations.loops
+        )
+        couplings = tuple(
+            (x.name, tuple(x.factors.items()), x.offset) for x in self.equations.couplings
+        )
+        return self.model.saveToString(), loops, couplings
 
     def __repr__(self) -> str:
         """Its loops, and what drives them."""

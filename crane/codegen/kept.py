@@ -36,9 +36,8 @@ def place_of(depends: Any, kind: str = "note") -> str | None:
     A program also depends on the package's files, on what traces it and on what compiles it.
 
     Args:
-        depends: Numbers, texts, bytes, arrays, dataclasses, mappings and tuples of them, which say
-            all that the program's formulas depend on besides; None where they depend on other
-            code.
+        depends: Numbers, texts, bytes, arrays, dataclasses and tuples of them, which say all that
+            the program's formulas depend on besides; None where they depend on other code.
         kind: Of what is kept.
 
     Raises:
@@ -60,8 +59,6 @@ def _plain(value: Any) -> Any:
         return value
     if isinstance(value, tuple):
         return tuple(map(_plain, value))
-    if isinstance(value, Mapping):
-        return "mapping", tuple((_plain(key), _plain(x)) for key, x in value.items())
     if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
         return value.dtype.str, value.shape, value.tobytes()
     if is_dataclass(value) and not isinstance(value, type):

@@ -148,8 +148,9 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
     closure = machine.closure
     depends = (
         closure.parts, closure.structure, machine.home, machine.lower, machine.upper,
-        machine.active, machine.driven, machine.tip, task, chosen.space, chosen.duration,
-        chosen.coefficients, chosen.via,
+        machine.active, machine.driven, machine.tip, chosen.space, chosen.duration,
+        tuple((name, tuple(row)) for name, row in chosen.coefficients.items()),
+        tuple((x.time, tuple(x.point.items()), tuple(x.rates.items())) for x in chosen.via),
     )  # fmt: skip
     return kept_result(("task", depends), lambda: _followed(machine, chosen), "scipy.interpolate")
 
