@@ -94,7 +94,7 @@ class Closure:
         self.active_names = tuple(active)
         coordinates = self.equations.coordinates
         self.active = np.array([coordinates.column(name) for name in active], dtype=np.intp)
-        self.passive = np.setdiff1d(np.arange(model.nv), self.active)
+        self.passive = np.delete(np.arange(model.nv), self.active)
         self._names = coordinates.names
 
         def columns(names: Collection[str]) -> list[int]:
