@@ -1,5 +1,6 @@
 """The program: options of all commands, and what becomes of errors."""
 
+import gc
 import io
 import os
 import sys
@@ -37,9 +38,12 @@ from crane.cli.shared import INTERRUPTED, app, say
 from crane.cli.waiting import watched
 from crane.common.errors import CraneError, CraneWarning, one_line
 
+_SPARING = 20_000  # objects between collections: nearly all that starting makes is there to stay
+
 
 def main() -> None:
     """Run the command line: errors are one line, exit status 2."""
+    gc.set_threshold(_SPARING)
     arguments = [word for word in sys.argv[1:] if word != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may be no text

@@ -5,6 +5,7 @@ import dataclasses
 import threading
 from collections.abc import Collection, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -19,7 +20,7 @@ from crane.closure.following import followed
 from crane.closure.home import Sought, settle
 from crane.closure.structure import Structure
 from crane.closure.traced import geometry_of
-from crane.codegen import TooLongError, carefully
+from crane.codegen import TooLongError, carefully, kept_result
 from crane.common.errors import BranchEdgeError, InputError, MechanismError, WrongBranchError
 from crane.common.samples import Array, as_samples, per_sample, solve
 from crane.common.shown import Brief
@@ -94,7 +95,7 @@ class Closure(Brief):
         self.active_names = tuple(active)
         coordinates = self.equations.coordinates
         self.active = np.array([coordinates.column(name) for name in active], dtype=np.intp)
-        self.passive = np.setdiff1d(np.arange(model.nv), self.active)
+        self.passive = np.delete(np.arange(model.nv), self.active)
         self._names = coordinates.names
 
         def columns(names: Collection[str]) -> list[int]:
@@ -102,14 +103,8 @@ class Closure(Brief):
 
         self.guess = guess
         self.said = np.array(sorted(columns(said or ())), dtype=np.intp)
-        self.structure, self.sought = settle(
-            self.equations,
-            self.active,
-            self.passive,
-            guess,
-            None if said is None else columns(said),
-            columns(loose),
-        )
+        where = None if said is None else columns(said), columns(loose)
+        self.structure, self.sought = self._settled(*where)
         if wound:
             turns = np.round((guess - self.structure.home) / (2 * np.pi))
             turns[coordinates.slides] = 0.0
@@ -123,6 +118,30 @@ class Closure(Brief):
         )
         self.home = self._branch.home.q.copy()
         self.home.flags.writeable = False
+
+    def _settled(
+        self, said: list[int] | None, loose: list[int]
+    ) -> tuple[Structure, Sought | None]:
+        def find() -> tuple[Structure, Sought | None]:
+            return settle(self.equations, self.active, self.passive, self.guess, said, loose)
+
+        if not self.equations.names:
+            return find()
+        told = None if said is None else tuple(said)
+        depends = (self.parts, self.active, self.guess, told, tuple(loose))
+        return kept_result(("home", depends), find, "scipy.linalg")
+
+    @property
+    def parts(self) -> tuple[Any, ...]:
+        """All that its equations are made of, see `crane.codegen.kept_result`."""
+        loops = tuple(
+            (x.name, x.type, x.predecessor, x.successor, *map(float, x.axis))
+            for x in self.equations.loops
+        )
+        couplings = tuple(
+            (x.name, tuple(x.factors.items()), x.offset) for x in self.equations.couplings
+        )
+        return self.model.saveToString(), loops, couplings
 
     def _line(self) -> str:
         """Its loops, and what drives them."""

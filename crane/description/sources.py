@@ -2,7 +2,6 @@
 
 import sys
 from functools import cache
-from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
 from crane.common.errors import DescriptionError, known
@@ -26,6 +25,8 @@ def bundled() -> dict[str, Path]:
 @cache
 def example_root() -> Path | None:
     """Folder `robots` of example-robot-data, or None where that is not installed."""
+    from importlib.metadata import PackageNotFoundError, files  # slow to import
+
     try:
         listed = files("example-robot-data") or []
     except PackageNotFoundError:  # as where conda installed it, which keeps no list of Python's

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import PPoly
 
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number, as_samples
 from crane.common.shown import Brief, counted
+from crane.motion.piecewise import Piecewise
 from crane.motion.splines import least_jerk, quintics
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ class Trajectory(Brief):
 
     def __init__(
         self,
-        curve: PPoly,
+        curve: Piecewise,
         tip: "Trajectory | None" = None,
         attitude: "Trajectory | Turning | None" = None,
     ):
@@ -81,7 +81,7 @@ class Trajectory(Brief):
     def turns(self) -> Array:
         """Times (k,) [s] at which a coordinate may be largest or least: knots, and rests."""
         curve, rate = self._curves[:2]
-        rests = [np.ravel(roots) for roots in np.ravel(rate.roots(extrapolate=False))]
+        rests = [np.ravel(roots) for roots in np.ravel(rate.roots())]
         times = np.concatenate([curve.x, *rests])
         return np.unique(times[np.isfinite(times)])
 
@@ -132,7 +132,7 @@ def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Traj
     table = np.zeros((size, 1, len(rows)))
     for column, row in enumerate(rows):
         table[size - len(row) :, 0, column] = row[::-1]
-    return Trajectory(PPoly(table, [0.0, duration]))
+    return Trajectory(Piecewise(table, np.array([0.0, duration])))
 
 
 def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Trajectory:

@@ -6,7 +6,6 @@ from functools import cached_property
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
-from scipy.interpolate import make_interp_spline
 
 from crane.closure.traced import Bodies, Constants, Loops, MovingBodies, folded
 from crane.codegen import Number, Program, Tape, TooLongError
@@ -337,6 +336,8 @@ class Kinematics(Brief):
                 for k in range(knots[max(i - 1, 0)], knot + 1):
                     start = self._inverse(targets[k], start, places[k], None)
                 return None
+        from scipy.interpolate import make_interp_spline  # slow to import
+
         try:
             curve = make_interp_spline(knots, searched)(np.arange(len(targets)))
             q_a = curve = np.clip(curve, machine.lower, machine.upper)
