@@ -1,6 +1,7 @@
 """Cylinders put into open machines: their steel, where they fit, and what the machine is then."""
 
 import os
+import re
 import warnings
 from pathlib import Path
 
@@ -319,18 +320,35 @@ def test_strokes_beyond_a_dead_centre_are_told(tmp_path):
         machine.closure.solve(q_a)
 
 
-def test_bodies_lighter_than_their_cylinder_are_told(tmp_path):
+def test_machines_lighter_than_their_cylinder_are_told(tmp_path):
     """Files of other people have placeholders for masses: forces would be those of the steel."""
     path = planar(tmp_path)
     path.write_text(path.read_text().replace('mass value="800.0"', 'mass value="0.03"'))
-    _, told = told_by(crane.add_cylinder, path, name="hoist", out=tmp_path / "d.yaml", **LIFT)
+    lift, fold = LIFT | {"name": "hoist"}, FOLD | {"name": "crowd"}
+    _, told = told_by(crane.add_cylinder, path, out=tmp_path / "d.yaml", **lift)
+    assert not any("weighs" in line for line in told)  # it moves the arm as well
+    path.write_text(re.sub('mass value=".*?"', 'mass value="0.03"', path.read_text()))
+    _, told = told_by(crane.add_cylinder, path, out=tmp_path / "e.yaml", **lift)
     assert told[-1] == (
-        "the cylinder weighs 81.26 kg, and 'boom' 0.03 kg: forces are little more than its own "
-        "weight, give the bodies the masses of the real machine"
+        "the cylinder weighs 81.26 kg, and all that 'lift' moves 0.06 kg: forces are little more "
+        "than its own weight, give the bodies the masses of the real machine"
     )
-    _, told = told_by(crane.add_cylinder, path, name="crowd", out=tmp_path / "e.yaml",
-                      **FOLD | {"bore": 0.03, "rod": 0.02})  # fmt: skip
-    assert not any("arm" in line for line in told if "weighs" in line)
+    _, told = told_by(crane.add_cylinder, path, out=tmp_path / "f.yaml", **fold)
+    assert "all that 'fold' moves 0.03 kg" in told[-1]
+
+
+def test_a_joint_without_limits_takes_those_of_its_cylinder(tmp_path):
+    path = planar(tmp_path)
+    path.write_text(path.read_text().replace('"lift" type="revolute"', '"lift" type="continuous"'))
+    added, told = told_by(crane.add_cylinder, path, out=tmp_path / "d.yaml", **LIFT)
+    assert not told
+    machine = crane.load(added.path)
+    lift = machine.closure.solve([[0.0, 1.0], [0.9, 1.0]])[:, machine.column("lift")]
+    foot, eye = np.array([0.6, -0.8]), np.array([1.9, 0.3])  # from the pin of the boom
+    a, b, length = np.linalg.norm(foot), np.linalg.norm(eye), np.array([1.3, 2.2])
+    angle = np.arccos((a**2 + b**2 - length**2) / (2 * a * b))  # by the law of cosines
+    assert abs(lift[1] - lift[0]) == pytest.approx(angle[1] - angle[0])
+    assert added.length[0] < length[0] and added.length[1] > length[1]
 
 
 def test_what_belonged_to_the_joint_is_left_out(tmp_path):

@@ -42,15 +42,5 @@ def check(
 
         print(f"home written to {write(file, *driven, *found)}")
         report = check_machine(file, *driven, floating, *found)
-    for line in report.lines:
-        print(line)
-    if report.summary is not None:
-        print(report.summary)
-    for note in report.notes:
-        print(note)
-    if report.findings:
-        print(report.counts)
-    for line in report.proposed:
-        print(line)
-    print(f"next: {report.next}")
+    print(report)
     raise typer.Exit(report.status)

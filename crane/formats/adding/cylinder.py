@@ -134,7 +134,7 @@ def add_cylinder(
             warnings.simplefilter("ignore", CraneWarning)
             closed = load(part / file.name)  # what does not load is not left behind
         warn_of_strokes(closed, name)
-    warn_of_masses(loaded, steel, eyes)
+    warn_of_masses(loaded, steel, span.joint)
     return _added(file, name, loaded, steel, span, reached, shares, notes)
 
 

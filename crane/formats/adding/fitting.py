@@ -3,12 +3,15 @@
 import warnings
 from collections.abc import Sequence
 
+import numpy as np
+
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.formats.adding.eyes import Eye
 from crane.formats.adding.span import Span
 from crane.formats.adding.steel import SteelCylinder
 from crane.machine import Machine
 
+_STILL = 1e-9  # rate against the joint's, below which something does not move
 _RESOLVED = 1e-4  # of the stroke, to which its reachable part is told
 
 
@@ -35,35 +38,39 @@ def fitted(
         )
     start, reached = found
     if len(reached) < len(span.values):
+        index = machine.active.index(span.joint)
+        endless = bool(np.isinf([machine.lower[index], machine.upper[index]]).all())
         a, b = span.values[reached[0]], span.values[reached[-1]]
         inside = (span.length >= ends[0]) & (span.length <= ends[1])
         beyond = [k for k in (reached[0] - 1, reached[-1] + 1) if 0 <= k < len(inside)]
         dead = [f"{span.values[k]:.4g}" for k in beyond if inside[k]]
         what = f", with a dead centre at {' and '.join(dead)}" if dead else ""
-        warnings.warn(
-            f"'{span.joint}' moves from {values}, and a cylinder of {ends[0]:.4g} to "
-            f"{ends[1]:.4g} m drives it from {a:.4g} to {b:.4g}{what}: its eyes are {lengths} "
-            "apart over all of it, choose stroke, dead length or eyes by that",
-            CraneWarning,
-            stacklevel=4,
-        )
+        if dead or not endless:  # else its range is what the stroke makes of it
+            warnings.warn(
+                f"'{span.joint}' moves from {values}, and a cylinder of {ends[0]:.4g} to "
+                f"{ends[1]:.4g} m drives it from {a:.4g} to {b:.4g}{what}: its eyes are {lengths} "
+                "apart over all of it, choose stroke, dead length or eyes by that",
+                CraneWarning,
+                stacklevel=4,
+            )
     return start, reached
 
 
-def warn_of_masses(machine: Machine, steel: SteelCylinder, eyes: Sequence[Eye]) -> None:
-    """Warn of bodies that are lighter than the cylinder between them, as placeholders are."""
+def warn_of_masses(machine: Machine, steel: SteelCylinder, joint: str) -> None:
+    """Warn where all that a joint moves is lighter than its cylinder, as placeholders are."""
     model, own = machine.model, steel.barrel.mass + steel.piston_rod.mass
-    bodies = {eye.link: model.frames[machine.frame(eye.link)].parentJoint for eye in eyes}
-    light = {
-        link: model.inertias[body].mass
-        for link, body in bodies.items()
-        if body and model.inertias[body].mass < own
-    }
-    if light:
-        told = " and ".join(f"'{link}' {mass:.3g} kg" for link, mass in light.items())
+    rates = machine.closure.gamma(machine.home)[:, machine.active.index(joint)]
+    moving = [
+        i for i, x in enumerate(model.joints)
+        if (np.abs(rates[x.idx_v : x.idx_v + x.nv]) > _STILL).any() and i
+    ]  # fmt: skip
+    bodies = {body for i in moving for body in model.subtrees[i]}
+    mass = sum(model.inertias[body].mass for body in bodies)
+    if mass < own:
         warnings.warn(
-            f"the cylinder weighs {own:.4g} kg, and {told}: forces are little more than its own "
-            "weight, give the bodies the masses of the real machine",
+            f"the cylinder weighs {own:.4g} kg, and all that '{joint}' moves {mass:.3g} kg: "
+            "forces are little more than its own weight, give the bodies the masses of the real "
+            "machine",
             CraneWarning,
             stacklevel=4,
         )

@@ -76,6 +76,11 @@ class Report:
     proposals: tuple[Proposal, ...] = ()
     notes: tuple[str, ...] = ()
 
+    def __str__(self) -> str:
+        """All of it as the command prints it: what to mend, the machine, and what comes next."""
+        told = [*self.lines, self.summary, *self.notes, self.counts * bool(self.findings)]
+        return "\n".join([*filter(None, told), *self.proposed, f"next: {self.next}"])
+
     @property
     def proposed(self) -> list[str]:
         """The proposed loops as they are pasted into a machine file."""
