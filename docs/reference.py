@@ -24,7 +24,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Write the pages before any is read."""
     app.add_role("public", Public())
     app.connect("config-inited", lambda *_: write())
-    app.connect("autodoc-process-docstring", _tables)
+    app.connect("autodoc-process-docstring", _restructured, priority=400)  # before napoleon
     return {"parallel_read_safe": True}
 
 
@@ -46,20 +46,35 @@ class Public(SphinxRole):
         return [link], []
 
 
-def _tables(
+def _restructured(
     _app: Sphinx, _what: str, _name: str, _of: Any, _options: Any, lines: list[str]
 ) -> None:
-    """Tables of docstrings, written as in Markdown, as reStructuredText has them."""
+    """Docstrings as reStructuredText has them: tables of Markdown, equations in indented blocks."""
     written: list[str] = []
+    block, last = 0, ""  # indentation of a block of equations, the last line that is not empty
     for before, line in zip(["", *lines], lines, strict=False):
-        if not line.startswith("|"):
+        indent = len(line) - len(line.lstrip())
+        if not line or (block and indent >= block):
             written.append(line)
-        elif not set(line) <= set("|-: "):
-            if not before.startswith("|"):
-                written += [".. list-table::", "   :header-rows: 1", ""]
-            first, *others = line.strip("|").split(" | ")
-            written += [f"   * - {first.strip()}", *(f"     - {cell.strip()}" for cell in others)]
+        elif not before and last and indent > len(last) - len(last.lstrip()):
+            block = indent
+            written += [" " * (len(last) - len(last.lstrip())) + "::", "", line]
+        elif line.startswith("|"):
+            block = 0
+            written += _row(line, first=not before)
+        else:
+            block = 0
+            written.append(line.replace("|", "\\|"))
+        last = line or last
     lines[:] = written
+
+
+def _row(line: str, first: bool) -> list[str]:
+    if set(line) <= set("|-: "):
+        return []
+    key, *others = line.strip("|").split(" | ")
+    head = [".. list-table::", "   :header-rows: 1", ""] if first else []
+    return [*head, f"   * - {key.strip()}", *(f"     - {cell.strip()}" for cell in others)]
 
 
 def write() -> None:
