@@ -117,7 +117,9 @@ def test_logs_that_cannot_be_read(log, tmp_path):
     for path, text, message in (
         ("gone.npz", None, "no such file"),
         ("gone.csv", None, "no such file"),
-        ("words.csv", "t,x\n0,up\n", "no table of numbers"),
+        ("words.csv", "t,x\n0,up\n", "words.csv: line 2, column 'x': 'up' is not a number"),
+        ("empty.csv", "# a: 1\nt;x\n0;1\n1;\n", "line 4, column 'x': '' is not a number, corr"),
+        ("short_row.csv", "t;x\n0;1\n1\n", "no table of numbers"),
         ("twice.csv", "t,t\n0,1\n", "1 different names head 2 columns"),
         ("short.csv", "t\n0,1\n", "1 different names head 2 columns"),
     ):

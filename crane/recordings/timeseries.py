@@ -207,7 +207,7 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
         _check_end(path, notes)
         between = max(",;\t", key=heading.count)
         names = [cell.strip() for cell in next(csv.reader([heading], delimiter=between))]
-        values = _numbers(path, line, between)
+        values = _numbers(path, line, between, names)
         _check_count(values, notes)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
@@ -460,21 +460,38 @@ def _values(path: Path, header: int, lines: int, units: Mapping[str, str]) -> Ar
     return values
 
 
-def _numbers(path: Path, header: int, between: str) -> Array:
-    """Numbers (N, columns) below the header row.
+def _numbers(path: Path, header: int, between: str, names: Sequence[str]) -> Array:
+    """Numbers (N, columns) of a log, below its header row.
 
     Raises:
-        RecordingError: There are none.
-        ValueError: Something else is there.
+        RecordingError: There are none, or a cell holds something else.
+        ValueError: Lines have not as many cells as others.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about a file without samples
-        values = np.loadtxt(
-            path, delimiter=between, comments=None, skiprows=header, ndmin=2, encoding="utf-8"
-        )
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about a file without samples
+            values = np.loadtxt(
+                path, delimiter=between, comments=None, skiprows=header, ndmin=2, encoding="utf-8"
+            )
+    except ValueError:
+        _find_word(path, header, between, names)
+        raise
     if not values.size:
         raise RecordingError("has a header and no samples, write one row per sample")
     return values
+
+
+def _find_word(path: Path, header: int, between: str, names: Sequence[str]) -> None:
+    """Raise an error about the first cell of a log that is no number."""
+    with path.open(encoding="utf-8-sig") as file:
+        for line, text in enumerate(file, start=1):
+            cells = text.rstrip("\n").split(between) if line > header and text.strip() else []
+            for name, cell in zip(names, cells, strict=False):
+                if _number(cell) is None:
+                    raise RecordingError(
+                        f"line {line}, column '{name}': '{_shown(cell)}' is not a number, correct "
+                        f"or remove the line"
+                    )
 
 
 def _number(cell: str) -> float | None:

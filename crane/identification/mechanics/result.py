@@ -215,7 +215,7 @@ class Identification(Brief):
 
     @property
     def machine(self) -> Machine:
-        """The machine that was identified."""
+        """As it was described; `crane identify` writes it as it was identified."""
         return self.model.machine
 
     def to_text(self) -> str:
