@@ -61,8 +61,8 @@ def main() -> None:
     warnings.showwarning = _show_warning
     warnings.simplefilter("once", CraneWarning)
     try:
+        run = program(*arguments[:1])
         with watched(" ".join(["crane", *arguments[:1]])):
-            run = program(*arguments[:1])
             status = run(args=arguments, standalone_mode=False, prog_name="crane")
         if status == INTERRUPTED:  # what the parser makes of KeyboardInterrupt
             raise KeyboardInterrupt
