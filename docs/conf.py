@@ -35,6 +35,7 @@ myst_heading_anchors = 4
 nb_execution_mode = "force"  # what is kept of notebooks does not know that the package has changed
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
+nb_execution_in_temp = True
 nb_merge_streams = True
 
 autodoc_member_order = "bysource"

@@ -49,7 +49,7 @@ class Public(SphinxRole):
 def _restructured(
     _app: Sphinx, _what: str, _name: str, _of: Any, _options: Any, lines: list[str]
 ) -> None:
-    """Docstrings as reStructuredText has them: tables of Markdown, equations in indented blocks."""
+    """Docstrings as reStructuredText has them: tables of Markdown, indented equations."""
     written: list[str] = []
     block, last = 0, ""  # indentation of a block of equations, the last line that is not empty
     for before, line in zip(["", *lines], lines, strict=False):
