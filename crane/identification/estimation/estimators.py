@@ -255,7 +255,9 @@ class _Rows:
         self.members = [np.flatnonzero(groups == g) for g in range(int(groups.max()) + 1)]
         self.groups = groups
         for g, rows in enumerate(self.members):
-            if len(rows) < 2 or (np.diff(samples[rows]) <= 0).any():
+            if len(rows) < 2:
+                raise InputError(f"group {g} has {len(rows)} row, give two at least")
+            if (np.diff(samples[rows]) <= 0).any():
                 raise InputError(f"samples of group {g} do not increase, sort its rows by time")
         self.mean = np.zeros(size)
         self.pull = np.zeros((0, size)) if pull is None else pull

@@ -235,6 +235,12 @@ def equations_of(
     rows = Equations(model, base_parameters(model), motions, bandwidth, limits, progress)
     if not rows.moving.any():
         raise RecordingError("no joint moves faster than what counts as standstill, move it more")
+    for joint, count in zip(model.machine.active, rows.moving.sum(axis=0), strict=True):
+        if count == 1:  # which tells nothing of its noise
+            raise RecordingError(
+                f"'{joint}' is in one sample only faster than what counts as standstill, move it "
+                "more, or raise its slow"
+            )
     # of columns, the triangular factors tell what all rows tell
     return rows, rows.base.narrowed(np.vstack(list(rows.factors[:, :, :-1])))
 
