@@ -13,7 +13,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxRole
 
 import crane
-from crane.cli import app as commands
+from crane.cli import program
 
 HERE = Path(__file__).parent
 GENERATED = HERE / "generated"
@@ -134,7 +134,7 @@ def _commands() -> str:
     import typer
     from typer.cli import get_docs_for_click
 
-    command = typer.main.get_command(commands)
+    command = typer.main.get_command(program())
     context = typer.Context(command, info_name="crane")
     return str(get_docs_for_click(obj=command, ctx=context, name="crane", title="Commands"))
 

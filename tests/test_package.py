@@ -99,7 +99,7 @@ def test_robots_are_found_where_conda_puts_them(monkeypatch, tmp_path):
     def unlisted(name):
         raise PackageNotFoundError(name)
 
-    monkeypatch.setattr(sources, "files", unlisted)
+    monkeypatch.setattr("importlib.metadata.files", unlisted)
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
     assert sources.example_root.__wrapped__() is None
     robots = tmp_path / "share" / "example-robot-data" / "robots"
