@@ -12,7 +12,7 @@ from hydraulic_rig import COMPENSATED, rig
 from test_open_loops import five_bar
 
 import crane
-from crane.cli import app
+from crane.cli import program
 from crane.cli.simulate import control_of, under_task
 
 DATA = Path(__file__).parent / "data"
@@ -79,7 +79,7 @@ def writing():
     """Names of the commands that take a place to write to, or write into what they read."""
     return {
         name
-        for name, command in _walked(typer.main.get_command(app))
+        for name, command in _walked(typer.main.get_command(program()))
         if {one.name for one in command.params} & {"out", "force", "write_home"}
     }
 
