@@ -45,8 +45,8 @@ def starts(rounds: int) -> str:
             for name, arguments in _processes()
         ]
     first = _both(lambda: _process((_MAIN, *_RUN), None), rounds)
-    rows.append(("the simulation, neither Python's bytecode nor machine code kept", *first))
-    processes = table(("process, from its second run on", "wall [s]", "CPU [s]"), rows)
+    rows.append(("the simulation, the first ever: neither Python's bytecode nor machine code kept", *first))
+    processes = table(("process; bytecode, machine code and results are kept", "wall [s]", "CPU [s]"), rows)
     # in processes of their own: machines of equal formulas share their machine code
     with tempfile.TemporaryDirectory() as kept:
         first, later = (_spent(kept) for _ in range(2))
