@@ -45,8 +45,9 @@ def starts(rounds: int) -> str:
             for name, arguments in _processes()
         ]
     first = _both(lambda: _process((_MAIN, *_RUN), None), rounds)
-    rows.append(("the simulation, neither Python's bytecode nor machine code kept", *first))
-    processes = table(("process, from its second run on", "wall [s]", "CPU [s]"), rows)
+    rows.append(("the simulation, where neither bytecode nor machine code is kept", *first))
+    title = "process; bytecode, machine code and results are kept"
+    processes = table((title, "wall [s]", "CPU [s]"), rows)
     # in processes of their own: machines of equal formulas share their machine code
     with tempfile.TemporaryDirectory() as kept:
         first, later = (_spent(kept) for _ in range(2))
