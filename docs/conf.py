@@ -16,6 +16,7 @@ project = "crane"
 author = copyright = "The crane authors"
 version = release = crane.__version__
 language = "en"
+highlight_language = "none"  # of equations in docstrings
 smartquotes = False  # they make a dash of the two before an option
 extensions = [
     "myst_nb",
