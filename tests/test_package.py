@@ -95,6 +95,12 @@ def test_identify_says_at_once_what_feasible_bodies_need(tried, tmp_path, monkey
     assert not (tmp_path / "found").exists()
 
 
+def test_it_is_said_before_recordings_are_looked_at(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cvxpy", None)
+    with pytest.raises(InputError, match="a feasible estimate needs CVXPY"):
+        crane.identify(crane.load("mini_forwarder"), [], feasible=True)
+
+
 def test_robots_are_found_where_conda_puts_them(monkeypatch, tmp_path):
     def unlisted(name):
         raise PackageNotFoundError(name)
