@@ -4,23 +4,26 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.installed
-READY_BENCH := .venv/.installed-bench
+READY_DEV := .venv/.installed-dev
+READY_DOCS := .venv/.installed-docs
+INSTALL := $(BIN)/python -m pip install --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test slow lint bench reproduce clean
+.PHONY: help setup demo test slow lint docs bench reproduce clean
 
 help:
-	@echo "make setup   create .venv and install the package with its development tools"
+	@echo "make setup   create .venv and install the package with its extras and development tools"
 	@echo "make demo    simulate the mini forwarder; results in demo-output/"
 	@echo "make test    fast tests"
 	@echo "make slow    slow tests: browser, MuJoCo, long simulations"
 	@echo "make lint    ruff and mypy"
+	@echo "make docs    the site, its tutorials executed and its links followed; build/site/index.html"
 	@echo "make bench   measure speed; results in docs/performance.md"
 	@echo "make reproduce   both forwarder papers again; docs/validation/"
 	@echo "make clean   remove .venv, caches and results"
 
-setup: $(READY)
+setup: $(READY_DEV)
 
 $(READY): pyproject.toml
 	@$(PYTHON) -c "" 2>/dev/null || \
@@ -29,30 +32,41 @@ $(READY): pyproject.toml
 	    { echo "error: $$($(PYTHON) --version) is too old or too new, take 3.11 to 3.14: make PYTHON=python3.12" >&2; exit 2; }
 	@$(PYTHON) -c "import venv, ensurepip" 2>/dev/null || \
 	    { echo "error: $(PYTHON) has no venv module, install it: sudo apt install python3-venv (Debian, Ubuntu)" >&2; exit 2; }
-	@echo "Installing into .venv (the first time takes a few minutes)"
+	@echo "Installing the package and what it needs into .venv: 0.4 GB of downloads, one to five minutes"
 	@$(PYTHON) -m venv .venv
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@$(INSTALL) --editable .
 	@touch $@
 
-$(READY_BENCH): $(READY)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
+$(READY_DEV): $(READY)
+	@echo "Installing the development tools into .venv: 0.3 GB of downloads, one to five minutes"
+	@$(INSTALL) --editable '.[dev]'
+	@touch $@
+
+$(READY_DOCS): $(READY)
+	@echo "Installing what builds the site into .venv: 0.2 GB of downloads, one to five minutes"
+	@$(INSTALL) --editable '.[docs]'
 	@touch $@
 
 demo: $(READY)
 	$(BIN)/crane demo --out demo-output --force
 
-test: $(READY)
+test: $(READY_DEV)
 	$(BIN)/python -m pytest -n 2
 
-slow: $(READY_BENCH)
+slow: $(READY_DEV)
 	$(BIN)/python -m pytest -n 2 -m slow
 
-lint: $(READY)
+lint: $(READY_DEV)
 	$(BIN)/python -m ruff check .
 	$(BIN)/python -m ruff format --check .
 	$(BIN)/python -m mypy
 
-bench: $(READY_BENCH)
+docs: $(READY_DOCS)
+	rm -rf build/site
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs build/site
+	$(BIN)/linkchecker --no-status build/site/index.html
+
+bench: $(READY_DEV)
 	$(BIN)/python scripts/benchmark.py --write docs/performance.md
 	$(BIN)/python scripts/large_machines.py --write docs/performance.md
 
@@ -61,5 +75,5 @@ reproduce: $(READY)
 	$(BIN)/python scripts/reproduce_hydraulic_forwarder.py --write docs/validation/hydraulic_forwarder.md
 
 clean:
-	rm -rf .venv .hypothesis .mypy_cache .pytest_cache .ruff_cache build dist demo-output
+	rm -rf .venv .hypothesis .mypy_cache .pytest_cache .ruff_cache build dist demo-output docs/generated
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,5 +1,6 @@
 """crane: machines with closed kinematic chains, computed in their actuators."""
 
+import sys
 import time
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -39,7 +40,13 @@ if TYPE_CHECKING:
     from crane.dynamics import Dynamics
     from crane.dynamics.buckling import Buckling
     from crane.dynamics.reactions import Reactions
-    from crane.formats import load, write_machine, write_mjcf, write_urdf_plus
+    from crane.formats import (
+        load,
+        robot_description,
+        write_machine,
+        write_mjcf,
+        write_urdf_plus,
+    )
     from crane.formats.adding import add_cylinder, add_loops
     from crane.formats.check import check
     from crane.hydraulics import PDGains
@@ -59,6 +66,7 @@ if TYPE_CHECKING:
         Kinematics,
         Sway,
         Trajectory,
+        Transmission,
         Turning,
         point_to_point,
         polynomial,
@@ -115,8 +123,10 @@ if TYPE_CHECKING:
     from crane.view.page import report
     from crane.view.sketch import sketch, sketch_circuit
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 LOADED = time.time()  # before any other file of the package was read
+
+from crane.common import shown as _shown  # noqa: E402
 
 _HOMES = {
     "crane.closure": "Closure",
@@ -131,7 +141,7 @@ _HOMES = {
     "crane.dynamics": "Dynamics",
     "crane.dynamics.buckling": "Buckling",
     "crane.dynamics.reactions": "Reactions",
-    "crane.formats": "load write_machine write_mjcf write_urdf_plus",
+    "crane.formats": "load robot_description write_machine write_mjcf write_urdf_plus",
     "crane.formats.adding": "add_cylinder add_loops",
     "crane.formats.check": "check",
     "crane.hydraulics": "PDGains",
@@ -147,8 +157,8 @@ _HOMES = {
     "crane.identification.mechanics.payload": "identify_payload",
     "crane.identification.mechanics.result": "Identification",
     "crane.machine": "Machine Payload",
-    "crane.motion": "Kinematics Sway Trajectory Turning point_to_point polynomial read_path "
-    "retimed task_trajectory tip_trajectory via_attitudes via_points without_sway",
+    "crane.motion": "Kinematics Sway Trajectory Transmission Turning point_to_point polynomial "
+    "read_path retimed task_trajectory tip_trajectory via_attitudes via_points without_sway",
     "crane.motion.workspaces": "Workspace workspace",
     "crane.ratings": "Breakout Capacity Rule ToolForce Torques WorkingRange breakout capacity "
     "tool_force torques working_range",
@@ -164,24 +174,24 @@ _HOMES = {
 }
 
 __all__ = [
-    "Batch", "Breakout", "Buckling", "Calibration", "Capacity", "Closure", "Command",
-    "Comparison", "ComputedTorque", "Contact", "Controller", "CraneError", "CraneWarning",
-    "Cutting", "Design", "Dynamics", "EndStop", "Excitation", "ExternalForce", "ForceElement",
-    "Friction", "GasSpring", "Gradient", "Ground", "Identification", "InterruptedRun",
-    "Kinematics", "Law", "LinearModel", "Machine", "PDGains", "PI", "PIGains", "Payload", "Phase",
-    "PhasedWrench", "Phases", "PowerAccount", "PowerComparison", "Pushing", "Reactions",
-    "Recording", "Rope", "Rule", "SOILS", "Sampled", "Sensitivities", "Sensor",
-    "SignalExcitation", "Signals", "Soil", "Study", "Sway", "SwayStudy", "TipVelocity",
-    "ToolForce", "Torques", "Trajectory", "Turning", "ValveDrive", "ValveFeedforward", "ValvePD",
-    "WorkingRange", "Workspace", "Wrench", "add_cylinder", "add_loops", "breakout", "calibrate",
-    "capacity", "casadi_function", "check", "cross_validate", "design", "excite", "excite_valves",
-    "fastest", "gradient", "identify", "identify_cylinder_friction", "identify_orifices",
-    "identify_payload", "identify_valve", "joystick", "linear_models", "linearize", "load",
-    "point_to_point", "polynomial", "power_account", "read_measured", "read_path", "replay",
-    "report", "retimed", "sensitivities", "simulate", "simulate_batch", "sketch",
-    "sketch_circuit", "study", "sway_study", "task_trajectory", "tip_trajectory", "tool_force",
-    "torques", "via_attitudes", "via_points", "without_sway", "working_range", "workspace",
-    "write_machine", "write_mjcf", "write_urdf_plus",
+    "Batch", "Breakout", "Buckling", "Calibration", "Capacity", "Closure", "Command", "Comparison",
+    "ComputedTorque", "Contact", "Controller", "CraneError", "CraneWarning", "Cutting", "Design",
+    "Dynamics", "EndStop", "Excitation", "ExternalForce", "ForceElement", "Friction", "GasSpring",
+    "Gradient", "Ground", "Identification", "InterruptedRun", "Kinematics", "Law", "LinearModel",
+    "Machine", "PDGains", "PI", "PIGains", "Payload", "Phase", "PhasedWrench", "Phases",
+    "PowerAccount", "PowerComparison", "Pushing", "Reactions", "Recording", "Rope", "Rule",
+    "SOILS", "Sampled", "Sensitivities", "Sensor", "SignalExcitation", "Signals", "Soil", "Study",
+    "Sway", "SwayStudy", "TipVelocity", "ToolForce", "Torques", "Trajectory", "Transmission",
+    "Turning", "ValveDrive", "ValveFeedforward", "ValvePD", "WorkingRange", "Workspace", "Wrench",
+    "add_cylinder", "add_loops", "breakout", "calibrate", "capacity", "casadi_function", "check",
+    "cross_validate", "design", "excite", "excite_valves", "fastest", "gradient", "identify",
+    "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
+    "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
+    "power_account", "read_measured", "read_path", "replay", "report", "retimed",
+    "robot_description", "sensitivities", "simulate", "simulate_batch", "sketch", "sketch_circuit",
+    "study", "sway_study", "task_trajectory", "tip_trajectory", "tool_force", "torques",
+    "via_attitudes", "via_points", "without_sway", "working_range", "workspace", "write_machine",
+    "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 
@@ -191,6 +201,25 @@ def __getattr__(name: str) -> Any:
         if name in names.split():
             return getattr(import_module(module), name)
     raise AttributeError(f"module 'crane' has no attribute '{name}'")
+
+
+def _to_html(what: Any) -> str | None:
+    from crane.view.notebook import html
+
+    return html(what)
+
+
+def _watch_cells() -> None:
+    """In a notebook, tell what goes on in cells that take long."""
+    shell = sys.modules["IPython"].get_ipython() if "IPython" in sys.modules else None
+    if hasattr(shell, "kernel"):
+        from crane.view.cells import watch_cells
+
+        watch_cells(shell)
+
+
+_shown.to_html = _to_html
+_watch_cells()
 
 
 def __dir__() -> list[str]:

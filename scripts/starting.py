@@ -8,7 +8,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,40 +16,37 @@ from measuring import table
 
 import crane
 from crane.control import PI
+from crane.description import examples
 from crane.dynamics.compiled import QUANTITIES
 from crane.motion.trajectories import task_trajectory
 from crane.simulation.integration import Chart, CompiledStepper
 
+_MAIN = "import sys; sys.argv[0] = 'crane'; import crane.cli; crane.cli.main()"
+_FORWARD = (
+    "import crane; m = crane.load('mini_forwarder'); q = m.home[m.closure.active]; "
+    "crane.Dynamics(m).forward(q, 0 * q, 0 * q)"
+)
+_RUN = ("simulate", "mini_forwarder", "--task", "lift", "--force", "--out", "run")
+
+
+def _processes() -> Iterator[tuple[str, tuple[str, ...]]]:
+    """What is started, and Python's arguments; the robot's file goes by its full path."""
+    yield "`crane --help`", (_MAIN, "--help")
+    yield "`crane check ur5_robot.urdf`", (_MAIN, "check", str(examples()["ur5_robot"]))
+    yield "`crane simulate mini_forwarder --task lift`", (_MAIN, *_RUN)
+    yield '`crane.Dynamics(crane.load("mini_forwarder")).forward(...)`', (_FORWARD,)
+
 
 def starts(rounds: int) -> str:
-    """A whole process, and compiling each formula; machine code is kept in folders of its own."""
-
-    def process(kept: str | None) -> tuple[float, float]:
-        with tempfile.TemporaryDirectory() as folder:
-            environment = dict(os.environ, XDG_CACHE_HOME=kept or folder)
-            if kept is None:
-                environment["PYTHONPYCACHEPREFIX"] = str(Path(folder) / "bytecode")
-            words = ["simulate", "mini_forwarder", "--task", "lift", "--out", f"{folder}/run"]
-            code = (
-                f"import sys; sys.argv = ['crane', *{words}]; import crane.cli; crane.cli.main()"
-            )
-            before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-            command = [sys.executable, "-c", code]
-            subprocess.run(command, check=True, capture_output=True, env=environment)
-            wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
-        cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        return wall, cpu
-
-    rows = []
+    """Whole processes, and compiling each formula; what is kept is in folders of its own."""
     with tempfile.TemporaryDirectory() as kept:
-        process(kept)
-        for name, cache in (
-            ("the first ever, neither Python's bytecode nor machine code kept", None),
-            ("any later one", kept),
-        ):
-            wall, cpu = np.median([process(cache) for _ in range(rounds)], axis=0)
-            rows.append((name, f"{wall:.2f}", f"{cpu:.2f}"))
-    title = "process `crane simulate mini_forwarder --task lift`"
+        rows = [
+            (name, *_both(lambda arguments=arguments: _process(arguments, kept), rounds))
+            for name, arguments in _processes()
+        ]
+    first = _both(lambda: _process((_MAIN, *_RUN), None), rounds)
+    rows.append(("the simulation, where neither bytecode nor machine code is kept", *first))
+    title = "process; bytecode, machine code and results are kept"
     processes = table((title, "wall [s]", "CPU [s]"), rows)
     # in processes of their own: machines of equal formulas share their machine code
     with tempfile.TemporaryDirectory() as kept:
@@ -57,6 +54,27 @@ def starts(rounds: int) -> str:
     each = [(name, f"{seconds:.3f}", f"{later[name]:.3f}") for name, seconds in first.items()]
     title = "tracing and compiling, or reading what is kept"
     return f"{processes}\n\n{table((title, 'first time [s]', 'later [s]'), each)}"
+
+
+def _both(run: Callable[[], tuple[float, float]], rounds: int) -> tuple[str, str]:
+    """Medians of wall and CPU time, after a run that does not count."""
+    run()
+    wall, cpu = np.median([run() for _ in range(rounds)], axis=0)
+    return f"{wall:.2f}", f"{cpu:.2f}"
+
+
+def _process(arguments: tuple[str, ...], kept: str | None) -> tuple[float, float]:
+    """Wall and CPU time [s]; what Python and crane keep is in a folder, or not there."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(kept or folder)
+        environment = dict(os.environ, XDG_CACHE_HOME=str(place))
+        environment["PYTHONPYCACHEPREFIX"] = str(place / "bytecode")
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
+        before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        command = [sys.executable, "-c", *arguments]
+        subprocess.run(command, check=True, capture_output=True, env=environment, cwd=folder)
+        wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def _spent(kept: str) -> dict[str, float]:

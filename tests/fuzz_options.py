@@ -254,7 +254,7 @@ def every_command(group, before=""):
 def draw(seed, known, only=None):
     """A call: its words, one of them at the edge."""
     rng = random.Random(seed)
-    commands = every_command(get_command(entry.app))
+    commands = every_command(get_command(entry.program()))
     missing = commands.keys() - CALLS.keys()
     assert not missing, f"say in CALLS what a call of {missing} needs"
     every = [

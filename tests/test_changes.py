@@ -10,7 +10,7 @@ import pytest
 from broken import DATA
 
 import crane
-import crane.cli.entry
+import crane.cli
 from crane.common.errors import InputError
 from crane.description import bundled, changed, parameters
 from crane.formats import read
@@ -218,7 +218,7 @@ def test_every_documented_name_is_one():
 
 
 def test_names_can_be_listed_and_changed(capsys):
-    crane.cli.entry.app(args=["info", "mini_forwarder", "--parameters"], standalone_mode=False)
+    crane.cli.program()(args=["info", "mini_forwarder", "--parameters"], standalone_mode=False)
     listed = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert {name: float(f"{x:.6g}") for name, x in parameters(read("mini_forwarder")).items()} == {
         name: float(value) for name, value in listed

@@ -759,7 +759,7 @@ def mjcf(machine, step):
 @pytest.mark.slow
 def test_motion_equals_mujoco(mini):
     """The crane swings in springs and dampers at its actuators; MuJoCo's loops are soft."""
-    mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (extra 'bench')")
+    mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (extra 'mjcf')")
     model = pin.Model(mini.model)
     for body in range(1, model.njoints):  # MuJoCo refuses the zero moments of slender bodies
         inertia = model.inertias[body]

@@ -39,6 +39,8 @@ def test_programs_print_what_the_index_says(program, tmp_path):
     needed = NEEDS.get(program)
     if needed and not find_spec(needed):
         pytest.skip(f"{needed} is not installed")
+    if program.startswith("ros2_") and find_spec("rclpy"):
+        pytest.skip("a node of ROS runs until it is stopped")
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     run = subprocess.run(
         [sys.executable, FOLDER / program],

@@ -38,6 +38,12 @@ def found(machine):
     return crane.excite_valves(machine, fit, duration=5.0, step=0.005, noise=NOISE, trials=8)
 
 
+def test_a_notebook_shows_signals_and_what_they_tell(found):
+    html = found._repr_html_()
+    assert repr(found).startswith("SignalExcitation of 'rig', 5 s: ") and len(repr(found)) <= 200
+    assert html.count("<img ") == 1 and "std, designed" in html and "largest pressure" in html
+
+
 def strokes(machine, signals, time):
     """Of a machine that the signals drive, and its velocities."""
     run = crane.simulate(

@@ -337,7 +337,7 @@ def test_convert(tmp_path):
     [
         ("there.urdf", (), "there.urdf: exists already, choose another name or add --force"),
         ("x.yaml", (), "x.yaml: a machine file comes with its URDFs, give the name of a folder"),
-        ("x", ("--to", "sdf"), "error: --to is 'sdf', known: machine, mjcf, urdf+"),
+        ("x", ("--to", "sdf"), "error: --to is 'sdf', known: machine, mjcf, urdf, urdf+"),
     ],
 )
 def test_bad_conversions(out, options, line, tmp_path):

@@ -256,6 +256,16 @@ def test_what_cannot_be_identified(mini):
         assert str(caught.value).startswith(message), str(caught.value)
 
 
+def test_a_joint_of_one_row_is_refused(mini):
+    """Whose noise nothing tells: all but one of its rows are slower than the limit given."""
+    given = motion(mini, step=4e-3)
+    given = dataclasses.replace(given, v=given.v.copy())
+    given.v[:, 1] = 0.0
+    given.v[100, 1] = 1.0
+    with pytest.raises(RecordingError, match="^'X1' is in one sample only faster than"):
+        identify(mini, given, bandwidth=1e3, slow={"X1": 0.5}, trust=True)
+
+
 def test_a_constant_recording_is_refused(mini):
     given = motion(mini, duration=2.0)
     still = np.broadcast_to(given.q[0], given.q.shape)

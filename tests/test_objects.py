@@ -92,15 +92,30 @@ def test_without_a_folder_nothing_is_kept(place, translated):
 
 
 def test_what_was_used_least_lately_makes_room(place, monkeypatch):
+    monkeypatch.setattr(objects, "MOST", 400)  # three of them
     for number, name in enumerate("abc"):
         objects.object_code(name, lambda: b"x" * 100)
         for file in place.iterdir():
             if file.stat().st_mtime > 1e9:
                 os.utime(file, (number, number))
     first = objects.object_code("a", lambda: b"never")  # used now
-    monkeypatch.setattr(objects, "MOST", 350)
     objects.object_code("d", lambda: b"y" * 100)
     left = {file.read_bytes()[-1:] for file in place.iterdir()}
     assert first == b"x" * 100 and left == {b"x", b"y"}
     assert objects.object_code("a", lambda: b"gone") == first
     assert objects.object_code("b", lambda: b"gone") == b"gone"
+
+
+def test_the_folder_is_not_looked_through_each_time(place, monkeypatch):
+    looks, look = [], objects._files
+
+    def counted(folder):
+        looks.append(folder)
+        return look(folder)
+
+    monkeypatch.setattr(objects, "_files", counted)
+    monkeypatch.setattr(objects, "MOST", 64 * 132)  # with their digests
+    for number in range(100):
+        objects.object_code(str(number), lambda: b"x" * 100)
+        assert len(list(place.iterdir())) == min(number + 1, 64 - (63 - number) % 4)
+    assert len(looks) == 25

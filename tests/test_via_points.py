@@ -3,12 +3,13 @@
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.interpolate import make_interp_spline
+from scipy.interpolate import PPoly, make_interp_spline
 from scipy.spatial.transform import Rotation, Slerp
 
 import crane
 from crane.common.errors import DescriptionError, InputError, UnreachableTipError
 from crane.motion.attitude import Inclination, roll_pitch_yaw
+from crane.motion.piecewise import Piecewise
 from crane.motion.splines import least_jerk
 
 PLACES = [[0.0, 1.0], [0.5, np.nan], [0.2, 3.0], [1.0, 2.0]]
@@ -29,7 +30,8 @@ def test_it_passes_the_points_from_rest_to_rest():
     path = crane.via_points(TIMES, PLACES)
     q, v, a = path(np.array(TIMES))
     given = np.isfinite(PLACES)
-    np.testing.assert_allclose(q[given], np.array(PLACES)[given], rtol=1e-15, atol=1e-15)
+    rounding = 20 * np.finfo(float).eps  # of sums of six terms, after a solution by LAPACK
+    np.testing.assert_allclose(q[given], np.array(PLACES)[given], rounding, rounding)
     assert np.abs(v[[0, -1]]).max() < 1e-13 and np.abs(a[[0, -1]]).max() < 1e-12
     assert path.duration == 2.0
     # what is left open follows its own points alone
@@ -555,3 +557,21 @@ def test_a_task_without_drives_for_its_attitude_is_told(task):
     machine, _ = task(f"time: 0, {TIP}, {angles}", f"time: 2, {TIP}, {angles}")
     with pytest.raises(InputError, match="too few drives for roll, pitch, yaw of 'bucket_lip'"):
         crane.task_trajectory(machine, "go")
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 5])
+@pytest.mark.parametrize("parts", [1, 4])
+def test_piecewise_polynomials_are_those_of_scipy(degree, parts):
+    draw = np.random.default_rng(degree)
+    knots = np.r_[-0.3, np.cumsum(draw.uniform(0.1, 2.0, parts))]
+    rows = draw.normal(size=(degree + 1, parts, 3))
+    time = np.r_[knots, draw.uniform(-2.0, knots[-1] + 2.0, 50)]
+    own, scipy_s = Piecewise(rows, knots), PPoly(rows, knots)
+    for order in range(degree + 2):
+        wanted = scipy_s(time, order)
+        size = np.abs(wanted).max() + 1e-300
+        assert np.abs(own(time, order) - wanted).max() <= 1e-13 * size
+        assert np.abs(own.derivative(order)(time) - wanted).max() <= 1e-13 * size
+        assert own(time[0], order).shape == (3,)
+    roots, wanted = own.roots(), scipy_s.roots(extrapolate=False)
+    assert all(map(np.array_equal, np.ravel(roots), np.ravel(wanted)))

@@ -8,16 +8,18 @@ import sys
 PROGRAM = """
 import sys
 import time
-from crane.cli import entry, waiting
+from crane.cli import entry
+from crane.cli import waiting as terminal
+from crane.common import waiting
 from crane.cli.shared import app, progress_bar
 from crane.formats import loading
 
-waiting._AFTER, waiting._EVERY = float(sys.argv.pop()), 0.05
+waiting.AFTER, waiting.EVERY = float(sys.argv.pop()), 0.05
 
 @app.command()
 def wait(seconds: float, bar: bool = False, served: bool = False):
     if served:
-        with waiting.shown():
+        with terminal.shown():
             time.sleep(seconds)
         return
     if bar:

@@ -10,7 +10,7 @@ from test_patu655 import ELBOW, LIFT_PIN, STROKES, TIP, plane
 from typer.testing import CliRunner
 
 import crane
-from crane.cli.shared import app
+from crane.cli import program
 from crane.common.errors import InputError
 from crane.motion.workspaces import workspace
 from crane.motion.workspaces.patch import last_closed
@@ -259,7 +259,7 @@ def test_the_command_writes_tables_summary_and_picture(tmp_path):
     out = tmp_path / "space"
     words = ["workspace", "patu655", "--lock", "X_ext=0.5", "--set", "X_lift.upper=0.4",
              "--samples", "400", "--out", str(out)]  # fmt: skip
-    result = CliRunner().invoke(app, words)
+    result = CliRunner().invoke(program(), words)
     assert result.exit_code == 0, result.output
     assert "largest radius" in result.output
     files = {path.name for path in out.iterdir()}

@@ -1,6 +1,5 @@
 """The command line."""
 
-from crane.cli.entry import main
-from crane.cli.shared import app
+from crane.cli.entry import main, program
 
-__all__ = ["app", "main"]
+__all__ = ["main", "program"]

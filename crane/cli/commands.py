@@ -1,7 +1,6 @@
 """Commands on machines and runs: list, info, simulate, view, plot, demo."""
 
 from collections.abc import Iterator
-from math import isinf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -187,97 +186,15 @@ def is_run(what: str) -> bool:
 
 
 def _describe(machine: "Machine") -> Iterator[str]:
-    from crane.common.units import quantity
-    from crane.description.sensors import Sensor
-    from crane.dynamics import Dynamics
-    from crane.dynamics.lengths import Lengths
+    """Its facts; rows of their tables below them, without cells that say nothing."""
+    from crane.view.facts import facts_of
 
-    closure, ideal = machine.closure, Sensor().numbers()
-    structure = closure.structure
-    mass = sum(inertia.mass for inertia in list(machine.model.inertias)[1:])
-    yield f"{machine.name}"
-    if machine.source:
-        yield f"  source      {machine.source}"
-    yield f"  file        {machine.path}"
-    yield f"  chains      {', '.join(chain.name for chain in machine.chains)}"
-    yield (
-        f"  joints      {len(machine.joints)}, of which {len(machine.driven_joints)} active"
-        f"{f' and {len(machine.free)} free' if machine.free else ''}; "
-        f"moving mass {quantity(mass, 'kg', 4)}"
-    )
-    width = max(10, 1 + max(map(len, (*machine.joints, *closure.equations.names))))
-    for i, joint in enumerate(machine.active):
-        home = machine.home[closure.active[i]]
-        free = ", free" if joint in machine.free else ""
-        unit = machine.unit(joint)
-        limits = _limits(machine.lower[i], machine.upper[i], unit)
-        yield f"    {joint:<{width}}{limits}, home {home:.5g} {unit}{free}"
-    for i in closure.passive:
-        joint = machine.joints[i]
-        yield f"    {joint:<{width}}passive, home {machine.home[i]:.5g} {machine.unit(joint)}"
-    loops = closure.equations.loops
-    yield (
-        f"  loops       {len(loops)}: {len(structure.rows)} independent equations, "
-        f"{len(structure.redundant)} redundant"
-    )
-    for loop in loops:
-        yield f"    {loop.name:<{width}}{loop.type}, {loop.predecessor} to {loop.successor}"
-    for coupling in closure.equations.couplings:
-        terms = " + ".join(f"{factor:g} {joint}" for joint, factor in coupling.factors.items())
-        yield f"    {coupling.name:<{width}}coupling, {terms} = {coupling.offset:g}"
-    if structure.blocks:
-        order = [
-            "+".join(machine.joints[closure.passive[i]] for i in columns)
-            for _, columns in structure.blocks
-        ]
-        yield f"  solved as   {', then '.join(order)}"
-    elements = [item for item in machine.elements if item.between is not None]
-    lengths, _ = Lengths(machine, [item.between for item in elements if item.between]).at(
-        machine.home
-    )
-    for item, length in zip(elements, lengths, strict=True):
-        one, two = item.between or ("", "")
-        yield f"  between     {one} and {two}: {item.kind}, ends {length:.5g} m apart at home"
-    for motor in machine.motors:
-        terms = " + ".join(f"{factor:g} {joint}" for joint, factor in motor.factors.items())
-        yield f"  drive       {motor.name}, along {terms}"
-    if loops:
-        drive = float(closure.condition(machine.home))
-        better = [c for c in closure.proposals if drive > 10 and c.condition < drive / 2]
-        others = f"; better with {better[0]}" if better else ""
-        yield f"  driven      condition {drive:.3g} at home{others}"
-    if mass:
-        backend = Dynamics(machine).backend_of("forward")
-        reason = "" if backend == "compiled" else ", too large for machine code"
-        yield f"  computed    {backend}{reason}"
-    yield f"  tip         {machine.tip or 'none'}"
-    if machine.hydraulics is not None:
-        supply = machine.hydraulics.supply
-        flow = f", {6e4 * supply.flow:.4g} l/min at most" if supply.flow else ""
-        yield f"  hydraulics  {1e-5 * supply.pressure:.4g} bar{flow}"
-        for joint, cylinder in machine.hydraulics.cylinders.items():
-            valve = machine.hydraulics.valves[joint]
-            kind = "sharing" if valve.sharing else "compensated" if valve.margin else "orifice"
-            unit = "cm2" if machine.unit(joint) == "m" else "cm3/rad"
-            size = 1e4 if unit == "cm2" else 1e6
-            kind += " valve of two spools" if valve.spool_b else " valve"
-            yield (
-                f"    {joint:<{width}}{kind}, {size * cylinder.area_a:.4g} and "
-                f"{size * cylinder.area_b:.4g} {unit}"
-            )
-    for name, sensor in machine.sensors.items():
-        known = [f"{what} {x:g}" for what, x in sensor.numbers().items() if x != ideal[what]]
-        where = [f"{sensor.column} [{sensor.unit}]" if sensor.unit else sensor.column]
-        yield f"  sensor      {name}: {', '.join([x for x in where if x] + known) or 'ideal'}"
-    for task in machine.tasks.values():
-        most = "at most " * bool(task.phases)
-        yield f"  task        {task.name}, {most}{task.duration:g} s: {task.description}"
-
-
-def _limits(lower: float, upper: float, unit: str) -> str:
-    """A range in words, which may have no end."""
-    if isinf(lower) and isinf(upper):
-        return "unlimited"
-    if isinf(lower):
-        return f"at most {upper:.5g} {unit}"
-    return f"at least {lower:.5g} {unit}" if isinf(upper) else f"{lower:.5g} to {upper:.5g} {unit}"
+    facts = list(facts_of(machine))
+    width = max(10, 1 + max((len(row[0]) for fact in facts for row in fact.rows), default=0))
+    yield machine.name
+    for fact in facts:
+        yield f"  {fact.name:<12}{fact.text}"
+        for row in fact.rows:
+            cells = zip(fact.head[1:], row[1:], strict=True)
+            words = ", ".join(f"{head} {cell}".strip() for head, cell in cells if cell)
+            yield f"    {row[0]:<{width}}{words}"

@@ -24,7 +24,7 @@ from crane.cli.shared import (
 )
 from crane.common.errors import InputError, known
 
-_FORMATS = ("urdf+", "mjcf", "machine")
+_FORMATS = ("urdf+", "urdf", "mjcf", "machine")
 _SUFFIXES = {".urdf": "urdf+", ".xml": "mjcf", ".mjcf": "mjcf"}
 
 
@@ -39,7 +39,9 @@ def convert(
     ],
     to: Annotated[
         str | None,
-        typer.Option(metavar="FORMAT", help="urdf+, mjcf or machine; from the suffix otherwise."),
+        typer.Option(
+            metavar="FORMAT", help="urdf+, urdf, mjcf or machine; from the suffix otherwise."
+        ),
     ] = None,
     change: Change = None,
     lock: Lock = None,
@@ -50,9 +52,10 @@ def convert(
     argument: Argument = None,
     force: Force = False,
 ) -> None:
-    """Write a machine as one URDF with loops, as MJCF, or as machine file with sub-chains."""
+    """Write a machine as one URDF with loops or with them cut, as MJCF, or as machine file."""
     from crane.cli.runs import check_folder, check_free
-    from crane.formats import write_machine, write_mjcf, write_urdf_plus
+    from crane.common.output import replacing
+    from crane.formats import robot_description, write_machine, write_mjcf, write_urdf_plus
 
     kind = to or _SUFFIXES.get(out.suffix.lower(), "machine")
     if kind not in _FORMATS:
@@ -66,6 +69,10 @@ def convert(
     loaded = load(machine, lock, change, active, free, floating, packages, argument)
     if kind == "machine":
         written = write_machine(loaded, out, force=force)
+    elif kind == "urdf":
+        written = out
+        with replacing(out) as part:
+            part.write_text(robot_description(loaded), encoding="utf-8")
     else:
         written = out
         (write_urdf_plus if kind == "urdf+" else write_mjcf)(loaded, out)

@@ -1,45 +1,59 @@
 """The program: options of all commands, and what becomes of errors."""
 
+import gc
 import io
 import os
 import sys
 import warnings
+from importlib import import_module
 from typing import Annotated
 
 import typer
 
 import crane
-from crane.cli import (  # noqa: F401  register their commands
-    add,
-    breakout,
-    calibrate,
-    capacity,
-    check,
-    circuit,
-    commands,
-    convert,
-    design,
-    excite,
-    identify,
-    live,
-    modes,
-    pictures,
-    power,
-    sensitivities,
-    simulate,
-    stability,
-    study,
-    sway,
-    working_range,
-    workspace,
-)
 from crane.cli.shared import INTERRUPTED, app, say
 from crane.cli.waiting import watched
 from crane.common.errors import CraneError, CraneWarning, one_line
 
+_SPARING = 20_000  # objects between collections: nearly all that starting makes is there to stay
+
+_HOMES = {  # modules of this room, in the order of `crane --help`, and the commands in each
+    "add": "add",
+    "breakout": "breakout",
+    "calibrate": "calibrate",
+    "capacity": "capacity",
+    "check": "check",
+    "circuit": "circuit",
+    "commands": "list info view plot demo",
+    "convert": "convert import",
+    "design": "design",
+    "excite": "excite",
+    "identify": "identify payload",
+    "live": "live",
+    "modes": "modes",
+    "pictures": "sketch",
+    "power": "power",
+    "sensitivities": "sensitivities",
+    "simulate": "simulate",
+    "stability": "stability",
+    "study": "study",
+    "sway": "sway",
+    "working_range": "working-range",
+    "workspace": "workspace",
+}
+
+
+def program(command: str = "") -> typer.Typer:
+    """The program with the command of that name at least, or with all where none has it."""
+    homes = [home for home, names in _HOMES.items() if command in names.split()]
+    for home in homes or _HOMES:
+        import_module(f"crane.cli.{home}")
+    return app
+
 
 def main() -> None:
     """Run the command line: errors are one line, exit status 2."""
+    gc.set_threshold(_SPARING)
     arguments = [word for word in sys.argv[1:] if word != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may be no text
@@ -47,8 +61,9 @@ def main() -> None:
     warnings.showwarning = _show_warning
     warnings.simplefilter("once", CraneWarning)
     try:
+        run = program(*arguments[:1])
         with watched(" ".join(["crane", *arguments[:1]])):
-            status = app(args=arguments, standalone_mode=False, prog_name="crane")
+            status = run(args=arguments, standalone_mode=False, prog_name="crane")
         if status == INTERRUPTED:  # what the parser makes of KeyboardInterrupt
             raise KeyboardInterrupt
         if sys.stdout is not None:  # it is where the shell has closed it

@@ -1,31 +1,16 @@
 """What takes long says so: one line on the terminal, two seconds after a command has begun.
 
-The library computes without a word. What it is at is read off the main thread's stack: the room of
-the package (see CONTRIBUTING.md) that is nearest to what runs now. Into pipes and files nothing
-is written.
+Into pipes and files nothing is written.
 """
 
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, TextIO
 
-_AFTER = 2.0  # [s] from which on a command takes long
-_EVERY = 0.5  # [s] between two looks
-_DOING = {
-    "formats": "reading",
-    "closure": "closing the loops",
-    "codegen": "compiling",
-    "dynamics": "computing forces",
-    "motion": "computing motions",
-    "simulation": "simulating",
-    "identification": "identifying",
-    "studies": "computing variants",
-    "view": "drawing",
-}
+from crane.common.waiting import Watch, doing
 
 _ERASE = "\r\x1b[2K"
 
@@ -73,42 +58,6 @@ class _Stream:
         return getattr(self._stream, name)
 
 
-class _Watch(threading.Thread):
-    """Tells what the main thread is at, as long as nothing else does."""
-
-    def __init__(self, what: str, line: _Line):
-        super().__init__(daemon=True)
-        self._what, self._line, self._over = what, line, threading.Event()
-        self._main = threading.main_thread().ident
-
-    def run(self) -> None:
-        """Wait, then look every half second."""
-        begun = time.monotonic()
-        wait = _AFTER
-        while not self._over.wait(wait):
-            wait = _EVERY
-            if _shown.is_set():
-                continue
-            frame = sys._current_frames().get(self._main or 0)
-            self._line.draw(f"{self._what}: {doing(frame)}, {time.monotonic() - begun:.0f} s")
-
-    def end(self) -> None:
-        """Say no more, and take the line away."""
-        self._over.set()
-        self.join()
-        self._line.erase()
-
-
-def doing(frame: FrameType | None) -> str:
-    """What a stack of calls is about, by the innermost room of the package that has a word."""
-    while frame is not None:
-        package, _, rest = str(frame.f_globals.get("__name__", "")).partition(".")
-        if package == "crane" and (word := _DOING.get(rest.partition(".")[0])):
-            return word
-        frame = frame.f_back
-    return "working"
-
-
 @contextmanager
 def watched(what: str) -> Iterator[None]:
     """Tell on a terminal what goes on, once it has taken two seconds.
@@ -121,7 +70,12 @@ def watched(what: str) -> Iterator[None]:
         yield
         return
     line = _Line(errors)
-    watch = _Watch(what, line)
+
+    def tell(frame: FrameType | None, seconds: float) -> None:
+        if not _shown.is_set():
+            line.draw(f"{what}: {doing(frame) or 'working'}, {seconds:.0f} s")
+
+    watch = Watch(tell)
     sys.stderr = _Stream(errors, line)
     if out is not None:
         sys.stdout = _Stream(out, line)
@@ -130,6 +84,7 @@ def watched(what: str) -> Iterator[None]:
         yield
     finally:
         watch.end()
+        line.erase()
         sys.stdout, sys.stderr = out, errors
 
 

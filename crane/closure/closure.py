@@ -5,6 +5,7 @@ import dataclasses
 import threading
 from collections.abc import Collection, Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -19,9 +20,10 @@ from crane.closure.following import followed
 from crane.closure.home import Sought, settle
 from crane.closure.structure import Structure
 from crane.closure.traced import geometry_of
-from crane.codegen import TooLongError, carefully
+from crane.codegen import TooLongError, carefully, kept_result
 from crane.common.errors import BranchEdgeError, InputError, MechanismError, WrongBranchError
 from crane.common.samples import Array, as_samples, per_sample, solve
+from crane.common.shown import Brief
 from crane.description import Coupling, LoopSpec
 
 _FEW, _FAR = 100, 0.1  # samples worth sorting: how many, how far apart as a share of the range
@@ -29,7 +31,7 @@ _SAME = 1e-6  # rad, machine's size, between a posture and what Newton's method 
 _STEPS = 8  # from home to a target that is far from the one before it
 
 
-class Closure:
+class Closure(Brief):
     """The loops of a machine as functions of its active coordinates.
 
     Park, Choi, Ploen (1999); equations (3) and (4) of the reduced-scale forwarder paper, for any
@@ -93,7 +95,7 @@ class Closure:
         self.active_names = tuple(active)
         coordinates = self.equations.coordinates
         self.active = np.array([coordinates.column(name) for name in active], dtype=np.intp)
-        self.passive = np.setdiff1d(np.arange(model.nv), self.active)
+        self.passive = np.delete(np.arange(model.nv), self.active)
         self._names = coordinates.names
 
         def columns(names: Collection[str]) -> list[int]:
@@ -101,14 +103,8 @@ class Closure:
 
         self.guess = guess
         self.said = np.array(sorted(columns(said or ())), dtype=np.intp)
-        self.structure, self.sought = settle(
-            self.equations,
-            self.active,
-            self.passive,
-            guess,
-            None if said is None else columns(said),
-            columns(loose),
-        )
+        where = None if said is None else columns(said), columns(loose)
+        self.structure, self.sought = self._settled(*where)
         if wound:
             turns = np.round((guess - self.structure.home) / (2 * np.pi))
             turns[coordinates.slides] = 0.0
@@ -123,7 +119,31 @@ class Closure:
         self.home = self._branch.home.q.copy()
         self.home.flags.writeable = False
 
-    def __repr__(self) -> str:
+    def _settled(
+        self, said: list[int] | None, loose: list[int]
+    ) -> tuple[Structure, Sought | None]:
+        def find() -> tuple[Structure, Sought | None]:
+            return settle(self.equations, self.active, self.passive, self.guess, said, loose)
+
+        if not self.equations.names:
+            return find()
+        told = None if said is None else tuple(said)
+        depends = (self.parts, self.active, self.guess, told, tuple(loose))
+        return kept_result(("home", depends), find, "scipy.linalg")
+
+    @property
+    def parts(self) -> tuple[Any, ...]:
+        """All that its equations are made of, see `crane.codegen.kept_result`."""
+        loops = tuple(
+            (x.name, x.type, x.predecessor, x.successor, *map(float, x.axis))
+            for x in self.equations.loops
+        )
+        couplings = tuple(
+            (x.name, tuple(x.factors.items()), x.offset) for x in self.equations.couplings
+        )
+        return self.model.saveToString(), loops, couplings
+
+    def _line(self) -> str:
         """Its loops, and what drives them."""
         loops = ", ".join(loop.name for loop in self.equations.loops) or "no loops"
         return (

@@ -4,8 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from crane.codegen.scalar import Expression, Number, needed
-from crane.common.errors import InputError
-from crane.common.extras import how
+from crane.common.extras import library
 
 _BINARY = {
     "add": lambda a, b: a + b,
@@ -19,19 +18,6 @@ _NAMES = {
 }  # fmt: skip
 
 
-def library() -> Any:
-    """CasADi.
-
-    Raises:
-        InputError: It is not installed.
-    """
-    try:
-        import casadi
-    except ImportError:
-        raise InputError(f"CasADi is not installed, {how('casadi')}") from None
-    return casadi
-
-
 def expressions(outputs: Sequence[Number], arguments: Sequence[Any]) -> list[Any]:
     """CasADi's scalars of traced formulas.
 
@@ -42,7 +28,7 @@ def expressions(outputs: Sequence[Number], arguments: Sequence[Any]) -> list[Any
     Raises:
         InputError: CasADi is not installed.
     """
-    ca = library()
+    ca = library("casadi", "a graph")
     operations = next((x.tape.operations for x in outputs if isinstance(x, Expression)), [])
     found: dict[int, Any] = {}
     for index in needed(outputs):

@@ -30,7 +30,7 @@ class Signature:
     outputs: Layout | None
 
 
-def place_of(depends: Any) -> str | None:
+def place_of(depends: Any, kind: str = "note") -> str | None:
     """The name of a program's note, or None where it cannot be kept.
 
     A program also depends on the package's files, on what traces it and on what compiles it.
@@ -38,6 +38,7 @@ def place_of(depends: Any) -> str | None:
     Args:
         depends: Numbers, texts, bytes, arrays, dataclasses and tuples of them, which say all that
             the program's formulas depend on besides; None where they depend on other code.
+        kind: Of what is kept.
 
     Raises:
         TypeError: Something else, which may mean another thing to another process.
@@ -49,7 +50,7 @@ def place_of(depends: Any) -> str | None:
     if package is None:
         return None
     tracing = sys.version, np.__version__
-    return objects.named(repr((package, tracing, settings(), said)), "note")
+    return objects.named(repr((package, tracing, settings(), said)), kind)
 
 
 def _plain(value: Any) -> Any:

@@ -1,5 +1,37 @@
 """What does not come with the package by itself."""
 
+from importlib import import_module
+from typing import Any
+
+from crane.common.errors import InputError
+
+# Module: what its library is called, and the extra of pyproject.toml that brings it.
+_LIBRARIES = {
+    "casadi": ("CasADi", "casadi"),
+    "control": ("python-control", "control"),
+    "cvxpy": ("CVXPY", "feasible"),
+    "distributed": ("Dask", "cluster"),
+    "mujoco": ("MuJoCo", "mjcf"),
+    "viser": ("viser", "live"),
+}
+
+
+def library(module: str, purpose: str) -> Any:
+    """A library of an extra, imported.
+
+    Args:
+        module: Its name in Python.
+        purpose: What needs it, for the error.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    name, extra = _LIBRARIES[module]
+    try:
+        return import_module(module)
+    except ImportError:
+        raise InputError(f"{purpose} needs {name}, {how(extra)}") from None
+
 
 def how(extra: str) -> str:
     """How to install an extra of pyproject.toml, from the repository.

@@ -1,6 +1,6 @@
 """One sample (n,) or a stack of them (N, n): every public function takes both."""
 
-from collections.abc import Callable, Iterable, Sequence, Sized
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,22 +48,6 @@ def as_sample(value: ArrayLike, size: int, what: str, names: Sequence[str] = ())
         columns = f" ({', '.join(names)})" if names else ""
         raise InputError(f"{what} has the shape {shape}, give ({size},){columns}")
     return as_samples(value, size, what, names)
-
-
-class Brief:
-    """Shown in one line: arrays by their shapes, collections by their lengths."""
-
-    def __repr__(self) -> str:
-        """Class and fields."""
-        words = []
-        for name, value in vars(self).items():
-            if isinstance(value, str | int | float | bool) or value is None:
-                words.append(f"{name}={value!r}")
-            elif isinstance(value, np.ndarray):
-                words.append(f"{name}={value.shape}")
-            elif isinstance(value, Sized) and not isinstance(value, Brief):
-                words.append(f"{name}: {len(value)}")
-        return f"{type(self).__name__}({', '.join(words)})"
 
 
 # Between these lies every quantity of a machine in SI units but zero, and its square is a number.

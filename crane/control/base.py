@@ -8,6 +8,7 @@ import numpy as np
 
 from crane.codegen import Number
 from crane.common.samples import Array, as_sample
+from crane.common.shown import Brief
 from crane.dynamics import Dynamics
 from crane.machine import Machine
 from crane.motion.curves import Trajectory
@@ -71,7 +72,7 @@ class TracedController(Controller, Protocol):
         """`__call__` as formulas."""
 
 
-class Law:
+class Law(Brief):
     """A controller whose law is written once, and called in numbers as well as traced.
 
     A law writes `law`, and `begin`, `references`, `settings`, `reference` where it has states,

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
 
 from crane.codegen import Number
 from crane.codegen.scalar import add, apply
@@ -107,6 +106,8 @@ class ValveFeedforward(ValvePD):
         self, machine: Machine, reference: Trajectory, force: Array
     ) -> tuple[Array, Array]:
         """Times (N,) and the openings (N, m) that the reference demands."""
+        from scipy.interpolate import make_interp_spline  # slow to import
+
         count = int(np.ceil(reference.duration * _STEPS_PER_SECOND)) + 1
         time = np.linspace(0.0, reference.duration, count)
         q_a, v_a, _ = reference(time)

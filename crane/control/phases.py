@@ -9,6 +9,7 @@ import numpy as np
 from crane.codegen import Number
 from crane.common.errors import InputError, SimulationError
 from crane.common.samples import Array, as_number
+from crane.common.shown import Brief
 from crane.control.base import At
 from crane.control.valves import Command, circuit_of, signal_of
 from crane.description.phases import Phase
@@ -18,7 +19,7 @@ from crane.machine import Machine
 _PERIOD = 0.01  # [s] between looks at the machine
 
 
-class Phases(Command, threading.local):
+class Phases(Command, Brief, threading.local):
     """Levers that are held until joints have come to their positions, phase by phase.
 
     Every 10 ms it looks where the joints are. A joint that has come to its position, in the

@@ -13,6 +13,7 @@ from crane.codegen.scalar import apply
 from crane.common.errors import InputError, known
 from crane.common.magnitudes import meant
 from crane.common.samples import Array, as_number, as_sample
+from crane.common.shown import Brief
 from crane.control.base import At
 from crane.hydraulics import Hydraulics, PDGains, Valve
 from crane.hydraulics.components import Spool
@@ -94,7 +95,7 @@ def signal_of(spool: Valve | Spool, lever: Array) -> Array:
     return np.asarray(spool.neutral + (spool.full - spool.neutral) * u)
 
 
-class Signals(Command):
+class Signals(Command, Brief):
     """Signals given in time, straight between the instants and constant beyond them.
 
     Args:
@@ -193,7 +194,7 @@ class Signals(Command):
         return at.reference[: self._count]
 
 
-class ValvePD(Command):
+class ValvePD(Command, Brief):
     """One PD controller per spool, equation (37) of the electro-hydraulic forwarder paper.
 
     u = K_p (q_ref - q) + K_d (q_ref' - q') + F_f, with the feedforward F_f that jumps over the
@@ -262,7 +263,7 @@ class _Held(threading.local):
         self.signals, self.since = [signals], [0.0]
 
 
-class Sampled(Command):
+class Sampled(Command, Brief):
     """A program of the user that sets the valves once per period, as a control unit does.
 
     Args:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from crane.codegen.scalar import Number, times
 from crane.common.errors import InputError
 from crane.common.samples import Array
+from crane.common.shown import Brief
 
 AXES = ("world", "frame")
 PARTS = tuple(f"{kind}_{axis}" for kind in ("force", "moment") for axis in "xyz")
@@ -35,7 +36,7 @@ class Here(NamedTuple):
     states: Sequence[Number] = ()
 
 
-class ExternalForce:
+class ExternalForce(Brief):
     """A wrench at a frame. What depends on more than time writes `wrench` in a class of its own.
 
     Its formulas become machine code: `wrench` is called with numbers and, once, with formulas.

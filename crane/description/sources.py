@@ -1,7 +1,7 @@
 """Where machines are found: bundled by name, example-robot-data by name, or a path."""
 
+import sys
 from functools import cache
-from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 
 from crane.common.errors import DescriptionError, known
@@ -25,10 +25,13 @@ def bundled() -> dict[str, Path]:
 @cache
 def example_root() -> Path | None:
     """Folder `robots` of example-robot-data, or None where that is not installed."""
+    from importlib.metadata import PackageNotFoundError, files  # slow to import
+
     try:
         listed = files("example-robot-data") or []
-    except PackageNotFoundError:
-        return None
+    except PackageNotFoundError:  # as where conda installed it, which keeps no list of Python's
+        shared = Path(sys.prefix, "share", "example-robot-data", "robots")
+        return shared if shared.is_dir() else None
     for item in listed:
         parts = item.parts
         if "robots" in parts:

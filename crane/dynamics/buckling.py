@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_samples
+from crane.common.shown import Brief
 from crane.hydraulics.components import Cylinder
 from crane.machine import Machine
 
@@ -121,7 +122,7 @@ class Column:
         return np.asarray(self.count * 0.5 * (low + high))
 
 
-class Buckling:
+class Buckling(Brief):
     """Whether a machine's cylinders buckle.
 
     A cylinder counts that lies in a loop and has one pin at either end, so that what its ends are

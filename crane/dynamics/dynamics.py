@@ -10,6 +10,7 @@ from crane.closure.traced import geometry_of
 from crane.codegen import TooLongError, carefully
 from crane.common.errors import InputError, MechanismError, known
 from crane.common.samples import Array, as_number, as_samples, per_sample, solve
+from crane.common.shown import Brief
 from crane.description.external import PARTS
 from crane.dynamics.compiled import FRICTION, SLOPES, NamedCode, QuantityCode
 from crane.dynamics.frames import FrameJacobians
@@ -35,7 +36,7 @@ ARGUMENTS = {  # of the quantities that `derivatives` takes
 }
 
 
-class Dynamics:
+class Dynamics(Brief):
     """Dynamics of a machine in its active coordinates, without multipliers.
 
     The tree's dynamics projected by gamma (Park, Choi, Ploen 1999), equations (4) and (6) of the
@@ -93,7 +94,7 @@ class Dynamics:
         self._grips = grips_at(machine, self.forces) if self.backend == "compiled" else []
         self.pattern[self._grips] = np.nan
 
-    def __repr__(self) -> str:
+    def _line(self) -> str:
         """Of what, and how it is computed."""
         return f"Dynamics of '{self.machine.name}', {self.backend}"
 

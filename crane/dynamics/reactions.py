@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from crane.closure.equations import turned
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_samples
+from crane.common.shown import Brief
 from crane.description.external import PARTS
 from crane.dynamics.joint_forces import JointForces
 from crane.dynamics.lengths import LEAST
@@ -39,7 +40,7 @@ class _Placed(NamedTuple):
     slopes: Array
 
 
-class Reactions:
+class Reactions(Brief):
     """Wrenches in the joints of a machine with closed loops.
 
     With tau the forces along the tree's joints that its motion asks for (rnea) less those of

@@ -6,8 +6,6 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
-from scipy.optimize import nnls
-from scipy.spatial import ConvexHull, QhullError
 
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_samples
@@ -85,6 +83,8 @@ class Stability:
         )
         if not self.stands and len(self._pressing) < len(self._links):
             raise InputError(f"'{machine.name}' has supports that move without being contacts")
+        from scipy.spatial import ConvexHull, QhullError  # slow to import
+
         try:
             hull = ConvexHull(self.places(machine.home[None])[0, :, :2])
         except (QhullError, ValueError):
@@ -274,5 +274,7 @@ def _shared(balance: Array, wanted: Array) -> Array:
             out[on] = np.maximum(part, 0.0)
             return out
         on = [i for i, force in zip(on, part, strict=True) if force > 0]
+    from scipy.optimize import nnls  # slow to import
+
     found: Array = nnls(balance, wanted)[0]
     return found

@@ -5,8 +5,10 @@ from crane.formats.loading import load, recalled
 from crane.formats.machine_file.read import read
 from crane.formats.machine_file.write import write_machine
 from crane.formats.mjcf.write import write_mjcf
+from crane.formats.urdf.description import robot_description
 from crane.formats.urdf.write import write_urdf_plus
 
 __all__ = [
-    "load", "read", "recalled", "write_home", "write_machine", "write_mjcf", "write_urdf_plus",
+    "load", "read", "recalled", "robot_description", "write_home", "write_machine", "write_mjcf",
+    "write_urdf_plus",
 ]  # fmt: skip

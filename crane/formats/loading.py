@@ -56,7 +56,9 @@ def load(
             of some freedoms their names, such as ("z", "ry") for one that heaves and pitches.
         packages: Folders of the packages that files name by `package://`, `model://` and
             `$(find ...)`, or folders in which these are, see `crane.common.packages`.
-        arguments: Values of the arguments of a xacro file; `model` of an SDF with several models.
+        arguments: Values of the arguments of a xacro file; `model` of an SDF with several models;
+            `urdf_constraint`, true where a URDF's `<constraint>` elements, as proposed upstream,
+            are to be read as loops, see `crane.formats.urdf.constraints`.
 
     Returns:
         The machine, its home posture closed.

@@ -9,7 +9,6 @@ from pathlib import Path
 from crane.common.errors import CraneWarning
 from crane.common.packages import giving
 from crane.description.spec import ForceElement
-from crane.formats.sdf.translate import translated
 from crane.formats.xacro.expand import expanded, needs_xacro
 from crane.formats.xml import XmlFile
 from crane.machine import Machine
@@ -41,6 +40,8 @@ def opened(file: Path) -> Opened:
     if needs_xacro(xml):
         xml = expanded(xml)
     if xml.root.tag == "sdf":
+        from crane.formats.sdf.translate import translated  # most files are none
+
         return Opened(*translated(xml))
     return Opened(xml)
 

@@ -93,36 +93,55 @@ def add_joint(robot: etree._Element, joint: Joint) -> etree._Element:
     return element
 
 
-def draw(robot: etree._Element, machine: Machine, chains: Iterable[str] | None = None) -> None:
-    """Copy what a machine's URDFs draw to the links of the same names."""
+def draw(
+    robot: etree._Element,
+    machine: Machine,
+    chains: Iterable[str] | None = None,
+    uris: bool = False,
+) -> None:
+    """Copy what a machine's URDFs draw to the links of the same names.
+
+    Args:
+        robot: Where to.
+        machine: The machine.
+        chains: Names of those of its chains that are drawn, all if not given.
+        uris: Whether meshes are named by URIs, as ROS needs them, and not by paths.
+    """
     links = {link.get("name"): link for link in robot.iterfind("link")}
     materials: dict[str, etree._Element] = {}
     with robots(machine, chains) as sources:
         for xml in sources:
             for material in xml.root.iterfind("material"):
                 materials.setdefault(material.get("name", ""), copy.deepcopy(material))
-            _copy_shapes(xml.root, links, xml.file.parent)
+            _copy_shapes(xml.root, links, xml.file.parent, uris)
     for material in reversed(materials.values()):
         robot.insert(0, material)
 
 
 def _copy_shapes(
-    source: etree._Element, links: Mapping[str, etree._Element], folder: Path
+    source: etree._Element, links: Mapping[str, etree._Element], folder: Path, uris: bool
 ) -> None:
     for link in source.iterfind("link"):
         target = links.get(link.get("name", "").strip())
         if target is None:
             continue
         for drawn in (*link.iterfind("visual"), *link.iterfind("collision")):
-            target.append(_located(drawn, folder))
+            target.append(_located(drawn, folder, uris))
 
 
-def _located(drawn: etree._Element, folder: Path) -> etree._Element:
-    """A copy of what is drawn, its mesh named by its whole path where it is there."""
+def _located(drawn: etree._Element, folder: Path, uris: bool) -> etree._Element:
+    """A copy of what is drawn, its mesh named by its whole path where it is there.
+
+    As URI, a mesh of a package keeps its name, which other computers understand, too.
+    """
     drawn = copy.deepcopy(drawn)
     for mesh in drawn.iter("mesh"):
-        if (file := mesh_file(mesh.get("filename", ""), folder)) is not None:
-            mesh.set("filename", str(file.resolve()))
+        name = mesh.get("filename", "")
+        if uris and name.startswith("package://"):
+            continue
+        if (file := mesh_file(name, folder)) is not None:
+            place = file.resolve()
+            mesh.set("filename", place.as_uri() if uris else str(place))
     return drawn
 
 
@@ -147,7 +166,7 @@ def finished(
         parent = element.getparent()
         parent.insert(parent.index(element) + 1, beside)
         beside.tail, element.tail = element.tail, "  "
-    head = f'<?xml version="1.0" encoding="utf-8"?>\n<!-- {_within(comment)} -->\n'
+    head = f'<?xml version="1.0"?>\n<!-- {_within(comment)} -->\n'
     return head.encode() + etree.tostring(robot, encoding="utf-8") + b"\n"
 
 
@@ -170,6 +189,14 @@ def left_out(machine: Machine, what: str, names: Sequence[str] | Iterator[str]) 
             CraneWarning,
             stacklevel=3,
         )
+
+
+def add_friction(element: etree._Element, machine: Machine, joint: str) -> None:
+    """`<dynamics>` of a joint that has Coulomb or viscous friction."""
+    law = machine.friction.get(joint)
+    if law is not None and (law.viscous or law.coulomb):
+        values = {"damping": text([law.viscous]), "friction": text([law.coulomb])}
+        etree.SubElement(element, "dynamics", values)
 
 
 def drives_of(machine: Machine) -> dict[str, dict[str, float]]:

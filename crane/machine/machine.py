@@ -16,6 +16,7 @@ from crane.closure import Closure, frame_id
 from crane.closure.coordinates import Coordinates
 from crane.common.errors import InputError, LimitError, known
 from crane.common.samples import Array, as_number, as_sample, as_samples
+from crane.common.shown import Brief, counted
 from crane.description import (
     Chain,
     Drive,
@@ -43,8 +44,8 @@ from crane.machine.between import misplaced
 _LIMIT_SLACK = 1e-9  # [rad], [machine's size] beyond a limit that counts as on it
 
 
-@dataclass(frozen=True)
-class Payload:
+@dataclass(frozen=True, repr=False)
+class Payload(Brief):
     """A rigid load put on a frame at run time.
 
     Attributes:
@@ -61,8 +62,8 @@ class Payload:
     inertia: ArrayLike = field(default_factory=lambda: np.zeros((3, 3)))
 
 
-@dataclass(frozen=True, eq=False)
-class Machine:
+@dataclass(frozen=True, eq=False, repr=False)
+class Machine(Brief):
     """A machine with closed kinematic chains, ready to be computed with.
 
     Attributes:
@@ -136,17 +137,17 @@ class Machine:
     packages: tuple[str, ...]
     arguments: Mapping[str, str]
 
-    def __repr__(self) -> str:
-        """Name, joints, loops and what drives it."""
-        drives = ", ".join(f"{joint} [{self.unit(joint)}]" for joint in self.driven_joints)
-        free = f", free {', '.join(self.free)}" if self.free else ""
-        loops = len(self.closure.equations.loops)
-        circuit = ", hydraulic" if self.hydraulics is not None else ""
-        return (
-            f"Machine '{self.name}': {len(self.joints)} joints, "
-            f"{loops} loop{'' if loops == 1 else 's'}{circuit}, "
-            f"driven by {drives or 'nothing'}{free}"
-        )
+    def _line(self) -> str:
+        """Name, degrees of freedom, joints, loops, and what is special about what drives it."""
+        words = [
+            repr(self.name),
+            counted(len(self.active), "degree of freedom", "degrees of freedom"),
+            counted(len(self.joints), "joint"),
+            counted(len(self.closure.equations.loops), "loop"),
+            *(["hydraulic"] if self.hydraulics is not None else []),
+            *([f"{len(self.free)} free"] if self.free else []),
+        ]
+        return f"Machine({', '.join(words)})"
 
     @property
     def home(self) -> Array:

@@ -6,11 +6,14 @@ from crane.motion.kinematics import Kinematics
 from crane.motion.paths import read_path
 from crane.motion.sway import Sway, retimed, without_sway
 from crane.motion.trajectories import task_trajectory, tip_trajectory
+from crane.motion.transmission import JointState, Transmission
 
 __all__ = [
+    "JointState",
     "Kinematics",
     "Sway",
     "Trajectory",
+    "Transmission",
     "Turning",
     "point_to_point",
     "polynomial",

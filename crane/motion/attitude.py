@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.machine import Machine
 from crane.motion.curves import Trajectory, via_points
 
@@ -192,7 +193,7 @@ def _crossing(v: Array) -> Array:
     return out
 
 
-class Turning:
+class Turning(Brief):
     """An attitude in time, R = R_0 exp([r]) with r(t) a rotation vector.
 
     With w^2 = r^T r and the series S_1 = sin(w)/w, S_2 = (1 - cos w)/w^2, S_3 = (w - sin w)/w^3,

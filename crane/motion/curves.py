@@ -5,10 +5,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import PPoly
 
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number, as_samples
+from crane.common.shown import Brief, counted
+from crane.motion.piecewise import Piecewise
 from crane.motion.splines import least_jerk, quintics
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 _JUMP = 1e-9  # of the largest value, what no jump is
 
 
-class Trajectory:
+class Trajectory(Brief):
     """A motion with two derivatives; before its start and after its end it stands still.
 
     Args:
@@ -38,13 +39,19 @@ class Trajectory:
 
     def __init__(
         self,
-        curve: PPoly,
+        curve: Piecewise,
         tip: "Trajectory | None" = None,
         attitude: "Trajectory | Turning | None" = None,
     ):
         self.duration = float(curve.x[-1])
         self.tip, self.attitude = tip, attitude
         self._curves = (curve, curve.derivative(), curve.derivative(2))
+
+    def _line(self) -> str:
+        """How long, and of how many coordinates."""
+        count = np.size(self.position(0.0))
+        words = f"{self.duration:.6g} s of {counted(count, 'coordinate')}"
+        return f"{type(self).__name__}({words}{', by its tip' * (self.tip is not None)})"
 
     def position(self, time: ArrayLike) -> Array:
         """Coordinates alone, (n,) or (N, n) at times () or (N,) [s]."""
@@ -74,7 +81,7 @@ class Trajectory:
     def turns(self) -> Array:
         """Times (k,) [s] at which a coordinate may be largest or least: knots, and rests."""
         curve, rate = self._curves[:2]
-        rests = [np.ravel(roots) for roots in np.ravel(rate.roots(extrapolate=False))]
+        rests = [np.ravel(roots) for roots in np.ravel(rate.roots())]
         times = np.concatenate([curve.x, *rests])
         return np.unique(times[np.isfinite(times)])
 
@@ -125,7 +132,7 @@ def polynomial(coefficients: Sequence[Sequence[float]], duration: float) -> Traj
     table = np.zeros((size, 1, len(rows)))
     for column, row in enumerate(rows):
         table[size - len(row) :, 0, column] = row[::-1]
-    return Trajectory(PPoly(table, [0.0, duration]))
+    return Trajectory(Piecewise(table, np.array([0.0, duration])))
 
 
 def point_to_point(start: ArrayLike, end: ArrayLike, duration: float) -> Trajectory:

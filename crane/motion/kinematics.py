@@ -6,13 +6,13 @@ from functools import cached_property
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
-from scipy.interpolate import make_interp_spline
 
 from crane.closure.traced import Bodies, Constants, Loops, MovingBodies, folded
 from crane.codegen import Number, Program, Tape, TooLongError
 from crane.codegen.scalar import add, cross, dot, scale, subtract, times
 from crane.common.errors import ClosureError, InputError, UnreachableTipError, known
 from crane.common.samples import Array, as_sample, as_samples, per_sample
+from crane.common.shown import Brief
 from crane.common.threads import PerThread
 from crane.machine import Machine
 from crane.motion.attitude import INCLINATION, Attitude, Inclination, Rotation, roll_pitch_yaw
@@ -37,7 +37,7 @@ def norm(vector: Array) -> float:
     return float(np.linalg.norm(vector))
 
 
-class Kinematics:
+class Kinematics(Brief):
     """Position of one frame as a function of q_A.
 
         x = p(f(q_A)),    x' = J gamma v_A,    x'' = J gamma a_A + bias.
@@ -70,7 +70,7 @@ class Kinematics:
         self._turned: dict[str, Attitude] = {}
         self._memory = PerThread(self._model.createData)
 
-    def __repr__(self) -> str:
+    def _line(self) -> str:
         """What moves, of what."""
         return f"Kinematics of '{self.frame}' of '{self.machine.name}'"
 
@@ -336,6 +336,8 @@ class Kinematics:
                 for k in range(knots[max(i - 1, 0)], knot + 1):
                     start = self._inverse(targets[k], start, places[k], None)
                 return None
+        from scipy.interpolate import make_interp_spline  # slow to import
+
         try:
             curve = make_interp_spline(knots, searched)(np.arange(len(targets)))
             q_a = curve = np.clip(curve, machine.lower, machine.upper)

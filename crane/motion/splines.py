@@ -2,10 +2,9 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PPoly
-from scipy.linalg import solveh_banded
 
 from crane.common.samples import Array
+from crane.motion.piecewise import Piecewise
 
 _PARTS = 3  # value, rate and second rate at a knot
 _NOISE_POINTS = 7  # of a divided difference that noise alone is left of
@@ -14,7 +13,7 @@ _SMOOTHEST = 2.5e-3  # cut-off per knot: below, rounding spoils what is left
 _ENOUGH = 1e-3  # of the scatter and of the cut-off, to which both are found
 
 
-def quintics(time: Array, x: Array, v: Array, a: Array) -> PPoly:
+def quintics(time: Array, x: Array, v: Array, a: Array) -> Piecewise:
     """Polynomials of fifth order between knots (N,) with values and derivatives (N, n).
 
     With u = t - t_i, h = t_i+1 - t_i and what the second order misses at u = h,
@@ -35,7 +34,7 @@ def quintics(time: Array, x: Array, v: Array, a: Array) -> PPoly:
         v[:-1],
         x[:-1],
     ]
-    return PPoly(np.array(rows), time)
+    return Piecewise(np.array(rows), np.asarray(time, dtype=np.float64))
 
 
 def _basis() -> Array:
@@ -152,6 +151,8 @@ def least_jerk(time: Array, x: Array, v: Array) -> Array:
     Returns:
         (N, 3) values, rates and second rates.
     """
+    from scipy.linalg import solveh_banded  # slow to import
+
     knots, level = _Knots(time), x[0]  # what is far from zero keeps its digits
     given = np.column_stack([x - level, v, np.full(len(time), np.nan)])
     given[[0, -1], 2] = 0.0
@@ -200,6 +201,8 @@ def smoothed(time: Array, x: Array, scatter: float) -> tuple[Array, Array, float
     Returns:
         Times (K,) of the knots, values, rates and second rates there (K, 3), and f_c [Hz].
     """
+    from scipy.linalg import solveh_banded  # slow to import
+
     grid = np.arange(time[0], time[-1], _CLOSEST)
     first = np.searchsorted(time, grid)
     knots = _Knots(time[np.unique(np.r_[first, len(time) - 1])])

@@ -14,11 +14,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import BSpline, make_interp_spline
-from scipy.linalg import eigh
 
 from crane.common.errors import ClosureError, InputError, LimitError, known
 from crane.common.samples import Array, as_number
+from crane.common.shown import Brief
 from crane.dynamics import Dynamics
 from crane.machine import Machine
 from crane.motion.curves import Trajectory
@@ -38,7 +37,7 @@ _DIFFERENCE = 1e-6  # step of difference quotients [rad], [machine's size]
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
 
-class Sway:
+class Sway(Brief):
     """What hangs on the free joints of a machine: where it hangs, how it sways, what moves it.
 
     Args:
@@ -127,6 +126,8 @@ class Sway:
         free = ~self._driven
         mass = self._dynamics.mass_matrix(q_a)[np.ix_(free, free)]
         stiffness = self.stiffness(q_a)[:, free]
+        from scipy.linalg import eigh  # slow to import
+
         squares, shapes = eigh((stiffness + stiffness.T) / 2, mass)
         if squares[0] <= 0:
             raise InputError(f"what {', '.join(self.machine.free)} carry does not hang")
@@ -249,6 +250,8 @@ def _sampled(machine: Machine, duration: float, motion: Callable[[Array], Array]
 
 def _derivatives(time: Array, q_a: Array) -> tuple[Array, Array]:
     """Velocities and accelerations of the quintic spline from rest to rest."""
+    from scipy.interpolate import make_interp_spline  # slow to import
+
     rest = np.zeros(q_a.shape[1])
     ends: Any = [(1, rest), (2, rest)]  # of which scipy's types know less than scipy
     spline = make_interp_spline(time, q_a, k=5, bc_type=(ends, ends))
@@ -322,6 +325,8 @@ def _shaped(machine: Machine, reference: Trajectory, derivative: bool) -> Trajec
 
 def _smoothed(reference: Trajectory, time: Array, width: float) -> Array:
     """Means (N, n) of a reference before a time, weighted by a cubic B-spline of a width [s]."""
+    from scipy.interpolate import BSpline  # slow to import
+
     kernel = BSpline.basis_element(np.linspace(0.0, width, 5), extrapolate=False)
     quarter = width / 4.0
     out: Array = np.zeros(())
@@ -334,6 +339,8 @@ def _smoothed(reference: Trajectory, time: Array, width: float) -> Array:
 
 def _from_rest(time: Array) -> Array:
     """Quintic splines (N, s) that begin and end at rest at zero, wide enough to hold no noise."""
+    from scipy.interpolate import BSpline  # slow to import
+
     count = max(10, int(np.ceil(_SPLINES_PER_SECOND * time[-1])))
     knots = np.linspace(0.0, time[-1], count + 1)
     knots = np.concatenate([np.full(5, 0.0), knots, np.full(5, time[-1])])

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import make_interp_spline
 
+from crane.codegen import kept_result
 from crane.common.errors import InputError, LimitError, known
 from crane.common.samples import Array
 from crane.description.spec import TIP, Task, Via
@@ -63,6 +63,8 @@ def tip_trajectory(
         x_rate, x_second = np.hstack([x_rate, rate]), np.hstack([x_second, second])
     q_a = kinematics.tracked(x, guess, goal, time)
     if machine.driven.sum() > x_rate.shape[1]:
+        from scipy.interpolate import make_interp_spline  # slow to import
+
         spline = make_interp_spline(time, q_a, k=5)
         v_a, a_a = spline(time, 1), spline(time, 2)
     else:
@@ -143,6 +145,17 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
     chosen = machine.tasks[task]
     if chosen.space == "joystick":
         raise InputError(f"task '{task}' moves levers, it has no trajectory")
+    closure = machine.closure
+    depends = (
+        closure.parts, closure.structure, machine.home, machine.lower, machine.upper,
+        machine.active, machine.driven, machine.tip, chosen.space, chosen.duration,
+        tuple((name, tuple(row)) for name, row in chosen.coefficients.items()),
+        tuple((x.time, tuple(x.point.items()), tuple(x.rates.items())) for x in chosen.via),
+    )  # fmt: skip
+    return kept_result(("task", depends), lambda: _followed(machine, chosen), "scipy.interpolate")
+
+
+def _followed(machine: Machine, chosen: Task) -> Trajectory:
     if chosen.space == "tip":
         tip = _curve(chosen, TIP)
         attitude: Trajectory | Turning | None = None
@@ -154,7 +167,7 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
         return tip_trajectory(machine, tip, None, attitude)
     found = with_free(machine, _curve(chosen, machine.driven_joints))
     if text := beyond_limits(machine, found):
-        raise LimitError(f"task '{task}': {text}")
+        raise LimitError(f"task '{chosen.name}': {text}")
     return found
 
 

@@ -7,7 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from crane.common.errors import InputError
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
+from crane.common.units import quantity
 from crane.machine import Machine
 from crane.motion.workspaces.patch import fill
 from crane.ratings.causes import Cause, Causes
@@ -67,6 +69,12 @@ class Breakout(Brief):
     weights: bool
     bucket: Digging
     arm: Digging | None
+
+    def _line(self) -> str:
+        """Both forces."""
+        both = (("bucket", self.bucket), ("arm", self.arm))
+        words = [f"{name} {quantity(x.force, 'N', 4)}" for name, x in both if x is not None]
+        return f"Breakout of '{self.machine.name}' at '{self.frame}': {', '.join(words)}"
 
     def to_markdown(self) -> str:
         """A table: forces, levers, postures, what ends them."""

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crane.common.errors import InputError
-from crane.common.samples import Array, Brief, as_number, as_sample
+from crane.common.samples import Array, as_number, as_sample
+from crane.common.shown import Brief
 from crane.dynamics.statics import AtRest, Statics
 from crane.machine import Machine
 from crane.motion.workspaces.section import Section

@@ -28,6 +28,15 @@ class Capacity(Field):
 
     quantity: ClassVar[tuple[str, str]] = ("load", "kg")
 
+    def _line(self) -> str:
+        """The range of its loads and places."""
+        loads = self.loads[np.isfinite(self.loads)]
+        words = f"{loads.min():.4g} to {loads.max():.4g} kg" if len(loads) else "no load"
+        return (
+            f"Capacity of '{self.machine.name}' at '{self.frame}': {words} over "
+            f"{self.radii[0]:.4g} to {self.radii[-1]:.4g} m, rule '{self.rule.name}'"
+        )
+
     @property
     def loads(self) -> Array:
         """(s, b, a) rated loads [kg]: its values."""

@@ -6,8 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from crane.common import shown
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number
+from crane.common.units import quantity
 from crane.dynamics.statics import Statics
 from crane.machine import Machine
 from crane.motion.workspaces.section import slewing
@@ -45,6 +47,18 @@ class Torques(NamedTuple):
     height: float
     net: float
     slewing: float
+
+    def __repr__(self) -> str:
+        """The torques."""
+        words = [f"gross {quantity(self.gross, 'N m', 4)} of '{self.raising}'"]
+        words.append(f"net {quantity(self.net, 'N m', 4)} at {self.radius:g} m")
+        if np.isfinite(self.slewing):
+            words.append(f"slewing {quantity(self.slewing, 'N m', 4)}")
+        return f"Torques({', '.join(words)})"
+
+    def _repr_html_(self) -> str | None:
+        """What notebooks show."""
+        return shown.to_html(self)
 
     def to_markdown(self) -> str:
         """A table of the torques, and what each means."""

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crane.common.errors import InputError
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.dynamics.statics import AtRest, Statics
 from crane.motion.kinematics import Kinematics
 from crane.motion.workspaces.explore import limits_of, strokes_of

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.errors import InputError
-from crane.common.samples import Brief, as_number
+from crane.common.samples import as_number
+from crane.common.shown import Brief
 from crane.machine import Machine
 from crane.motion.workspaces import Workspace, workspace
 from crane.motion.workspaces.section import upwards
@@ -40,6 +41,11 @@ class WorkingRange(Brief):
     bucket: str | None
     level: float
     dimensions: tuple[Dimension, ...]
+
+    def _line(self) -> str:
+        """Its numbers."""
+        words = ", ".join(f"{one.name} {one.value:.4g} m" for one in self.dimensions)
+        return f"WorkingRange of '{self.machine.name}' at '{self.frame}': {words}"
 
     def __getitem__(self, name: str) -> Dimension:
         for one in self.dimensions:

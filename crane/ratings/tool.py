@@ -9,6 +9,7 @@ import numpy as np
 
 from crane.common.errors import InputError, known
 from crane.common.samples import Array, as_sample
+from crane.common.units import quantity
 from crane.dynamics.statics import Statics
 from crane.machine import Machine
 from crane.motion.workspaces.section import upwards
@@ -33,6 +34,12 @@ class ToolForce(Field):
     direction: str = ""
 
     quantity: ClassVar[tuple[str, str]] = ("force", "N")
+
+    def _line(self) -> str:
+        """Its direction, and the largest force."""
+        forces = self.forces[np.isfinite(self.forces)]
+        words = f"up to {quantity(forces.max(), 'N', 4)}" if len(forces) else "no force"
+        return f"ToolForce of '{self.machine.name}' at '{self.frame}', {self.direction}: {words}"
 
     @property
     def forces(self) -> Array:

@@ -31,6 +31,7 @@ from numpy.typing import ArrayLike
 from crane.common import scratch
 from crane.common.errors import RecordingError, at, known
 from crane.common.samples import Array
+from crane.common.shown import Brief, counted
 from crane.description.sensors import FORCE as FORCE
 from crane.description.sensors import FORCE_UNITS as FORCE_UNITS
 from crane.description.sensors import VELOCITY as VELOCITY
@@ -43,8 +44,8 @@ FREE = "free"  # a note of joints that nothing drives
 _LISTED = 40  # names in a message
 
 
-@dataclass(frozen=True, eq=False)
-class Recording:
+@dataclass(frozen=True, eq=False, repr=False)
+class Recording(Brief):
     """Samples of N instants of a machine with n active joints.
 
     The arrays are copied to contiguous float64 and checked: shapes, finite numbers, time
@@ -151,13 +152,14 @@ class Recording:
                 f"give strictly increasing times"
             )
 
-    def __repr__(self) -> str:
-        """What it is of, how long, and its joints."""
+    def _line(self) -> str:
+        """What it is of, how long, how many samples, and its columns."""
         what = ": ".join(word for word in (self.machine, self.task) if word)
         joints = ", ".join(f"{joint} [{self.units[joint]}]" for joint in self.joints)
         return (
             f"Recording of {what or 'a machine'}, {self.time[-1] - self.time[0]:.6g} s in "
-            f"{len(self.time)} samples: {joints}, {len(self.channels)} channels"
+            f"{counted(len(self.time), 'sample')}: {counted(len(self.channels), 'channel')} "
+            f"beside {joints or 'no joints'}"
         )
 
     def _names(self) -> list[str]:

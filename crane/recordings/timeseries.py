@@ -25,7 +25,8 @@ import numpy as np
 from crane.common import scratch
 from crane.common.errors import RecordingError, at
 from crane.common.output import replacing
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.common.units import TO_SI
 from crane.common.units import spellings as spellings
 from crane.description.sensors import TIME as TIME
@@ -103,12 +104,13 @@ def write_columns(
         OutputError: It cannot be written there.
     """
     head = [*_comments({**notes, SAMPLES: str(len(columns[0]))}), ",".join(_headings(units))]
+    line = ",".join(["%r"] * len(columns)) + "\n"
     with replacing(path) as part, part.open("w", encoding="utf-8", newline="\n") as file:
         file.write("\n".join(head) + "\n")
         for start in range(0, len(columns[0]), _ROWS_AT_ONCE):
             rows = np.column_stack([x[start : start + _ROWS_AT_ONCE] for x in columns])
             scratch.release()
-            text = "".join([",".join(map(repr, row)) + "\n" for row in rows.tolist()])
+            text = line * len(rows) % tuple(rows.ravel().tolist())
             file.write(text.replace("nan", "") if np.isnan(rows).any() else text)
 
 

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneError, InputError
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief, counted
+from crane.common.waiting import telling
 from crane.control import Controller
 from crane.dynamics import Dynamics
 from crane.machine import Machine
@@ -49,6 +51,13 @@ class Batch(Brief):
     failures: dict[int, str]
     warnings: dict[int, str]
 
+    def _line(self) -> str:
+        """How many, how long, and how many failed."""
+        return (
+            f"Batch of {counted(len(self.q), 'simulation')}, {self.time[-1]:.6g} s in "
+            f"{counted(len(self.time), 'sample')}: {len(self.failures)} failed"
+        )
+
 
 def simulate_batch(
     machines: Machine | Sequence[Machine],
@@ -81,6 +90,7 @@ def simulate_batch(
     Raises:
         InputError: Lengths or active joints that do not go together.
     """
+    progress = telling(progress)
     if isinstance(machines, Machine):
         machines = [machines] * (1 if initial is None else len(initial))
     if not machines:

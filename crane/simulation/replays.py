@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.errors import CraneWarning, InputError, RecordingError, at, known
-from crane.common.samples import Array, Brief, as_number
+from crane.common.samples import Array, as_number
+from crane.common.shown import Brief
+from crane.common.waiting import telling
 from crane.control import Signals, ValveDrive
 from crane.description.sensors import SIGNAL, SUPPLY, TANK
 from crane.machine import Machine
@@ -64,8 +66,8 @@ class Channel(Brief):
         return self.rms / spread if spread > 0 else (0.0 if self.rms == 0 else np.inf)
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Brief):
     """A recording beside the simulation of the same inputs.
 
     Attributes:
@@ -76,7 +78,7 @@ class Comparison:
     time: Array
     channels: tuple[Channel, ...]
 
-    def __repr__(self) -> str:
+    def _line(self) -> str:
         """How long, and what is compared."""
         return (
             f"Comparison over {self.time[-1] - self.time[0]:.6g} s in {len(self.time)} samples: "
@@ -129,6 +131,7 @@ def replay(
         RecordingError: The file is malformed, or has no signals.
         InputError: The machine has no valves.
     """
+    progress = telling(progress)
     step = as_number(step, "the step", "s", above=0)
     table = read(path, machine, columns, span)
     try:

@@ -14,6 +14,7 @@ from crane.codegen import Parts, TooLongError
 from crane.common import scratch
 from crane.common.errors import ClosureError, CraneWarning, InputError, SimulationError, known
 from crane.common.samples import Array, as_number, as_sample
+from crane.common.waiting import telling
 from crane.control import (
     Command,
     Controller,
@@ -145,6 +146,7 @@ def simulate(
     A reference that leaves the limits of a joint is a warning before the first step: with an end
     stop it can be meant.
     """
+    progress = telling(progress)
     if not (isinstance(label, str) and label.isprintable()):
         raise InputError(f"label {label!r} is not one line of text")
     if not isinstance(machine, Machine):

@@ -6,9 +6,10 @@ from typing import Any
 
 from crane.closure.traced import Bodies, Constants, Loops
 from crane.codegen import Number, Tape
-from crane.codegen.casadi_graph import expressions, library
+from crane.codegen.casadi_graph import expressions
 from crane.codegen.scalar import add, subtract, times, transposed
 from crane.common.errors import InputError, MechanismError, known
+from crane.common.extras import library
 from crane.control import Signals, ValveDrive
 from crane.dynamics import Dynamics
 from crane.dynamics.compiled import FRICTION, QUANTITIES
@@ -71,7 +72,7 @@ def casadi_function(
             accelerations jump, in "simulation".
         MechanismError: Its formulas are too long.
     """
-    ca = library()
+    ca = library("casadi", "a symbolic function")
     if not isinstance(machine, Machine):
         machine = load(machine)
     names = [*_POSTURES, *ARGUMENTS, _SIMULATION]

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 from crane.common.errors import CraneWarning, InputError
-from crane.common.extras import how
+from crane.common.extras import library
 
 _PATIENCE = 10.0  # [s] for the scheduler to answer
 
@@ -30,16 +30,13 @@ def by_workers(
     Raises:
         InputError: Dask is not installed, the scheduler does not answer, or workers keep dying.
     """
-    try:
-        from distributed import Client, as_completed
-    except ImportError:
-        raise InputError(f"a scheduler needs Dask, {how('cluster')}") from None
+    dask = library("distributed", "a scheduler")
     if not re.fullmatch(r"(\w+://)?[^\s/]+:\d+/?", scheduler):
         raise InputError(
             f"'{scheduler}' is no address of a scheduler, give one such as tcp://HOST:8786"
         )
     try:
-        client = Client(scheduler, timeout=_PATIENCE, set_as_default=False)
+        client = dask.Client(scheduler, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise InputError(
             f"no scheduler answers at '{scheduler}' ({error}), start one with 'dask scheduler' "
@@ -57,7 +54,7 @@ def by_workers(
         keys = [f"crane-study-{run}-{index}" for index in range(len(jobs))]
         futures = client.map(function, jobs, key=keys, pure=False)
         indices = {future.key: index for index, future in enumerate(futures)}
-        for future in as_completed(futures, loop=client.loop):
+        for future in dask.as_completed(futures, loop=client.loop):
             yield indices[future.key], _result(future, indices[future.key], scheduler)
 
 

@@ -8,7 +8,9 @@ import numpy as np
 
 from crane.codegen import Program, Tape
 from crane.common.errors import RecordingError, known
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
+from crane.common.units import quantity
 from crane.control import Signals, ValveDrive
 from crane.description import Friction
 from crane.description.sensors import VELOCITY
@@ -92,6 +94,15 @@ class PowerAccount(Brief):
     fuel: float | None
     machine: str
     task: str
+
+    def _line(self) -> str:
+        """Of what, how long, and what its shafts gave."""
+        what = ": ".join(word for word in (self.machine, self.task) if word)
+        fuel = "" if self.fuel is None else f", {self.fuel:.4g} kg of fuel"
+        return (
+            f"PowerAccount of {what or 'a machine'}, {self.time[-1] - self.time[0]:.6g} s: shafts "
+            f"{quantity(self.energy(self.shaft), 'J', 4)}{fuel}"
+        )
 
     @property
     def shaft(self) -> Array:

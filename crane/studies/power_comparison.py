@@ -6,7 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.errors import InputError
-from crane.common.samples import Array, Brief, as_number
+from crane.common.samples import Array, as_number
+from crane.common.shown import Brief
+from crane.common.units import quantity
 from crane.hydraulics.powers import SHAFT
 from crane.studies.power import CLASSES, PowerAccount, class_of, what_of
 
@@ -33,6 +35,12 @@ class PowerComparison(Brief):
             raise InputError("one run has nothing to be compared with, give two at least")
         if self.moved is not None:
             as_number(self.moved, "the mass that is moved", "kg", above=0)
+
+    def _line(self) -> str:
+        """What the shafts gave in each run."""
+        works = {run: account.totals[SHAFT] for run, account in self.accounts.items()}
+        words = ", ".join(f"{run} {quantity(work, 'J', 4)}" for run, work in works.items())
+        return f"PowerComparison of the shafts' work: {words}"
 
     def classes(self, run: str) -> dict[str, float]:
         """Energy of a run by what it goes into, see `CLASSES` [J]; their sum is the shafts'."""

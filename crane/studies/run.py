@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneError, CraneWarning, InputError, at, known
 from crane.common.samples import Array, as_count, as_samples, as_seed
+from crane.common.waiting import telling
 from crane.description.number_units import number_unit
 from crane.dynamics import Dynamics
 from crane.formats import load
@@ -118,6 +119,7 @@ def study(
         InputError: Unknown names, values that do not go together, no variant can be measured, or a
             machine that was changed after it was loaded.
     """
+    progress = telling(progress)
     processes_of(processes)
     seed = as_seed(seed)
     base, name = described(machine)

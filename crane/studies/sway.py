@@ -8,7 +8,9 @@ import numpy as np
 
 from crane.common.errors import InputError
 from crane.common.samples import Array, as_number
+from crane.common.shown import Brief, counted
 from crane.common.tables import aligned
+from crane.common.waiting import telling
 from crane.control import ValveFeedforward, fastest
 from crane.formats import load
 from crane.machine import Machine
@@ -52,8 +54,8 @@ class SwayRow:
         return f"{self.method}, damped" if self.damping else self.method
 
 
-@dataclass(frozen=True)
-class SwayStudy:
+@dataclass(frozen=True, repr=False)
+class SwayStudy(Brief):
     """Sway that a task leaves through the valves.
 
     Attributes:
@@ -63,6 +65,14 @@ class SwayStudy:
 
     task: str
     rows: tuple[SwayRow, ...]
+
+    def _line(self) -> str:
+        """Its task, and what leaves the least sway."""
+        best = min(self.rows, key=lambda row: row.residual)
+        return (
+            f"SwayStudy of '{self.task}': {counted(len(self.rows), 'motion')}, the least sway "
+            f"{np.degrees(best.residual):.3g} deg by {best.name}"
+        )
 
     def to_text(self) -> str:
         """A table."""
@@ -102,6 +112,7 @@ def sway_study(
     Raises:
         CraneError: As `load`, `fastest` and `simulate`.
     """
+    progress = telling(progress)
     if not payloads:
         raise InputError("no payloads, give some masses [kg]")
     rows: list[SwayRow] = []

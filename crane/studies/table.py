@@ -10,12 +10,13 @@ import numpy as np
 from crane.common.errors import InputError, known
 from crane.common.output import replacing
 from crane.common.samples import Array
+from crane.common.shown import Brief
 
 _MORE_IS_BETTER = ("reach", "range", "highest")
 
 
-@dataclass(frozen=True, eq=False)
-class Study:
+@dataclass(frozen=True, eq=False, repr=False)
+class Study(Brief):
     """Measures of V variants of a machine.
 
     Attributes:
@@ -41,7 +42,7 @@ class Study:
     grid: tuple[int, ...]
     notes: tuple[str, ...] = ()
 
-    def __repr__(self) -> str:
+    def _line(self) -> str:
         """What varies, and what is measured."""
         failed = sum(map(bool, self.reasons))
         return (

@@ -19,7 +19,9 @@ from crane.common.errors import OutputError
 from crane.common.output import replacing
 
 MOST = 256 << 20  # bytes in the folder; what was used least lately makes room
+_PARTS = 16  # of these, after each of which the folder is looked through again
 _DIGEST = 32  # bytes
+_left: dict[Path, int] = {}  # bytes that this process may write before it looks again
 
 
 def folder() -> Path:
@@ -69,9 +71,10 @@ def write(name: str, code: bytes) -> None:
         file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         if not _own(file.parent):
             return
-        _make_room(file.parent, len(code))
+        data = _digest(name, code) + code
+        _make_room(file.parent, len(data))
         with replacing(file) as part:
-            part.write_bytes(_digest(name, code) + code)
+            part.write_bytes(data)
 
 
 def _digest(name: str, code: bytes) -> bytes:
@@ -87,14 +90,22 @@ def _own(place: Path) -> bool:
 
 
 def _make_room(place: Path, size: int) -> None:
-    """Remove what was used least lately until there is room for so many bytes."""
-    files = sorted(_files(place))
-    total = size + sum(length for _, length, _ in files)
-    for _, length, item in files:
-        if total <= MOST:
-            return
-        item.unlink(missing_ok=True)
-        total -= length
+    """Remove what was used least lately until there is room for so many bytes.
+
+    Looking at thousands of files takes longer than compiling a small program, so that room is made
+    for many programs at once. Other processes may fill the same room meanwhile.
+    """
+    left = _left.get(place, 0)
+    if left < size:
+        left = max(size, MOST // _PARTS)
+        files = sorted(_files(place))
+        total = left + sum(length for _, length, _ in files)
+        for _, length, item in files:
+            if total <= MOST:
+                break
+            item.unlink(missing_ok=True)
+            total -= length
+    _left[place] = left - size
 
 
 def _files(place: Path) -> Iterator[tuple[float, int, Path]]:

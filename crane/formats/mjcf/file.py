@@ -10,13 +10,12 @@ import numpy as np
 from lxml import etree
 
 from crane.common.errors import CraneWarning, DescriptionError
-from crane.common.extras import how
+from crane.common.extras import library
 from crane.formats.mjcf.bounds import copies
 from crane.formats.mjcf.missing import MassMissingError, missing_file, without_files
 from crane.formats.xml import XmlFile
 
 _SHOWN = 6  # names in a line
-_INSTALL = f"reading MJCF needs MuJoCo, {how('mjcf')}"
 
 
 class MujocoFile:
@@ -33,7 +32,8 @@ class MujocoFile:
         model: MuJoCo's `MjModel`.
 
     Raises:
-        DescriptionError: MuJoCo is not installed, or the file or what it includes is wrong.
+        InputError: MuJoCo is not installed.
+        DescriptionError: The file or what it includes is wrong.
     """
 
     def __init__(self, file: Path):
@@ -43,11 +43,7 @@ class MujocoFile:
         self._otherwise: dict[str, list[str]] = {}
         self._sizes: dict[Path, int] = {}
         self._open(file, [])
-        try:
-            import mujoco
-        except ImportError:
-            raise DescriptionError(f"{file.name}: {_INSTALL}") from None
-        self._mujoco = mujoco
+        self._mujoco = mujoco = library("mujoco", f"{file.name}: reading MJCF")
         told: list[str] = []
         before = mujoco.get_mju_user_warning()
         mujoco.set_mju_user_warning(told.append)  # else into a file in the working folder

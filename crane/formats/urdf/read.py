@@ -13,6 +13,7 @@ from crane.description.spec import Coupling, ForceElement, Friction, LoopSpec
 from crane.description.tree import Joint, Link, Tree
 from crane.formats.opening import opened
 from crane.formats.series import SEVERAL
+from crane.formats.urdf.constraints import read_constraints
 from crane.formats.urdf.couplings import read_coupling
 from crane.formats.urdf.elements import (
     read_friction,
@@ -122,6 +123,7 @@ def read_urdf(file: Path, edit: Callable[[XmlFile], None] | None = None) -> Urdf
     remember_file(xml)
     if xml.root.tag != "robot":
         raise xml.fail(xml.root, f"a URDF starts with <robot>, this file with <{xml.root.tag}>")
+    read_constraints(xml)
     xml.check(xml.root, _CHILDREN, _ATTRIBUTES, _EXACT)
     if edit is not None:
         edit(xml)

@@ -7,6 +7,7 @@ from difflib import get_close_matches
 from lxml import etree
 
 from crane.common.errors import CraneWarning, known
+from crane.formats.urdf.constraints import HINT
 from crane.formats.xml import XmlFile
 
 # Of simulators, controllers and planners (ROS, SRDF, Gazebo, Drake, PyBullet, MuJoCo, PR2);
@@ -90,6 +91,8 @@ def _is_read(element: etree._Element, children: Mapping[str, Set[str]]) -> bool:
 
 def _meant(tag: str, tags: Set[str], attributes: Mapping[str, Set[str]]) -> str:
     """The element, or attribute of one, that may have been meant by an unknown element."""
+    if tag == "constraint":
+        return HINT
     within = {name: other for other in sorted(tags) for name in sorted(attributes.get(other, ()))}
     near = get_close_matches(tag.lower(), [*sorted(tags), *within], 1, _NEAR)
     if not near:

@@ -9,6 +9,7 @@ from crane.common.output import replacing
 from crane.description import Coupling, LoopSpec
 from crane.description.tree import Tree
 from crane.formats.parts import (
+    add_friction,
     add_joint,
     add_link,
     add_origin,
@@ -87,10 +88,7 @@ def write_urdf_plus(machine: Machine, path: str | Path) -> None:
 def _add_moving(machine: Machine, robot: etree._Element, name: str) -> None:
     element = add_joint(robot, machine.tree.joints[name])
     element.set("independent", str(name in machine.active).lower())
-    law = machine.friction.get(name)
-    if law is not None and (law.viscous or law.coulomb):
-        values = {"damping": text([law.viscous]), "friction": text([law.coulomb])}
-        etree.SubElement(element, "dynamics", values)
+    add_friction(element, machine, name)
 
 
 def _add_loop(tree: Tree, robot: etree._Element, loop: LoopSpec) -> None:

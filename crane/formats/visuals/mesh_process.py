@@ -9,7 +9,6 @@ It imports nothing of the package, which takes longer than most meshes.
 """
 
 import json
-import logging
 import os
 import sys
 import warnings
@@ -23,6 +22,8 @@ _FORMATS = ("stl", "obj", "dae", "glb", "gltf", "ply", "off")
 
 def main() -> None:
     """Read what is asked for."""
+    import logging  # which whoever asks for it has no use for
+
     out = os.fdopen(os.dup(1), "wb")
     silence = os.open(os.devnull, os.O_WRONLY)
     os.dup2(silence, 1)  # the output is ours alone

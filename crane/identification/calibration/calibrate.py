@@ -8,6 +8,7 @@ import numpy as np
 
 from crane.common.errors import InputError, RecordingError, at
 from crane.common.samples import Array
+from crane.common.waiting import telling
 from crane.description.number_units import number_unit
 from crane.description.sensors import (
     SENSOR,
@@ -88,6 +89,7 @@ def calibrate(
         RecordingError: A recording is malformed, or has no signals.
         SimulationError: The machine as it is cannot follow a recording.
     """
+    progress = telling(progress)
     if not isinstance(machine, Machine):
         machine = load(machine)
     paths = [recordings] if isinstance(recordings, str | Path) else list(recordings)

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.description.sensors import PRESSURE, VELOCITY, VELOCITY_UNITS
 from crane.identification.calibration.result import Calibration, Channel
 

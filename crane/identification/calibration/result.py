@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief, counted
 from crane.common.units import reading
 from crane.identification.calibration.ends import Ends
 from crane.identification.calibration.lacking import Lacking
@@ -116,8 +117,8 @@ class Channel(Brief):
         return float(np.sqrt(np.mean(left**2))) if len(left) else float("nan")
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(Brief):
     """A machine fitted to recordings.
 
     Attributes:
@@ -145,6 +146,16 @@ class Calibration:
     states: Mapping[str, Mapping[str, Array]] = field(default_factory=dict)
     lowest: bool = True
     left: tuple[str, ...] = ()
+
+    def _line(self) -> str:
+        """What was fitted to, and the numbers that are told."""
+        told = [x for x in self.fitted if not (x.bound or x.vague)]
+        values = ", ".join(f"{x.name} = {x.value:.5g}" for x in told)
+        numbers, channels = counted(len(self.fitted), "number"), len(self.sensors)
+        return (
+            f"Calibration of '{self.machine.name}': {len(told)} of {numbers} told by "
+            f"{counted(channels, 'channel')}{': ' * bool(told)}{values}"
+        )
 
     @property
     def notes(self) -> dict[str, str]:

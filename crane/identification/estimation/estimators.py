@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.errors import InputError
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.identification.estimation.jackknife import Jackknife
 from crane.identification.estimation.noise import Noise, between
 from crane.identification.estimation.regressor import Regressor, Stored, factors, triangular
@@ -254,7 +255,9 @@ class _Rows:
         self.members = [np.flatnonzero(groups == g) for g in range(int(groups.max()) + 1)]
         self.groups = groups
         for g, rows in enumerate(self.members):
-            if len(rows) < 2 or (np.diff(samples[rows]) <= 0).any():
+            if len(rows) < 2:
+                raise InputError(f"group {g} has {len(rows)} row, give two at least")
+            if (np.diff(samples[rows]) <= 0).any():
                 raise InputError(f"samples of group {g} do not increase, sort its rows by time")
         self.mean = np.zeros(size)
         self.pull = np.zeros((0, size)) if pull is None else pull

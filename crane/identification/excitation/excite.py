@@ -10,8 +10,10 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError, known
 from crane.common.output import replacing
-from crane.common.samples import Array, Brief, as_count, as_number, as_seed
+from crane.common.samples import Array, as_count, as_number, as_seed
+from crane.common.shown import Brief
 from crane.common.tables import aligned
+from crane.common.waiting import telling
 from crane.dynamics import Dynamics
 from crane.identification.excitation.fourier import Fourier
 from crane.identification.excitation.information import CRITERIA, Information, Quality
@@ -67,6 +69,13 @@ class Excitation(Brief):
     criterion: str
     seed: int
     step: float
+
+    def _line(self) -> str:
+        """For what, how long, and what it gains."""
+        return (
+            f"Excitation of '{self.machine.name}', {self.trajectory.duration:.6g} s: condition "
+            f"{self.before.condition:.3g} random, {self.after.condition:.3g} optimised"
+        )
 
     def motion(self) -> tuple[Array, Array, Array, Array, Array]:
         """Times (N,), and q_A, v_A, a_A, tau_A (N, n) of the machine as described."""
@@ -196,6 +205,7 @@ def excite(
     Raises:
         InputError: Arguments out of range, or no reference within the limits.
     """
+    progress = telling(progress)
     if criterion not in CRITERIA:
         raise InputError(f"criterion '{criterion}' is unknown, {known(CRITERIA, criterion)}")
     for what, value in (("starts", starts), ("harmonics", harmonics), ("periods", periods)):

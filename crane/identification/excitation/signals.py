@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.errors import InputError, known
-from crane.common.samples import Array, Brief, as_count, as_number, as_seed
+from crane.common.samples import Array, as_count, as_number, as_seed
+from crane.common.shown import Brief, counted
 from crane.common.tables import aligned
 from crane.common.units import quantity
+from crane.common.waiting import telling
 from crane.control.valves import circuit_of
 from crane.description.sensors import SIGNAL
 from crane.identification.calibration.unknowns import Unknown
@@ -65,6 +67,13 @@ class SignalExcitation(Brief):
     rate: Array
     criterion: str
     seed: int
+
+    def _line(self) -> str:
+        """For what, how long, and what it tells."""
+        return (
+            f"SignalExcitation of '{self.machine.name}', {self.run.time[-1]:.6g} s: "
+            f"{len(self.fit) - len(self.vague)} of {counted(len(self.fit), 'number')} told"
+        )
 
     @property
     def signals(self) -> dict[str, Array]:
@@ -167,6 +176,7 @@ def excite_valves(
     Source: Goodwin, Payne 1977, Dynamic System Identification, chapter 6; Meyer, Nachtsheim
     1995, Technometrics 37(1).
     """
+    progress = telling(progress)
     circuit_of(machine)
     if criterion not in CRITERIA:
         raise InputError(f"criterion '{criterion}' is unknown, {known(CRITERIA, criterion)}")

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.errors import InputError, RecordingError, known
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.description import Friction
 from crane.dynamics import Dynamics
 from crane.identification.estimation import estimators

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.errors import InputError
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.identification.estimation import estimators
 from crane.identification.hydraulics.cylinder_signals import (
     CylinderSignals,

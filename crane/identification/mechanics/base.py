@@ -8,7 +8,8 @@ import numpy as np
 
 from crane.closure.structure import Indices
 from crane.common.errors import ClosureError, InputError
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.term import Samples
 from crane.machine import Machine

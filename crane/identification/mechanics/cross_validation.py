@@ -11,7 +11,9 @@ import numpy as np
 from crane.common.errors import CraneError, CraneWarning, InputError
 from crane.common.samples import Array, as_number
 from crane.common.tables import aligned
+from crane.common.waiting import telling
 from crane.identification.mechanics.equations import Equations, Progress
+from crane.identification.mechanics.feasible import convex
 from crane.identification.mechanics.identify import Recorded, identify, motions_of
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.priors import by_name, stated
@@ -68,6 +70,7 @@ def cross_validate(
         InputError: Nothing is tried or what cannot be, or a recording is too short for its parts.
         RecordingError: A recording cannot serve.
     """
+    progress = telling(progress)
     if not tried or not all(tried.values()):
         raise InputError("nothing is tried, give values such as bandwidth=2,5,10")
     motions = motions_of(machine, recording, options.get("trust", False), None)
@@ -127,8 +130,10 @@ def _check(
     """See that settings are such as an identification takes, whatever is recorded.
 
     Raises:
-        InputError: One is not.
+        InputError: One is not, or what they need is not installed.
     """
+    if options.get("feasible"):
+        convex()
     model = Model(machine, options.get("terms"))
     for settings in grid:
         for name, value in settings.items():

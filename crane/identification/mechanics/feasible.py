@@ -11,10 +11,12 @@ is positive definite (Wensing, Kim, Slotine 2018, IEEE Robotics and Automation L
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from crane.common.errors import CraneError, InputError
+from crane.common.extras import library
 from crane.common.samples import Array
 from crane.description.inertia import inertia_problem
 
@@ -72,6 +74,15 @@ def body_parameters(P: Array) -> Array:
     return np.stack(columns, axis=-1)
 
 
+def convex() -> Any:
+    """The library that solves it.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    return library("cvxpy", "a feasible estimate")
+
+
 def feasible(
     W: Array,
     y: Array,
@@ -107,13 +118,12 @@ def feasible(
         nonnegative: Columns among the others that are not negative, such as friction.
 
     Raises:
-        InputError: Shapes, or a body of the prior that cannot exist.
+        InputError: Shapes, a body of the prior that cannot exist, or no CVXPY.
         CraneError: The solver gave up.
 
     Source: Lee, Wensing, Park 2020, IEEE Transactions on Robotics 36(1).
     """
-    import cvxpy as cp
-
+    cp = convex()
     size, split = np.shape(W)[1], 10 * len(bodies)
     spread = np.full(size - split, np.inf) if spread is None else np.asarray(spread)
     prior_weight = np.broadcast_to(np.asarray(prior_weight, np.float64), len(bodies))

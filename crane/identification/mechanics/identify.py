@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, RecordingError, known
 from crane.common.samples import Array, as_number, as_sample
+from crane.common.waiting import telling
 from crane.identification.estimation.estimators import (
     Estimate,
     Prior,
@@ -29,6 +30,7 @@ from crane.identification.mechanics.checks import doubt
 from crane.identification.mechanics.delays import delays
 from crane.identification.mechanics.determined import advice, magnitudes, sizes_of
 from crane.identification.mechanics.equations import Equations, Progress, long_enough
+from crane.identification.mechanics.feasible import convex
 from crane.identification.mechanics.inertias import body_names
 from crane.identification.mechanics.laws import Frictional
 from crane.identification.mechanics.model import Model
@@ -109,14 +111,17 @@ def identify(
         Parameters, their confidence, and how well they predict both recordings.
 
     Raises:
-        InputError: Arguments that do not fit.
+        InputError: Arguments that do not fit, or no CVXPY for feasible bodies.
         RecordingError: A recording that cannot serve, and why; one that determines nothing.
     """
+    progress = telling(progress)
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
     model = Model(machine, terms)
     if feasible and not model.bodies:
         raise InputError("the model has no bodies, so nothing has to be feasible")
+    if feasible:
+        convex()  # before all the work
     finished, progress = progress, in_parts(progress)
     tell_shared(_several(recording), _several(validation), trust)
     motions = motions_of(machine, recording, trust, progress)
@@ -230,6 +235,12 @@ def equations_of(
     rows = Equations(model, base_parameters(model), motions, bandwidth, limits, progress)
     if not rows.moving.any():
         raise RecordingError("no joint moves faster than what counts as standstill, move it more")
+    for joint, count in zip(model.machine.active, rows.moving.sum(axis=0), strict=True):
+        if count == 1:  # which tells nothing of its noise
+            raise RecordingError(
+                f"'{joint}' is in one sample only faster than what counts as standstill, move it "
+                "more, or raise its slow"
+            )
     # of columns, the triangular factors tell what all rows tell
     return rows, rows.base.narrowed(np.vstack(list(rows.factors[:, :, :-1])))
 

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from crane.common.errors import InputError
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.common.tables import aligned
 from crane.dynamics import Dynamics
 from crane.identification.mechanics.feasible import body_parameters, pseudo_inertia

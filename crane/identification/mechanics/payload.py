@@ -9,6 +9,7 @@ import numpy as np
 
 from crane.common.errors import InputError, RecordingError, known
 from crane.common.samples import Array
+from crane.common.waiting import telling
 from crane.dynamics import Dynamics
 from crane.identification.estimation.estimators import Estimate, Prior
 from crane.identification.estimation.regressor import triangular
@@ -82,6 +83,7 @@ def identify_payload(
 
     Source: Efron, Stein 1981, Annals of Statistics 9(3), the jackknife.
     """
+    progress = telling(progress)
     if method not in METHODS:
         raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
     if frame is None and machine.tip is None:

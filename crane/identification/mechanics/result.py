@@ -8,7 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.common.tables import aligned
 from crane.identification.estimation.estimators import Estimate
 from crane.identification.mechanics.base import Base
@@ -70,8 +71,8 @@ class ForceComparison(Brief):
         return float(left / size) if size else math.nan
 
 
-@dataclass(frozen=True, eq=False)
-class Identification:
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification(Brief):
     """Parameters of a machine from a recording.
 
     Attributes:
@@ -111,7 +112,7 @@ class Identification:
     slow: Array
     validation: ForceComparison | None = None
 
-    def __repr__(self) -> str:
+    def _line(self) -> str:
         """What was identified, how, and how well it predicts."""
         kind = "feasible, " if self.feasible else ""
         fits = {"error": self.training, "validation": self.validation}

@@ -7,7 +7,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from crane.common.errors import InputError, known
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.dynamics.lengths import Lengths
 from crane.machine import Machine
 

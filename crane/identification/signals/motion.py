@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError, RecordingError
-from crane.common.samples import Array, Brief, as_number
+from crane.common.samples import Array, as_number
+from crane.common.shown import Brief
 from crane.identification.signals.smoother import smooth
 
 _FEWEST = 50  # samples

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from crane.common.errors import ClosureError
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.machine import Machine
 
 Node = tuple[int, int]

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.machine import Machine
 from crane.motion.workspaces.patch import Patch
 from crane.motion.workspaces.raster import Raster
@@ -67,8 +68,8 @@ class StrokeMap(Brief):
     curves: tuple[Curve, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class Workspace:
+@dataclass(frozen=True, eq=False, repr=False)
+class Workspace(Brief):
     """Closed postures all over the strokes of a machine.
 
     Attributes:
@@ -114,7 +115,7 @@ class Workspace:
     raster: Raster
     complete: bool
 
-    def __repr__(self) -> str:
+    def _line(self) -> str:
         """What moves, with what, and how much of it closes."""
         return (
             f"Workspace of '{self.frame}' of '{self.machine.name}': {len(self.tips)} postures "

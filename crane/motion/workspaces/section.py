@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from crane.common.samples import Array, Brief
+from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.machine import Machine
 
 _FLAT = 1e-7  # share of the extent that counts as none

@@ -5,6 +5,8 @@ interpolant of order 7 (Hairer, Norsett and Wanner, Solving Ordinary Differentia
 II.5 and II.6; the coefficients are scipy's).
 """
 
+from typing import Any
+
 from crane.closure.traced import largest_share
 from crane.codegen import Number, Program, Tape, Value
 from crane.codegen.scalar import add, apply, maximum, minimum, scale, subtract
@@ -24,6 +26,13 @@ TOLERANCE = 1e-12  # error of a step, per size of the state
 _FASTER, _SAFETY = 5.0, 0.9  # change of the step's length from one to the next
 
 
+def _method() -> Any:
+    """What has the coefficients, which only a program that is not kept has to be made of."""
+    from scipy.integrate import DOP853  # slow to import
+
+    return DOP853
+
+
 class ExplicitStepper(ControlledStepper):
     """See above; `tolerance` is that of `errors_of`.
 
@@ -40,15 +49,12 @@ class ExplicitStepper(ControlledStepper):
     def __init__(
         self, chart: Chart, control: TracedController, states: int, tolerance: float = TOLERANCE
     ):
-        from scipy.integrate import DOP853
-
-        self._method = DOP853
         errors = errors_of(chart, states, tolerance)
         super().__init__(chart, control, states, ("explicit",), False, errors)
 
     def _add_method(self, program: Program) -> None:
         """stage1(s, k, h) to stage11, more0 to more2; finish(numbers, s, k, h, tol); dense."""
-        size, method = self._state.size, self._method
+        size, method = self._state.size, _method()
         stages = {f"stage{i}": method.A[i] for i in range(1, STAGES)}
         stages |= {f"more{i}": row for i, row in enumerate(method.A_EXTRA)}
         for name, weights in stages.items():
@@ -91,7 +97,7 @@ class ExplicitStepper(ControlledStepper):
 
     def _made(self, program: Program, step: Attempt) -> tuple[Way, Way]:
         """See `ControlledStepper`."""
-        r, size, method = step.r, self._state.size, self._method
+        r, size, method = step.r, self._state.size, _method()
         # a rate has more behind it, which the next one replaces
         more = program.outputs("rate").size - size
         k, stage = r.array("k", (STAGES + 1 + MORE) * size + more), r.array("stage", size)

@@ -179,28 +179,40 @@ class Sticking:
 
 def _bounded(reach: Array, net: Array) -> Array:
     """Shares (k,) of the limits, least |net - reach shares|; of many the smallest."""
-    from scipy.optimize import lsq_linear
+    shares, _, rank, _ = np.linalg.lstsq(reach, net, rcond=None)
+    full = np.abs(shares) > 1.0
+    if not full.any():
+        return shares.astype(np.float64)
+    # those beyond their limits on them, and the others anew: the least if these are within theirs
+    # and no slope leads back from a limit (Karush, Kuhn and Tucker's conditions)
+    found = np.where(full, np.sign(shares), 0.0)
+    found[~full] = np.linalg.lstsq(reach[:, ~full], net - reach @ found, rcond=None)[0]
+    slopes = reach.T @ (net - reach @ found)
+    least = np.abs(found).max() <= 1.0 and (slopes * found)[full].min() >= 0.0
+    if least and rank == len(shares):
+        return found
+    from scipy.optimize import lsq_linear  # slow to import
 
-    shares = np.linalg.lstsq(reach, net, rcond=None)[0].astype(np.float64)
-    if np.abs(shares).max() <= 1.0:
-        return shares
-    found = lsq_linear(reach, net, (-1.0, 1.0), method="bvls", tol=1e-15)
-    return np.asarray(found.x)
+    return np.asarray(lsq_linear(reach, net, (-1.0, 1.0), method="bvls", tol=1e-15).x)
 
 
 def _independent(columns: Array) -> tuple[Indices, int]:
-    """Indices of columns that span them all, the largest first, and how many there are.
+    """Indices of columns that span them all, and how many there are.
 
     Each is looked at in its own size: a limit may be next to nothing, of a brake that is released.
     """
-    from scipy.linalg import qr
+    count = columns.shape[1]
+    own = np.linalg.norm(columns, axis=0)
+    # a column of length 1 is no nearer to what others span than their least singular value
+    if count <= len(columns) and own.all():
+        least = np.linalg.svd(columns / own, compute_uv=False).min(initial=1.0)
+        if least > 2.0 * _INDEPENDENT:
+            return np.arange(count), count
+    from scipy.linalg import qr  # slow to import
 
-    if not columns.size:
-        return np.zeros(0, dtype=int), 0
     upper, order = qr(columns, mode="r", pivoting=True)
     sizes = np.abs(np.diag(upper))
-    own = np.linalg.norm(columns, axis=0)[order[: len(sizes)]]
-    rank = int((sizes > _INDEPENDENT * own).sum())
+    rank = int((sizes > _INDEPENDENT * own[order[: len(sizes)]]).sum())
     return np.asarray(order[:rank], dtype=np.intp), rank
 
 

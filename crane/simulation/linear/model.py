@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import InputError, OutputError
+from crane.common.errors import OutputError
+from crane.common.extras import library
 from crane.common.output import replacing
 from crane.common.samples import Array, as_sample
+from crane.common.shown import Brief, counted
 from crane.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -43,8 +45,8 @@ class Mode(NamedTuple):
         return self.pole.imag > _PAIRED * abs(self.pole)
 
 
-@dataclass(frozen=True, eq=False)
-class LinearModel:
+@dataclass(frozen=True, eq=False, repr=False)
+class LinearModel(Brief):
     """x' = A x + B u, y = C x + D u, deviations from an operating point.
 
     Attributes:
@@ -80,6 +82,15 @@ class LinearModel:
     machine: Machine
     posture: Array
     ways: Array
+
+    def _line(self) -> str:
+        """Its sizes, and where it rings."""
+        rings = [mode.frequency for mode in self.modes if mode.rings]
+        words = f", rings at {rings[0]:.3g} to {rings[-1]:.3g} Hz" if rings else ""
+        return (
+            f"LinearModel of '{self.machine.name}': {counted(len(self.x), 'state')}, "
+            f"{counted(len(self.u), 'input')}, {counted(len(self.y), 'output')}{words}"
+        )
 
     @cached_property
     def modes(self) -> tuple[Mode, ...]:
@@ -220,15 +231,10 @@ class LinearModel:
         Raises:
             InputError: python-control is not installed.
         """
-        try:
-            from control import StateSpace  # type: ignore[import-untyped, unused-ignore]
-        except ImportError:
-            raise InputError(
-                "python-control is not installed, install it: pip install control"
-            ) from None
+        control = library("control", "to_control")
         names = {"states": self.states, "inputs": self.inputs, "outputs": self.outputs}
         lists = {key: list(value) for key, value in names.items()}
-        return StateSpace(self.A, self.B, self.C, self.D, **lists)
+        return control.StateSpace(self.A, self.B, self.C, self.D, **lists)
 
     def save(self, path: str | Path) -> Path:
         """Write matrices, names and operating point as .mat (MATLAB, Octave) or .npz.

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, known
 from crane.common.samples import Array, as_samples
+from crane.common.waiting import telling
 from crane.description.changes import unknown_parameter
 from crane.dynamics import Dynamics
 from crane.formats import load
@@ -131,6 +132,7 @@ def linear_models(
     Raises:
         InputError: See `linearize`; an unknown name.
     """
+    progress = telling(progress)
     if not isinstance(machine, Machine):
         machine = load(machine)
     values = {name: np.atleast_1d(np.asarray(x, dtype=np.float64)) for name, x in vary.items()}

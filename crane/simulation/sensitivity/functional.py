@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from crane.codegen import Parts
 from crane.common.errors import CraneWarning, InputError, known
 from crane.common.samples import Array
+from crane.common.shown import Brief
+from crane.common.waiting import telling
 from crane.control import Command, Controller
 from crane.description.sensors import VELOCITY
 from crane.machine import Machine
@@ -26,8 +28,8 @@ Functional = Callable[[Array, Array], tuple[ArrayLike, ArrayLike]]
 """Times (N + 1,), outputs (N + 1, k) -> J, dJ/dy (N + 1, k); of several, with an axis first."""
 
 
-@dataclass(frozen=True, eq=False)
-class Gradient:
+@dataclass(frozen=True, eq=False, repr=False)
+class Gradient(Brief):
     """A motion, a number J made of it, and the derivatives of J by numbers of the machine.
 
     Attributes:
@@ -48,7 +50,7 @@ class Gradient:
     total: Array
     slopes: Array
 
-    def __repr__(self) -> str:
+    def _line(self) -> str:
         """Of what, by how much."""
         return f"Gradient of {', '.join(self.outputs)} by {len(self.by)} numbers"
 
@@ -123,6 +125,7 @@ def gradient(
         InputError: As `sensitivities`, or weights of another shape.
         SimulationError: As `sensitivities`.
     """
+    progress = telling(progress)
     asked = Asked.of(machine, controller, initial, duration, step, outputs, method, tolerance)
     directions = asked.directions
     by = None if by is None else list(dict.fromkeys(by))

@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, known
 from crane.common.samples import Array
+from crane.common.shown import Brief
 from crane.common.units import reading
+from crane.common.waiting import telling
 from crane.control import Command, Controller
 from crane.description.sensors import (
     FORCE,
@@ -32,8 +34,8 @@ from crane.simulation.sensitivity.setup import Setup
 NOTHING = 1e-9  # of an output, in the unit that it is read in
 
 
-@dataclass(frozen=True, eq=False)
-class Sensitivities:
+@dataclass(frozen=True, eq=False, repr=False)
+class Sensitivities(Brief):
     """A motion, and its derivatives by numbers.
 
     Attributes:
@@ -50,7 +52,7 @@ class Sensitivities:
     values: Array
     slopes: Array
 
-    def __repr__(self) -> str:
+    def _line(self) -> str:
         """Of what, by what."""
         return f"Sensitivities of {', '.join(self.outputs)} by {', '.join(self.by)}"
 
@@ -160,6 +162,7 @@ def sensitivities(
         InputError: Unknown names, a machine that floats, or one without formulas.
         SimulationError: The motion comes to a dead centre; else as `simulate`.
     """
+    progress = telling(progress)
     if not by:
         raise InputError("no number is named, give `by` such as ['payload.mass']")
     asked = Asked.of(machine, controller, initial, duration, step, outputs, method, tolerance)

@@ -12,7 +12,9 @@ from scipy.optimize import minimize
 from scipy.stats import qmc
 
 from crane.common.errors import CraneError, CraneWarning, InputError, known
-from crane.common.samples import Array, Brief, as_count, as_seed
+from crane.common.samples import Array, as_count, as_seed
+from crane.common.shown import Brief
+from crane.common.waiting import telling
 from crane.formats import load
 from crane.formats.loading import Variants
 from crane.machine import Machine
@@ -95,8 +97,8 @@ class Solution(Brief):
     says: str
 
 
-@dataclass(frozen=True, eq=False)
-class Design:
+@dataclass(frozen=True, eq=False, repr=False)
+class Design(Brief):
     """The best numbers that were found.
 
     Attributes:
@@ -122,7 +124,7 @@ class Design:
     solutions: tuple[Solution, ...]
     terms: Terms
 
-    def __repr__(self) -> str:
+    def _line(self) -> str:
         """What was varied for what, and the best of it."""
         best = self.solutions[0]
         values = ", ".join(f"{x:.6g}" for x in best.goals)
@@ -247,6 +249,7 @@ def design(
     Raises:
         InputError: Unknown names, no goal, ranges that are none, or no solution.
     """
+    progress = telling(progress)
     base, name = described(machine)
     processes = processes_of(processes)
     starts = as_count(starts, "the number of starts", 1, 10_000)

@@ -10,7 +10,7 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from crane.common.errors import CraneWarning, InputError, OutputError
-from crane.common.extras import how
+from crane.common.extras import library
 from crane.view.live.door import Door, hear_values_alone
 from crane.view.live.page import Page
 from crane.view.live.playback import Playback
@@ -70,10 +70,7 @@ def _work(page: Page, requests: Requests) -> None:
 
 def start(door: Door, port: int | None) -> Any:
     """A viser server behind a door, that says nothing and offers no address elsewhere."""
-    try:
-        import viser
-    except ImportError:
-        raise InputError(f"a live view needs viser, {how('live')}") from None
+    viser = library("viser", "a live view")
     port = _free_port(door.host, port)
     with redirect_stdout(io.StringIO()), door.kept():
         server: Any = viser.ViserServer(host=door.host, port=port, verbose=False)

@@ -74,14 +74,31 @@ def report(
     """
     if Path(path).suffix.lower() not in SUFFIXES:
         raise OutputError(f"{path}: a page is for a browser, end the name in .html")
-    scene = build_scene(machine, recording)
-    about = _about(machine, scene, recording)
-    if recording is not None:
-        about |= _runs(machine, scene, recording, other)
-    text = _html(about, scene)
+    text = page(machine, recording, other)
     with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
     return Path(path)
+
+
+def page(
+    machine: Machine,
+    recording: "Recording | None",
+    other: "Recording | None" = None,
+    share: float = 1.0,
+) -> str:
+    """The page of `report`, as HTML.
+
+    Args:
+        machine: See there.
+        recording: See there.
+        other: See there.
+        share: Of the frames and spans of time that a page has at most.
+    """
+    scene = build_scene(machine, recording, share)
+    about = _about(machine, scene, recording)
+    if recording is not None:
+        about |= _runs(machine, scene, recording, other, share)
+    return _html(about, scene)
 
 
 def open_in_browser(path: str | Path) -> bool:
@@ -112,11 +129,15 @@ def _about(machine: Machine, scene: Scene, recording: "Recording | None") -> dic
 
 
 def _runs(
-    machine: Machine, scene: Scene, recording: "Recording", other: "Recording | None"
+    machine: Machine,
+    scene: Scene,
+    recording: "Recording",
+    other: "Recording | None",
+    share: float,
 ) -> dict[str, Any]:
     """What was recorded, once or twice."""
-    share = 1.0 if other is None else 0.5
-    grid = Grid.of(recording, scene.rows, share)
+    spans = share * (1.0 if other is None else 0.5)
+    grid = Grid.of(recording, scene.rows, spans)
     runs: list[dict[str, Any]] = [
         {"motion": motion(scene.time, scene.q), "axis": grid.axis(), "label": recording.task}
     ]
@@ -126,9 +147,9 @@ def _runs(
             check_joints(machine, other)
         except RecordingError as error:
             raise RecordingError(f"the second recording: {error}") from None
-        rows = frame_rows(other.time)
+        rows = frame_rows(other.time, share)
         apart = other.time[0] > recording.time[-1] or other.time[-1] < recording.time[0]
-        over = Grid.of(other, rows, share)
+        over = Grid.of(other, rows, spans)
         runs.append(
             {
                 "motion": motion(other.time[rows], postures(machine, other, rows)),

@@ -11,9 +11,10 @@ from crane.identification.calibration.dependence import Left, left_over
 from crane.identification.calibration.result import Calibration, Channel, Fitted
 from crane.recordings.summary import title
 from crane.view.page.document import facts, table, write_document
-from crane.view.plots.identification import image_tag, matrix_figure
+from crane.view.plots.identification import matrix_figure
 from crane.view.plots.recording import STYLE
 from crane.view.plots.residuals import channel_figure, left_figure
+from crane.view.plots.tags import image_tag
 
 _FEW = 3  # numbers, whose correlations need no picture
 

@@ -12,8 +12,9 @@ from crane.identification.mechanics.result import Identification
 from crane.recordings.recording import FORCE_UNITS
 from crane.recordings.summary import title
 from crane.view.page.document import facts, table, write_document
-from crane.view.plots.identification import image_tag, matrix_figure, spectrum_figure, time_figure
+from crane.view.plots.identification import matrix_figure, spectrum_figure, time_figure
 from crane.view.plots.recording import RECORDED, STYLE
+from crane.view.plots.tags import image_tag
 
 _LONG_WORDS = 70  # letters of a group that are shown at once
 _MOST_PAIRS = 10

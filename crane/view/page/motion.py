@@ -91,10 +91,15 @@ def payload_place(machine: Machine) -> dict[str, Any] | None:
     return {"joint": joint - 1, "placement": matrix(pin.SE3(np.eye(3), moment / total))}
 
 
-def frame_rows(time: Array) -> np.ndarray:
-    """Rows of the samples that are frames: 30 per second, of a long recording fewer."""
+def frame_rows(time: Array, share: float = 1.0) -> np.ndarray:
+    """Rows of the samples that are frames: 30 per second, of a long recording fewer.
+
+    Args:
+        time: (N,) increasing [s].
+        share: Of the frames that a page has at most.
+    """
     span = float(time[-1] - time[0])
-    return decimate(time, min(FPS, MOST_FRAMES / span) if span else FPS)
+    return decimate(time, min(FPS, share * MOST_FRAMES / span) if span else FPS)
 
 
 def decimate(time: Array, fps: float) -> np.ndarray:

@@ -50,13 +50,16 @@ class Scene:
     heading: float
 
 
-def build_scene(machine: Machine, recording: "Recording | None" = None) -> Scene:
+def build_scene(
+    machine: Machine, recording: "Recording | None" = None, share: float = 1.0
+) -> Scene:
     """The machine in its home posture, or moving as recorded.
 
     Args:
         machine: The machine.
         recording: Its motion. Where it lacks the channel of a passive joint, the loops are closed
             at its active coordinates.
+        share: See `frame_rows`.
 
     Raises:
         RecordingError: The recording is of a machine with other joints.
@@ -65,7 +68,7 @@ def build_scene(machine: Machine, recording: "Recording | None" = None) -> Scene
     """
     import meshcat
 
-    rows = np.zeros(1, dtype=int) if recording is None else frame_rows(recording.time)
+    rows = np.zeros(1, dtype=int) if recording is None else frame_rows(recording.time, share)
     time = np.zeros(1) if recording is None else recording.time[rows]
     q = machine.home[None] if recording is None else postures(machine, recording, rows)
     visuals = read_visuals(machine)

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from crane.common.errors import InputError
 from crane.common.units import reading
 from crane.simulation.replays import Comparison
 from crane.view.plots.recording import DASHED, RECORDED, write_figure
@@ -20,10 +21,17 @@ def plot_comparison(comparison: Comparison, path: str | Path) -> None:
     Raises:
         OutputError: The file cannot be written.
     """
-    write_figure(path, lambda: _figure(comparison))
+    write_figure(path, lambda: comparison_figure(comparison))
 
 
-def _figure(comparison: Comparison) -> Figure:
+def comparison_figure(comparison: Comparison) -> Figure:
+    """The figure of a comparison, a panel per channel.
+
+    Raises:
+        InputError: It has none.
+    """
+    if not comparison.channels:
+        raise InputError("the file has no channel that the simulation has too")
     count = len(comparison.channels)
     across = min(_ACROSS, count)
     rows = -(-count // across)

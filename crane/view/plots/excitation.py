@@ -8,33 +8,37 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from crane.common.output import replacing
 from crane.common.samples import Array
 from crane.common.units import reading
 from crane.identification.excitation.excite import Excitation
 from crane.identification.excitation.signals import SignalExcitation
 from crane.recordings.recording import FORCE_UNITS
 from crane.recordings.summary import READING_UNITS
-from crane.view.plots.recording import DASHED, FAINT, RECORDED, STYLE
+from crane.view.plots.recording import DASHED, FAINT, RECORDED, STYLE, write_figure
 from crane.view.plots.text import plain
 
 _MOST = 2000  # instants that a line needs
 
 
 def plot_excitation(excitation: Excitation, path: str | Path) -> None:
-    """Write the figure of a reference as png: limits dashed, ways from and to rest shaded.
+    """Write the figure of a reference.
 
     Raises:
-        OutputError: The file cannot be written.
+        OutputError: The suffix is none of png, svg, pdf, or the file cannot be written.
     """
+    write_figure(path, lambda: excitation_figure(excitation))
+
+
+def excitation_figure(excitation: Excitation) -> Figure:
+    """The figure of a reference: limits dashed, ways from and to rest shaded."""
     count = len(excitation.machine.active)
     columns = tuple(x[:: -(-len(x) // _MOST)] for x in excitation.motion())
-    with mpl.rc_context(STYLE), replacing(path) as part:
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(2.4 * count + 0.6, 6.0), layout="constrained")
         grid = figure.subplots(3, count, sharex=True, squeeze=False)
         for i in range(count):
             _draw_joint(list(grid[:, i]), excitation, columns, i)
-        figure.savefig(part, format="png", dpi=200)
+    return figure
 
 
 def _draw_joint(
@@ -68,18 +72,23 @@ def _draw_joint(
 
 
 def plot_signals(excitation: SignalExcitation, path: str | Path) -> None:
-    """Write the figure of valve signals as png: signal, stroke with its ends dashed, pressures.
+    """Write the figure of valve signals.
 
     Raises:
-        OutputError: The file cannot be written.
+        OutputError: The suffix is none of png, svg, pdf, or the file cannot be written.
     """
+    write_figure(path, lambda: signals_figure(excitation))
+
+
+def signals_figure(excitation: SignalExcitation) -> Figure:
+    """The figure of valve signals: signal, stroke with its ends dashed, pressures."""
     count = len(excitation.signals)
-    with mpl.rc_context(STYLE), replacing(path) as part:
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(3.0 * count + 0.6, 6.0), layout="constrained")
         grid = figure.subplots(3, count, sharex=True, squeeze=False)
         for i, joint in enumerate(excitation.signals):
             _draw_valve(list(grid[:, i]), excitation, joint)
-        figure.savefig(part, format="png", dpi=200)
+    return figure
 
 
 def _draw_valve(column: Sequence[Axes], excitation: SignalExcitation, joint: str) -> None:

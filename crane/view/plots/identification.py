@@ -1,15 +1,13 @@
 """Figures of an identification: forces, residuals, spectra, correlations."""
 
-import base64
-import io
 from collections.abc import Sequence
-from html import escape
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from crane.common.samples import Array
-from crane.identification.mechanics.result import ForceComparison
+from crane.identification.mechanics.result import ForceComparison, Identification
+from crane.recordings.recording import FORCE_UNITS
 from crane.view.plots.recording import DASHED, INK
 from crane.view.plots.text import plain
 from crane.view.plots.thinning import envelope
@@ -89,9 +87,9 @@ def matrix_figure(R: Array, names: Sequence[str]) -> Figure:
     return figure
 
 
-def image_tag(figure: Figure, words: str) -> str:
-    """A figure as an HTML element that holds its picture."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
-    data = base64.b64encode(buffer.getvalue()).decode()
-    return f'<img alt="{escape(words)}" src="data:image/png;base64,{data}">'
+def force_figures(result: Identification) -> list[Figure]:
+    """Measured and modelled forces of the training, a figure per drive."""
+    return [
+        time_figure(result.training, i, FORCE_UNITS[result.machine.unit(joint)], joint)
+        for i, joint in enumerate(result.training.joints)
+    ]

@@ -1,0 +1,251 @@
+"""A closed machine as a transmission between its actuators and the joints of its tree."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from crane.common.errors import InputError, known
+from crane.common.samples import Array, as_number, as_sample
+from crane.common.shown import Brief
+from crane.description.external import PARTS
+from crane.dynamics.frames import FrameJacobians
+from crane.machine import Machine
+
+_FIELDS = ("position", "velocity", "effort")
+_SINGULAR = 1e-9  # least singular value of what joints move actuators by, per the largest
+
+
+@dataclass(frozen=True)
+class JointState:
+    """Joints of a tree, with the fields of `sensor_msgs/JointState`.
+
+    Attributes:
+        name: Names of all k joints.
+        position: (k,) [m], [rad].
+        velocity: (k,) [m/s], [rad/s]; empty where that of an actuator is not known.
+        effort: (k,) [N], [N m], of actuators at their own joints, of the others zero; empty
+            where that of an actuator is not known.
+    """
+
+    name: tuple[str, ...]
+    position: Array
+    velocity: Array
+    effort: Array
+
+
+class Transmission(Brief):
+    """Positions, velocities and forces between the actuators and the joints of the tree.
+
+    What ros2_control calls a transmission, with ratios that the loops determine. With q_A the
+    active joints, gamma = dq/dq_A in the posture, tau what acts at all joints of the tree, J that
+    of a link,
+
+        q = f(q_A),    v = gamma v_A,    f_A = gamma^T tau = gamma^T J^T w,
+
+    so that f_A^T v_A = tau^T v. `update` takes the state of actuators and closes the loops, on
+    the branch of home; forces are mapped in the posture that it left. The six freedoms of a
+    vehicle that floats are no joints here: it is where it is at home, and does not move.
+
+    Args:
+        machine: The machine.
+
+    Attributes:
+        machine: The machine.
+        actuators: Names of the n active joints.
+        joints: Names of the k joints of the tree.
+        state: The last state of all joints, None until each active joint has been heard of.
+    """
+
+    def __init__(self, machine: Machine):
+        self.machine = machine
+        self.state: JointState | None = None
+        flown = {x for i in machine.coordinates.floating for x in machine.joints[i : i + 6]}
+        self.actuators = tuple(joint for joint in machine.active if joint not in flown)
+        self.joints = tuple(joint for joint in machine.joints if joint not in flown)
+        self._at = {joint: i for i, joint in enumerate(self.actuators)}
+        self._columns = np.array([machine.column(joint) for joint in self.joints], dtype=np.intp)
+        self._own = np.array([machine.active.index(x) for x in self.actuators], dtype=np.intp)
+        self._heard = np.full((3, len(self.actuators)), np.nan)  # a row per field
+        self._gamma: Array | None = None
+        self._jacobians = FrameJacobians(machine)
+
+    def _line(self) -> str:
+        """From where to where, of what."""
+        actuators = ", ".join(self.actuators)
+        return f"Transmission of '{self.machine.name}': {actuators} to {len(self.joints)} joints"
+
+    @property
+    def unheard(self) -> tuple[str, ...]:
+        """Active joints whose position no message has had yet."""
+        return tuple(joint for joint, i in self._at.items() if np.isnan(self._heard[0, i]))
+
+    def update(
+        self,
+        name: Sequence[str],
+        position: Sequence[float] = (),
+        velocity: Sequence[float] = (),
+        effort: Sequence[float] = (),
+    ) -> JointState | None:
+        """Take a state of actuators, by the fields of a `sensor_msgs/JointState`.
+
+        Names come in any order, and may be some of the active joints: the others stay as they
+        were. Other joints are passed over, and so are values that are NaN, which stand for what
+        is not measured. A message says all that is known of the joints that it names: a velocity
+        or effort that it leaves out is not known any more, a position stays.
+
+        Args:
+            name: Names of k joints.
+            position: k positions [m], [rad], or none.
+            velocity: k velocities [m/s], [rad/s], or none.
+            effort: k forces [N], [N m], or none.
+
+        Returns:
+            The state of all joints, the loops closed to rounding; None where the message has no
+            active joint, or the position of one is not known yet.
+
+        Raises:
+            InputError: A field has another length than the names, or is infinite.
+            ClosureError: No posture closes the loops there, or none on the branch. The state
+                stays as it was before the message.
+        """
+        fields = zip((position, velocity, effort), _FIELDS, strict=True)
+        given = [_field(values, len(name), what) for values, what in fields]
+        places = [(self._at[joint], i) for i, joint in enumerate(name) if joint in self._at]
+        if not places:
+            return None
+        columns, found = np.array(places).T
+        heard, new = self._heard.copy(), np.array(given)[:, found]
+        heard[1:, columns] = new[1:]
+        measured = ~np.isnan(new[0])
+        heard[0, columns[measured]] = new[0, measured]
+        state = None if np.isnan(heard[0]).any() else self._closed(*heard)
+        self._heard = heard
+        return state
+
+    def _closed(self, q_a: Array, v_a: Array, f_a: Array) -> JointState:
+        closure = self.machine.closure
+        stroke = closure.home[closure.active]
+        stroke[self._own] = q_a
+        q = closure.solve(stroke)
+        gamma = closure.gamma(q)[np.ix_(self._columns, self._own)]
+        effort = np.zeros(len(q))
+        effort[closure.active[self._own]] = f_a
+        position, effort = q[self._columns], effort[self._columns]
+        self._gamma, self._posture = gamma, q
+        self.state = JointState(self.joints, position, _whole(gamma @ v_a), _whole(effort))
+        return self.state
+
+    def joint_to_actuator(self, effort: Mapping[str, float]) -> dict[str, float]:
+        """Forces of the actuators that do what forces at joints of the tree do: gamma^T tau.
+
+        Those that a controller of the tree asks for, or that its inverse dynamics says.
+
+        Args:
+            effort: By joint [N], [N m], zero where a joint is not named.
+
+        Returns:
+            By active joint [N], [N m].
+
+        Raises:
+            InputError: There is no such joint, or no state yet.
+        """
+        gamma, tau = self._ratios(), np.zeros(len(self.joints))
+        for joint, value in effort.items():
+            tau[self._row(joint)] = as_number(value, f"effort of {joint}", "")
+        return self._named(gamma.T @ tau)
+
+    def actuator_to_joint(
+        self, effort: Mapping[str, float], joints: Sequence[str]
+    ) -> dict[str, float]:
+        """Forces at chosen joints that do what forces of the actuators do.
+
+        With G the rows of gamma that belong to the joints, G^T tau = f_A: moments at the pins of
+        the booms, say, in place of the forces of their cylinders.
+
+        Args:
+            effort: By active joint [N], [N m], zero where one is not named.
+            joints: As many as there are active ones.
+
+        Returns:
+            By joint [N], [N m].
+
+        Raises:
+            InputError: Names are unknown, there is no state yet, or the joints do not determine
+                the machine's motion in its posture.
+        """
+        gamma, f_a = self._ratios(), np.zeros(len(self._at))
+        for joint, value in effort.items():
+            if joint not in self._at:
+                raise InputError(f"'{joint}' is not active, {known(self._at, joint)}")
+            f_a[self._at[joint]] = as_number(value, f"effort of {joint}", "")
+        found = [self._row(joint) for joint in joints]
+        units, active = self.machine.closure.units, self.machine.closure.active[self._own]
+        own, active = units[self._columns[found]], units[active]
+        rows = gamma[found] / own[:, None] * active
+        sizes = np.linalg.svd(rows, compute_uv=False)
+        if len(found) != len(f_a) or not sizes[-1] > _SINGULAR * sizes[0]:
+            raise InputError(
+                f"{', '.join(joints) or 'no joint'} do not determine how the machine moves here, "
+                f"give {len(f_a)} independent joints"
+            )
+        tau = np.linalg.solve(rows.T, f_a * active) / own
+        return dict(zip(joints, tau.tolist(), strict=True))
+
+    def wrench_to_actuator(self, wrench: ArrayLike, link: str | None = None) -> dict[str, float]:
+        """Forces of the actuators that do what a wrench on a link does: gamma^T J^T w.
+
+        Actuators that hold against the wrench give the same with the other sign.
+
+        Args:
+            wrench: (6,) force [N] and moment about the origin of the link [N m], in the axes of
+                the root link.
+            link: The link, the tip if not given.
+
+        Returns:
+            By active joint [N], [N m].
+
+        Raises:
+            InputError: There is no such link, no tip, or no state yet.
+        """
+        gamma = self._ratios()
+        if (frame := link or self.machine.tip) is None:
+            raise InputError(f"machine '{self.machine.name}' has no tip, name a link")
+        self.machine.frame(frame)
+        given = as_sample(wrench, 6, f"the wrench on '{frame}'", PARTS)
+        self._jacobians.place(self._posture)
+        return self._named(gamma.T @ (self._jacobians.of(frame).T @ given)[self._columns])
+
+    def _ratios(self) -> Array:
+        if self._gamma is None:
+            unheard = ", ".join(self.unheard)
+            raise InputError(f"the posture is not known yet, update it with {unheard}")
+        return self._gamma
+
+    def _row(self, joint: str) -> int:
+        if joint not in self.joints:
+            raise InputError(f"joint '{joint}' is unknown, {known(self.joints, joint)}")
+        return self.joints.index(joint)
+
+    def _named(self, f_a: Array) -> dict[str, float]:
+        return dict(zip(self._at, f_a.tolist(), strict=True))
+
+
+def _field(values: Sequence[float], count: int, what: str) -> Array:
+    """(count,) of a field, NaN where it is empty."""
+    if not len(values):
+        return np.full(count, np.nan)
+    array = np.asarray(values, dtype=float)
+    if array.shape != (count,):
+        raise InputError(
+            f"{what} has {len(values)} values for {count} names, give one each or none"
+        )
+    if np.isinf(array).any():
+        raise InputError(f"{what} has an infinite value, give NaN for what is not measured")
+    return array
+
+
+def _whole(values: Array) -> Array:
+    """All values, or none where one is not known."""
+    return np.empty(0) if np.isnan(values).any() else values

@@ -1,0 +1,141 @@
+"""The gallery: what commands make, made while the site is built."""
+
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from sphinx.application import Sphinx
+
+GENERATED = Path(__file__).parent / "generated"
+RUN = "from crane.cli import main; main()"
+
+
+class Entry(NamedTuple):
+    """One picture or page, and how it is made."""
+
+    title: str
+    text: str
+    commands: str  # one per line
+    result: str  # the file that is shown
+
+    @property
+    def file(self) -> str:
+        """Its name within the site."""
+        name = self.title.lower().replace(" ", "_").replace(",", "")
+        return f"gallery/{name}{Path(self.result).suffix}"
+
+
+PAGES = (
+    Entry(
+        "A log crane of laboratory size",
+        "The published trajectory that picks up a log and places it into the bunk. Press play, "
+        "turn it with the mouse or a finger, and switch forces on.",
+        "simulate mini_forwarder --task loading --out loading\nview loading --no-open",
+        "loading/view.html",
+    ),
+    Entry(
+        "A log crane on its valves",
+        "It lifts, stretches and runs its extension out, through its valves: signals in volt, "
+        "pressures in bar, flows.",
+        "simulate patu655 --task reach --out reach\nview reach --no-open",
+        "reach/view.html",
+    ),
+    Entry(
+        "An excavator grades",
+        "It draws its teeth towards itself, level and 50 mm above the ground, through its valves.",
+        "simulate excavator --task grade --out grade\nview grade --no-open",
+        "grade/view.html",
+    ),
+    Entry(
+        "A grapple that does not sway",
+        "A quarter turn with a log in the grapple, whose reference was changed so that nothing "
+        "sways after it.",
+        "simulate patu655_grapple --task swing --sway flat --out swing\nview swing --no-open",
+        "swing/view.html",
+    ),
+    Entry(
+        "A robot with a parallel linkage",
+        "A machine alone, without a run: its loops are closed while the page's sliders move.",
+        "view kr300 --out kr300.html --no-open",
+        "kr300.html",
+    ),
+    Entry(
+        "What an excavator lifts",
+        "Loads all over the reach, and what ends them: drives, tipping, pins. Point at a place.",
+        "capacity excavator --out capacity",
+        "capacity/capacity.html",
+    ),
+)
+PICTURES = (
+    Entry(
+        "How far it works",
+        "Reach, depth and heights, each an exact optimum.",
+        "working-range excavator --out range",
+        "range/working_range.png",
+    ),
+    Entry(
+        "Its mechanism",
+        "Drawn from the description, for a paper.",
+        "sketch patu655 --com --out mechanism.svg",
+        "mechanism.svg",
+    ),
+    Entry(
+        "Its hydraulic circuit",
+        "With the graphic symbols of ISO 1219-1.",
+        "sketch patu655 --circuit --out circuit.svg",
+        "circuit.svg",
+    ),
+)
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Make everything before pages are read."""
+    app.connect("config-inited", lambda *_: write())
+    return {"parallel_read_safe": True}
+
+
+def write() -> None:
+    """Run all commands; the page shows what they made."""
+    pages = GENERATED / "pages"
+    shutil.rmtree(pages, ignore_errors=True)
+    (pages / "gallery").mkdir(parents=True)
+    for entry in (*PAGES, *PICTURES):
+        with tempfile.TemporaryDirectory() as folder:
+            for command in entry.commands.splitlines():
+                _run(command, folder)
+            shutil.copy(Path(folder, entry.result), pages / entry.file)
+    text = "# Gallery\n\nEach is one file that needs no network, made by the commands below it.\n"
+    shown = [_page(entry) for entry in PAGES] + [_picture(entry) for entry in PICTURES]
+    (GENERATED / "gallery.md").write_text("\n".join([text, *shown]))
+
+
+def _run(command: str, folder: str) -> None:
+    words = [sys.executable, "-c", RUN, *shlex.split(command)]
+    run = subprocess.run(words, cwd=folder, capture_output=True, text=True)
+    if run.returncode:
+        raise RuntimeError(f"crane {command}: {run.stderr}")
+
+
+def _page(entry: Entry) -> str:
+    frame = (
+        f'<iframe class="page" src="../{entry.file}" title="{entry.title}" loading="lazy">'
+        "</iframe>\n"
+        f'<p><a href="../{entry.file}">Alone in the window</a></p>'
+    )
+    return _shown(entry, frame)
+
+
+def _picture(entry: Entry) -> str:
+    return _shown(entry, f'<img src="../{entry.file}" alt="{entry.title}">')
+
+
+def _shown(entry: Entry, html: str) -> str:
+    commands = "\n".join(f"crane {line}" for line in entry.commands.splitlines())
+    return (
+        f"## {entry.title}\n\n{entry.text}\n\n```{{raw}} html\n{html}\n```\n\n"
+        f"```console\n{commands}\n```\n"
+    )

@@ -1,0 +1,151 @@
+"""Pages of the site that the package writes itself: its public names, commands and examples."""
+
+import inspect
+import re
+import shutil
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxRole
+
+import crane
+from crane.cli import program
+
+HERE = Path(__file__).parent
+GENERATED = HERE / "generated"
+EXAMPLES = HERE.parent / "examples"
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Write the pages before any is read."""
+    app.add_role("public", Public())
+    app.connect("config-inited", lambda *_: write())
+    app.connect("autodoc-process-docstring", _restructured, priority=400)  # before napoleon
+    return {"parallel_read_safe": True}
+
+
+class Public(SphinxRole):
+    """`name`: a link where the package has a public name like that, otherwise code."""
+
+    def run(self) -> tuple[list[nodes.Node], list[nodes.system_message]]:
+        """The node of one name in backticks."""
+        name = self.text.removeprefix("crane.")
+        shown = nodes.literal(self.rawtext, self.text)
+        first = name.split(".")[0]
+        home = "crane" if first in crane.__all__ else "crane.common.errors"
+        if not hasattr(import_module(home), first):
+            return [shown], []
+        link = pending_xref(
+            self.rawtext, shown, refdomain="py", reftype="obj", reftarget=f"{home}.{name}"
+        )
+        link["refdoc"] = self.env.docname
+        return [link], []
+
+
+def _restructured(
+    _app: Sphinx, _what: str, _name: str, _of: Any, _options: Any, lines: list[str]
+) -> None:
+    """Docstrings as reStructuredText has them: tables of Markdown, indented equations."""
+    written: list[str] = []
+    block, last = 0, ""  # indentation of a block of equations, the last line that is not empty
+    for before, line in zip(["", *lines], lines, strict=False):
+        indent = len(line) - len(line.lstrip())
+        if not line or (block and indent >= block):
+            written.append(line)
+        elif not before and last and indent > len(last) - len(last.lstrip()):
+            block = indent
+            written += [" " * (len(last) - len(last.lstrip())) + "::", "", line]
+        elif line.startswith("|"):
+            block = 0
+            written += _row(line, first=not before)
+        else:
+            block = 0
+            written.append(line.replace("|", "\\|"))
+        last = line or last
+    lines[:] = written
+
+
+def _row(line: str, first: bool) -> list[str]:
+    if set(line) <= set("|-: "):
+        return []
+    key, *others = line.strip("|").split(" | ")
+    head = [".. list-table::", "   :header-rows: 1", ""] if first else []
+    return [*head, f"   * - {key.strip()}", *(f"     - {cell.strip()}" for cell in others)]
+
+
+def write() -> None:
+    """Write all of them anew."""
+    shutil.rmtree(GENERATED / "api", ignore_errors=True)
+    (GENERATED / "api").mkdir(parents=True)
+    rooms: dict[str, list[str]] = {}
+    for module, names in crane._HOMES.items():
+        rooms.setdefault(module.split(".")[1], []).extend(names.split())
+    del rooms["common"]
+    for room, names in rooms.items():
+        _write(f"api/{room}.rst", _room(room, sorted(names)))
+    _write("api/errors.rst", _errors())
+    _write("api/index.rst", _index(list(rooms)))
+    _write("commands.md", _commands())
+    _write("examples.md", _examples())
+
+
+def _write(name: str, text: str) -> None:
+    (GENERATED / name).write_text(text)
+
+
+def _room(room: str, names: list[str]) -> str:
+    module = import_module(f"crane.{room}")
+    parts = [_title(room.capitalize()), str(module.__doc__)]
+    for name in names:
+        value = getattr(crane, name)
+        if inspect.isclass(value):
+            members = "   :members:\n   :inherited-members: Exception, BaseException, object\n"
+            parts.append(f".. autoclass:: crane.{name}\n{members}")
+        elif callable(value):
+            parts.append(f".. autofunction:: crane.{name}\n")
+        else:
+            parts.append(f".. py:data:: crane.{name}\n\n   By name: {', '.join(value)}.\n")
+    return "\n\n".join(parts)
+
+
+def _errors() -> str:
+    text = "What goes wrong on purpose: one line that says what, where, and what to do."
+    body = ".. automodule:: crane.common.errors\n   :members:\n   :show-inheritance:\n"
+    return "\n\n".join([_title("Errors"), text, body])
+
+
+def _index(rooms: list[str]) -> str:
+    text = (
+        "Every public name is in ``crane`` itself; here they stand by the rooms that have them.\n"
+    )
+    tree = "\n".join(f"   {room}" for room in [*rooms, "errors"])
+    return f"{_title('The package')}\n\n{text}\n.. toctree::\n   :maxdepth: 2\n\n{tree}\n"
+
+
+def _title(text: str) -> str:
+    return f"{text}\n{'=' * len(text)}"
+
+
+def _commands() -> str:
+    import typer
+    from typer.cli import get_docs_for_click
+
+    command = typer.main.get_command(program())
+    context = typer.Context(command, info_name="crane")
+    return str(get_docs_for_click(obj=command, ctx=context, name="crane", title="Commands"))
+
+
+def _examples() -> str:
+    text = (EXAMPLES / "README.md").read_text()
+    programs = re.findall(r"^\| (.+?) \| \[(\w+)\.py\]", text, re.MULTILINE)
+    text = re.sub(r"\]\((\w+)\.py\)", r"](#example-\1)", text)
+    whole = [
+        f"(example-{name})=\n### {question}\n\n"
+        f"```{{literalinclude}} ../../examples/{name}.py\n:language: python\n```\n"
+        for question, name in programs
+    ]
+    return "\n".join([text, "## The programs", "", *whole])
