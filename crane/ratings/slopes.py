@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from scipy.spatial.transform import Rotation
 
 from crane.common.errors import InputError
 from crane.common.samples import Array
@@ -85,8 +86,11 @@ def field_slopes(chart: "Field", names: Sequence[str]) -> Array:
                 per_p = per_p + bound.sign * of_drives[:, k] / _rate(x, parts)[:, None]
         each[j] = per_q * causes.shares[bound.cause], per_p * causes.shares[bound.cause]
     strokes = [*places.pair, *places.others]
-    ways = places.section.slopes(at.tip, at.ways)[:, :, strokes]
-    place_by = places.section.slopes(at.tip, by_p.tip)
+    section = places.section  # it stands at home: seen from there, what slews is turned back
+    back = Rotation.from_rotvec(-angles[:, None] * section.second).as_matrix()
+    tips = section.origin + (back @ (at.tip - section.origin)[:, :, None])[:, :, 0]
+    ways = section.slopes(tips, back @ at.ways)[:, :, strokes]
+    place_by = section.slopes(tips, back @ by_p.tip)
     span = places.high - places.low
     for i in range(len(here)):
         together = np.flatnonzero(ends[i] <= loads[i] * (1 + _EQUAL)).tolist()
