@@ -51,10 +51,10 @@ demo: $(READY)
 	$(BIN)/crane demo --out demo-output --force
 
 test: $(READY_DEV)
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 slow: $(READY_DEV)
-	$(BIN)/python -m pytest -n 2 -m slow
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 
 lint: $(READY_DEV)
 	$(BIN)/python -m ruff check .
