@@ -60,21 +60,19 @@ def compare(dynamics, quantity, friction, span, arguments, tolerance=1e-9, pace=
     machine, n = dynamics.machine, len(span)
 
     def value(*given):
-        q_a, v_a, x = (*given, *[np.zeros(n)] * (3 - len(given)))
+        q_a, v_a, x = (*given, *[np.zeros((9, n))] * (3 - len(given)))
         return dynamics.at(key, machine.closure.solve(q_a), v_a, x)
 
     for part, derivative in enumerate(found.values()):
         for k in range(n):
-
-            def moved(argument, part=part):
-                return value(*(argument if i == part else a for i, a in enumerate(arguments)))
-
             # forces are polynomials of velocities and accelerations; postures are not
             step = 2e-3 if part == 0 else pace
             unit = np.eye(n)[k] * (span[k] if part < 2 or quantity != "forward" else 1.0)
-            wanted = difference(moved, arguments[part], unit, step)
+            given = [np.tile(x, (9, 1)) for x in arguments]
+            given[part] += np.arange(-4, 5)[:, None] * step * unit
+            wanted = ORDER_8 @ value(*given) / step
             got = derivative[..., k].ravel() * unit[k]
-            scale = max(np.abs(derivative * span).max(), 1e-4 * np.abs(value(*arguments)).max())
+            scale = max(np.abs(derivative * span).max(), 1e-4 * np.abs(value(*given)[4]).max())
             error = np.abs(got - wanted).max() / (scale or 1.0)
             assert error < tolerance, (quantity, names[part], machine.active[k], error)
 
