@@ -98,6 +98,7 @@ def test_the_rest_of_the_recording_is_predicted_to_its_noise(fitted):
         assert sensor.rms(sensor.before, False) > 3 * noise
 
 
+@pytest.mark.slow
 def test_channels_count_by_what_is_left_of_them_in_the_end(tmp_path, monkeypatch):
     """Smoothed friction, with which the search begins, leaves twice as much where much sticks."""
     searches, friction = [], "friction.x.coulomb"
@@ -175,6 +176,7 @@ def test_intervals_hold_the_truth(tmp_path):
     assert (shares < 2.5).all()
 
 
+@pytest.mark.slow
 def test_a_common_factor_and_delays(tmp_path):
     machine = simple(tmp_path)
     path = recorded(machine, tmp_path / "run.csv", 3, truth={
@@ -439,6 +441,7 @@ def test_one_orifice_of_a_compensated_valve_is_written(fitted, tmp_path):
     assert f"--set valve.x.c1={valve.c1:.8g}" in done.stdout and valve.c1 != valve.c4
 
 
+@pytest.mark.slow
 def test_fitted_sensors_stand_in_the_machine(fitted, tmp_path):
     """Of a raw log, with its columns; what is fitted is what was put on, a pressure of 3 bar."""
     machine, path, _ = fitted
@@ -487,6 +490,7 @@ def test_windows_and_quantities_that_cannot_be(fitted, tmp_path):
     assert "'sensor.x.zero' cannot be fitted to quantities, which its note" in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_said_to_be_noisy_hardly_counts(fitted):
     """Without its pressures the recording hardly tells what the rig lifts."""
     machine, path, _ = fitted

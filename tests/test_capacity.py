@@ -121,6 +121,7 @@ def test_a_slope_is_the_worst_of_all_sides(excavator):
         assert load == pytest.approx(least, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "free"), [("excavator", "X_bucket"), ("patu655", "X_ext")])
 def test_of_many_postures_it_is_the_one_that_carries_most(name, free):
     """Its third stroke moved to both sides by 30 steps, the tip held: nothing carries more."""

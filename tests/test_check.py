@@ -760,6 +760,7 @@ ARMS = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not examples(), reason="example-robot-data is not installed")
 @pytest.mark.parametrize("name", ARMS)
 def test_arms_give_no_false_alarm(name):

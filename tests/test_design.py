@@ -82,6 +82,7 @@ def four_bar(tmp_path):
     return tmp_path / "four_bar.yaml"
 
 
+@pytest.mark.slow
 def test_the_classical_transmission_angle_problem(four_bar):
     """Freudenstein and Primrose: 45 degrees of swing, 200 of the crank, from ten starts.
 

@@ -131,6 +131,7 @@ def test_with_hydraulics_a_pull_is_in_the_chambers():
     assert abs(more[0]) > 1e3
 
 
+@pytest.mark.slow
 def test_the_energy_of_a_load_on_valves_is_kept():
     machine = crane.load("patu655")
     pull = crane.Wrench(machine.tip, (0.0, 0.0, -500.0))

@@ -22,12 +22,12 @@ def run(kind, first, count, program="fuzz.py"):
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_some_changed_files(kind):
-    run(kind, 0, 60)
+    run(kind, 0, 30)
 
 
 @pytest.mark.parametrize("kind", GRAPHS)
 def test_some_odd_graphs(kind):
-    run(kind, 0, 40, "graphs.py")
+    run(kind, 0, 20, "graphs.py")
 
 
 @pytest.mark.slow

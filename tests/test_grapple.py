@@ -348,6 +348,7 @@ def test_valves_follow_what_the_circuit_turned_round_says(loaded, quarter):
     assert errors[1][0] > 0.1
 
 
+@pytest.mark.slow
 def test_a_command_tells_what_sway_is_left():
     """At the shortest time that the flow allows: 90 % less, in 10 % more time at most."""
     done = typed("sway", NAME, "--task", "swing", "--payload", "250", "--damping", "0")

@@ -252,6 +252,7 @@ def test_spool_channel_goes_before_voltage(machine, quick):
     np.testing.assert_allclose(identify_orifices(machine, right, "boom").values, X, rtol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["weak", "chambers"])
 def test_noise_like_the_paper_s(machine, slow, method):
     """Four periods of a slow motion, averaged, with 12 bit pressures."""

@@ -45,6 +45,7 @@ def recording(mini):
     return Recording(time, mini.active, q, np.zeros_like(q), 10 * q, units)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["mini", "patu", "five_bar", "slider_crank"])
 def test_a_thousand_moves_keep_the_loops_closed(request, name):
     machine = request.getfixturevalue(name)

@@ -9,6 +9,7 @@ import pytest
 from judge import judge
 
 
+@pytest.mark.slow
 def test_some_options_at_the_edge():
     assert judge("fuzz_options.py", 0, 12) == 12
 

@@ -530,6 +530,7 @@ def test_linear_models_have_seals_that_slide(tmp_path):
     assert force == pytest.approx(25.0 + TRACE + SEAL * (a + b - 2 * TANK), rel=1e-7)
 
 
+@pytest.mark.slow
 def test_calibration_finds_seals(tmp_path, monkeypatch):
     """Which are smooth, too, while it is far off; they alone make this joint stick."""
     made, variant = {}, Problem.variant

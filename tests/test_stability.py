@@ -200,6 +200,7 @@ def test_what_is_fixed_is_what_stands_on_stiff_contacts(folder):
     assert shares.stands is False and stability.stands
 
 
+@pytest.mark.slow
 def test_the_command_tells_both_loads(folder, tmp_path):
     path = folder / "patu655.yaml"
     done = typed("stability", path, "--at", "X_ext=1.0", "--task", "swing")

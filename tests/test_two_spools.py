@@ -219,6 +219,7 @@ def test_numbers_are_named_changed_written_and_read(tmp_path):
     assert np.abs(model.B[:, 1]).max() > 0
 
 
+@pytest.mark.slow
 def test_a_calibration_tells_the_second_spool(tmp_path):
     """Numbers of the second spool come back from a recording of both."""
     truth = {"neutral": 0.05, "full": 1.0, "delay": 0.031}
