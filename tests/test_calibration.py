@@ -195,6 +195,7 @@ def test_a_common_factor_and_delays(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_what_the_recording_cannot_say_is_said(tmp_path):
     """Area and load of a cylinder that only stands: a combination, and what nothing tells."""
     machine = simple(tmp_path)
@@ -430,6 +431,7 @@ def test_a_search_that_ended_in_the_wrong_minimum_goes_on(tmp_path):
     assert found.lowest and found.values["valve.x.bandwidth"] > 200
 
 
+@pytest.mark.slow
 def test_one_orifice_of_a_compensated_valve_is_written(fitted, tmp_path):
     machine, path, _ = fitted
     done = typed(

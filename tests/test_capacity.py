@@ -87,6 +87,7 @@ def test_every_cause_is_reached(excavator):
     assert "slew: working pressure" in {str(slope.causes[k]) for k in slope.ends}
 
 
+@pytest.mark.slow
 def test_a_slope_is_the_worst_of_all_sides(excavator):
     """Gravity that leans to 180 sides, none worse and one as bad."""
     lean, joints = np.deg2rad(8.0), excavator.hydraulics.joints

@@ -142,6 +142,7 @@ def test_inverse_dynamics_at_a_dead_centre_is_one_line(tmp_path):
     assert "'s' comes to a dead centre" in text and "\n" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rod", [2.0, 1.3])
 def test_postures_follow_a_recorded_stroke_through_dead_centres(tmp_path, rod):
     """From the slider alone: where it turns the crank goes on, three times round."""

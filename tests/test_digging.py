@@ -130,6 +130,7 @@ def test_arm_and_bucket_are_named_or_found(excavator):
     assert "| bucket | X_bucket | bucket | 1.4700 | 140.06 |" in text
 
 
+@pytest.mark.slow
 def test_a_tool_that_pushes_upwards_lifts(excavator):
     """As many newtons as the capacity has kilograms times g, by the same causes."""
     chart = crane.capacity(excavator, step=1.0)

@@ -225,6 +225,7 @@ def test_several_at_once_are_each_by_itself(tmp_path):
     assert "J3" in found.to_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["mini_forwarder", "patu655"])
 def test_a_machine_beside_another_has_the_numbers_of_one_that_is_loaded(name):
     machine = crane.load(name)

@@ -370,6 +370,7 @@ def test_all_payloads_leave_a_tenth_of_the_sway():
             assert row.less > 0.9 and row.share < 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("payload", [0.0, 500.0])
 @pytest.mark.parametrize("joint", ["sway_radial", "sway_tangential"])
 def test_feedback_damps_what_is_left(payload, joint):

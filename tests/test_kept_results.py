@@ -122,6 +122,7 @@ def _said(value):
     return repr(place_of(("all", value)))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 def test_motions_are_what_they_would_be_without(place, fresh):
     wanted = [_moved(*one) for one in _tasks()]

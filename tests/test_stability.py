@@ -158,6 +158,7 @@ def test_supports_are_written(standing, tmp_path):
     assert again.supports == standing.supports
 
 
+@pytest.mark.slow
 def test_a_payload_tips_it_by_its_inertia_earlier(folder, standing):
     """At rest as hand moments say, and less while it slews."""
     found = tipping_load(standing, "swing")
