@@ -23,7 +23,7 @@ Prior = tuple[Array, Array]
 _TURN = 1.345  # robust standard deviations: 95 % efficiency on normal noise (Huber 1964)
 _MAD = 1.482602218505602  # standard deviation over median absolute deviation of normal noise
 _CONVERGED = 1e-6  # standard deviations
-_ROUNDING = 1e-10  # of the forces
+_ROUNDING = 1e-8  # of the forces, what base parameters leave out as nothing new
 _ROUNDS = 100
 _WAITING = 4096  # instants without rows that are passed at once
 
@@ -381,13 +381,17 @@ class _Rows:
         are, the residuals there are smaller than the noise, and noise may be more than a steady
         spectrum. So the standard deviations are those of the `Jackknife` where these are larger;
         the correlations between parameters stay. R and A are of the rows that are not clipped,
-        with which alone the estimate moves, Q of all.
+        with which alone the estimate moves, Q of all. Residuals smaller than what rounding and
+        the choice of base parameters make of the rows count as that.
         """
         every = s[self.groups]
         clipped = np.clip(e, -turn * every, turn * every)
         counted = np.abs(e) <= turn * every
         count, inflated = len(e), math.sqrt(len(e) / max(len(e) - len(theta), 1))
         noise = inflated * np.array([_rms(clipped[rows]) for rows in self.members])
+        for of_group in self.members:
+            if 0 < (left := _rms(clipped[of_group])) < self.smallest:
+                clipped[of_group] *= self.smallest / left
         clipped /= every
         del every
         noises = [Noise.of(clipped[rows], self.samples[rows]) for rows in self.members]

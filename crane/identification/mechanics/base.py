@@ -15,7 +15,6 @@ from crane.identification.mechanics.term import Samples
 from crane.machine import Machine
 
 _RANK = 1e-8  # of a column's norm, what of it must be new
-_ALIKE = 1e12  # condition number of columns of length one that depend on each other
 _NOTHING = 1e-10  # of the largest norm, below which a column is zero
 _SPAN = 1.0  # [rad], [machine's size] of joints without limits
 # Preferred as base parameters, first: what is told from one axis before what needs many.
@@ -58,14 +57,14 @@ class Base(Brief):
         return len(self.independent)
 
     def narrowed(self, rows: Array) -> "Base":
-        """What of the base parameters a motion tells, rows (m, r) of their columns."""
-        names, tolerance = [self.names[i] for i in self.independent], _RANK
-        units = self.units[self.independent]
-        told = group(names, rows, units)
-        # many columns, each of them new by a little, may together hold nothing new
-        while _dependent(rows[:, told.independent]) and tolerance < 1e-2:
-            tolerance *= 10
-            told = group(names, rows, units, tolerance=tolerance)
+        """What of the base parameters a motion tells, rows (m, r) of their columns.
+
+        Of the columns those are taken first of which much is new: taken in another order, many
+        of which a little is new may together hold nothing new.
+        """
+        names, units = [self.names[i] for i in self.independent], self.units[self.independent]
+        order = _newest_first(rows)
+        told = group(names, rows, units, order.index)
         if told.rank == self.rank:
             return self
         independent = self.independent[told.independent]
@@ -166,11 +165,10 @@ def group(
     rows: Array,
     units: Array,
     preference: Callable[[int], Any] = lambda column: column,
-    tolerance: float = _RANK,
 ) -> Base:
     """Base parameters of a regressor (m, p) and units (p,), columns of small preference first.
 
-    A column counts if what is new of it exceeds the tolerance of its norm.
+    A column counts if what is new of it exceeds 1e-8 of its norm.
     """
     norms = np.linalg.norm(rows, axis=0)
     zero = norms * units <= _NOTHING * (norms * units).max(initial=0.0)
@@ -182,7 +180,7 @@ def group(
         for _ in range(2):  # twice is enough (Kahan, Parlett)
             rest = rest - directions @ (directions.T @ rest)
         length = np.linalg.norm(rest)
-        if length > tolerance:
+        if length > _RANK:
             chosen.append(i)
             directions = np.column_stack([directions, rest / length])
     independent = np.array(sorted(chosen), dtype=np.intp)
@@ -195,10 +193,22 @@ def group(
     return Base(tuple(names), independent, grouping, gone, units)
 
 
-def _dependent(columns: Array) -> bool:
-    if columns.shape[1] < 2:
-        return False
-    return float(np.linalg.cond(columns / np.linalg.norm(columns, axis=0))) > _ALIKE
+def _newest_first(columns: Array) -> list[int]:
+    """Columns in the order of what is new of them, as of columns of length one.
+
+    As with pivoting (Businger, Golub, 1965), but the first of those of which at least half as
+    much is new as of any, so that rounding does not choose among those of which as much is.
+    """
+    norms = np.linalg.norm(columns, axis=0)
+    rest, order = columns / np.where(norms, norms, 1.0), list[int]()
+    for _ in norms:
+        new = np.linalg.norm(rest, axis=0)
+        new[order] = -1.0
+        order.append(int(np.argmax(new >= 0.5 * new.max())))
+        if length := new[order[-1]]:
+            direction = rest[:, order[-1]] / length
+            rest -= np.outer(direction, direction @ rest)
+    return order
 
 
 def _preference(model: Model, column: int) -> tuple[int, int, int]:
