@@ -1,18 +1,13 @@
 """Recordings without noise, of motions that tell little: what is found, how far to trust it."""
 
-import csv
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import crane
+from crane.common.threads import on_one_thread
 
-CRANE = Path(sys.executable).with_name("crane")
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 
 
@@ -49,20 +44,23 @@ def test_intervals_hold_the_truth_where_rounding_is_all_the_noise(recorded, meth
     assert found.estimate.scaled_condition < 1e10  # of columns that count as told
 
 
-@pytest.mark.slow
-def test_threads_of_the_linear_algebra_move_nothing_that_is_told(tmp_path):
-    machine, recording = lift()
-    recording.to_csv(tmp_path / "lift.csv")
-    command = [CRANE, "identify", "mini_forwarder", "lift.csv", "--out", "two"]
-    done = subprocess.run(
-        command, cwd=tmp_path, capture_output=True, text=True,
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "2"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    one = crane.identify(machine, crane.Recording.from_csv(tmp_path / "lift.csv"))
-    with (tmp_path / "two" / "parameters.csv").open() as file:
-        two = list(csv.DictReader(file))
-    assert [row["parameter"] for row in two] == list(one.names)
-    assert os.environ["OPENBLAS_NUM_THREADS"] == "1"  # here
-    off = (one.values - [float(row["value"]) for row in two]) / one.std
-    assert np.abs(off).max() < 0.05
+def test_threads_of_the_linear_algebra_change_no_digit(recorded):
+    machine, recording = recorded
+    found = []
+    for threads in (1, 2):
+        with threadpool_limits(threads, "blas"):
+            assert crane_sees() == 1 and {_["num_threads"] for _ in blas()} == {threads}
+            found.append(crane.identify(machine, recording))
+    assert found[0].names == found[1].names
+    np.testing.assert_array_equal(found[0].values, found[1].values)
+    np.testing.assert_array_equal(found[0].std, found[1].std)
+
+
+def blas():
+    return [library for library in threadpool_info() if library["user_api"] == "blas"]
+
+
+@on_one_thread
+def crane_sees():
+    """Largest number of threads that a decorated function has."""
+    return max(library["num_threads"] for library in blas())

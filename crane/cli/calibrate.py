@@ -1,6 +1,5 @@
 """The command that fits a machine to recordings of it: calibrate."""
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -65,8 +64,6 @@ def calibrate(
     force: Force = False,
 ) -> None:
     """Fit numbers of a machine to recordings, through the simulation of its valve signals."""
-    # its matrices are small: threads would only wait for each other
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from crane.cli.runs import check_folder, write_calibration
     from crane.identification.calibration.calibrate import calibrate as run
 

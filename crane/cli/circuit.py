@@ -1,6 +1,5 @@
 """The command that finds a cylinder's valve, oil and friction: circuit."""
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -69,8 +68,6 @@ def circuit(
     force: Force = False,
 ) -> None:
     """Find bulk modulus and orifices, the valve's curve, or the friction of one cylinder."""
-    # its matrices are small: threads would only wait for each other
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from crane.cli.runs import check_folder, read_run
     from crane.common.output import staging
     from crane.identification.hydraulics.cylinder_signals import needed

@@ -1,6 +1,5 @@
 """The command that finds what tells most about a machine: excite."""
 
-import os
 from typing import Annotated
 
 import typer
@@ -70,8 +69,6 @@ def excite(
     force: Force = False,
 ) -> None:
     """Find a periodic motion, or with --fit signals of valves, that tell most about a machine."""
-    # its matrices are small: threads would only wait for each other
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from crane.cli.calibrate import fits
     from crane.cli.runs import check_folder
     from crane.common.output import staging

@@ -1,9 +1,11 @@
-"""What every thread has for itself."""
+"""What every thread has for itself, and how many threads compute."""
 
+import functools
 import threading
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Generic, ParamSpec, TypeVar
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -19,3 +21,21 @@ class PerThread(threading.local, Generic[T]):
 
     def __init__(self, make: Callable[[], T]):  # runs once in every thread
         self.own = make()
+
+
+def on_one_thread(function: Callable[P, T]) -> Callable[P, T]:
+    """The function with the linear algebra of numpy and scipy on one thread.
+
+    Of many small matrices: threads wait for each other longer than they compute, on a busy machine
+    a hundred times. What is found does not depend on how many there are, to the last digit.
+    """
+
+    @functools.wraps(function)
+    def alone(*args: P.args, **kwargs: P.kwargs) -> T:
+        import scipy.linalg  # noqa: F401 - brings its own library, which has to be there to be told
+        from threadpoolctl import threadpool_limits
+
+        with threadpool_limits(1, "blas"):
+            return function(*args, **kwargs)
+
+    return alone

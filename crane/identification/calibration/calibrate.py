@@ -8,6 +8,7 @@ import numpy as np
 
 from crane.common.errors import InputError, RecordingError, at
 from crane.common.samples import Array
+from crane.common.threads import on_one_thread
 from crane.common.waiting import telling
 from crane.description.number_units import number_unit
 from crane.description.sensors import (
@@ -40,6 +41,7 @@ _COUPLED = 0.95  # correlation of two numbers of which the data know a combinati
 _VAGUE = 0.5  # standard deviation, of a number's size, that says nothing
 
 
+@on_one_thread
 def calibrate(
     machine: Machine | str | Path,
     recordings: Sequence[str | Path] | str | Path,

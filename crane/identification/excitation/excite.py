@@ -13,6 +13,7 @@ from crane.common.output import replacing
 from crane.common.samples import Array, as_count, as_number, as_seed
 from crane.common.shown import Brief
 from crane.common.tables import aligned
+from crane.common.threads import on_one_thread
 from crane.common.waiting import telling
 from crane.dynamics import Dynamics
 from crane.identification.excitation.fourier import Fourier
@@ -161,6 +162,7 @@ class Excitation(Brief):
         return "\n\n".join("\n".join(aligned(rows)) for rows in (figures, shares, least))
 
 
+@on_one_thread
 def excite(
     machine: Machine,
     model: Model | None = None,

@@ -11,6 +11,7 @@ from crane.common.errors import InputError, known
 from crane.common.samples import Array, as_count, as_number, as_seed
 from crane.common.shown import Brief, counted
 from crane.common.tables import aligned
+from crane.common.threads import on_one_thread
 from crane.common.units import quantity
 from crane.common.waiting import telling
 from crane.control.valves import circuit_of
@@ -129,6 +130,7 @@ class SignalExcitation(Brief):
         return "\n\n".join(parts)
 
 
+@on_one_thread
 def excite_valves(
     machine: Machine,
     fit: Mapping[str, object] | Sequence[str],

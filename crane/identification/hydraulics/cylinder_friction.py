@@ -16,6 +16,7 @@ import numpy as np
 from crane.common.errors import InputError, RecordingError, known
 from crane.common.samples import Array
 from crane.common.shown import Brief
+from crane.common.threads import on_one_thread
 from crane.description import Friction
 from crane.dynamics import Dynamics
 from crane.identification.estimation import estimators
@@ -106,6 +107,7 @@ class CylinderFriction(Brief):
         return "\n".join([*lines, *([self.note] if self.note else [])]) + "\n"
 
 
+@on_one_thread
 def identify_cylinder_friction(
     machine: Machine,
     recording: Recording,

@@ -12,6 +12,7 @@ import numpy as np
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.common.shown import Brief
+from crane.common.threads import on_one_thread
 from crane.identification.estimation import estimators
 from crane.identification.hydraulics.cylinder_signals import (
     CylinderSignals,
@@ -128,6 +129,7 @@ class Orifices(Brief):
         return "\n".join(lines) + "\n"
 
 
+@on_one_thread
 def identify_orifices(
     machine: Machine,
     recordings: Recording | Sequence[Recording],

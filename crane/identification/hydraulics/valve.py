@@ -17,6 +17,7 @@ import numpy as np
 from crane.common.errors import RecordingError
 from crane.common.samples import Array
 from crane.common.shown import Brief
+from crane.common.threads import on_one_thread
 from crane.identification.estimation import estimators
 from crane.identification.hydraulics.cylinder_signals import channel, parts, speed
 from crane.identification.signals.steady import steady
@@ -125,6 +126,7 @@ class ValveCurve(Brief):
         return "\n".join(lines) + "\n"
 
 
+@on_one_thread
 def identify_valve(
     machine: Machine, recording: Recording, joint: str, settle: float = 0.5
 ) -> ValveCurve:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from crane.common.errors import CraneWarning, InputError, RecordingError, known
 from crane.common.samples import Array, as_number, as_sample
+from crane.common.threads import on_one_thread
 from crane.common.waiting import telling
 from crane.identification.estimation.estimators import (
     Estimate,
@@ -61,6 +62,7 @@ _SAMPLES = 500  # at which the speeds of joints are looked at
 _PART = 0.3  # of what is left to do that one pass over a recording is taken for
 
 
+@on_one_thread
 def identify(
     machine: Machine,
     recording: Recorded | Sequence[Recorded],
@@ -185,7 +187,7 @@ def identify(
     if all(mark == "not determined" for mark in found.marks):
         doubt(found.doubt, trust)
     elif found.doubt:
-        warnings.warn(found.doubt, CraneWarning, stacklevel=2)
+        warnings.warn(found.doubt, CraneWarning, stacklevel=3)
     return found
 
 
@@ -213,7 +215,7 @@ def _tell_short(others: Sequence[Motion], judging: Sequence[Motion], bandwidth: 
         if short
         else "no validation moves faster than what counts as standstill, nothing is judged"
     )
-    warnings.warn(f"{text}, give longer ones that move", CraneWarning, stacklevel=3)
+    warnings.warn(f"{text}, give longer ones that move", CraneWarning, stacklevel=4)
 
 
 def equations_of(

@@ -9,6 +9,7 @@ import numpy as np
 
 from crane.common.errors import InputError, RecordingError, known
 from crane.common.samples import Array
+from crane.common.threads import on_one_thread
 from crane.common.waiting import telling
 from crane.dynamics import Dynamics
 from crane.identification.estimation.estimators import Estimate, Prior
@@ -43,6 +44,7 @@ _VAGUE = 0.1  # of the machine's moving mass, that half of an interval may be at
 _GRAVITY = 9.81  # [m/s^2]
 
 
+@on_one_thread
 def identify_payload(
     machine: Machine,
     recording: Recording | Motion,
