@@ -125,7 +125,8 @@ def _pictures(what: Any) -> Iterator[str]:
 
 def _words(what: Any) -> Iterator[str]:
     if isinstance(what, Machine):
-        yield from _facts(list(facts_of(what)))
+        # notebooks are given away, and where a file lies here concerns nobody there
+        yield from _facts([fact for fact in facts_of(what) if fact.name != "file"])
     elif isinstance(what, Recording):
         yield from _blocks(summarize(what).to_markdown(), _markdown)
     elif hasattr(what, "to_markdown"):
