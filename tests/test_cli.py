@@ -87,6 +87,8 @@ def test_info_says_what_the_machine_is():
     assert "4: 8 independent equations, 12 redundant" in result.stdout
     assert "q4+q9, then q10+q2, then q6+q11, then q7+q3" in result.stdout
     assert "task        lift, 10 s: lifts along a straight line" in result.stdout
+    assert "\n  independent coordinates: condition 2.71 at home\n" in result.stdout
+    assert re.search(r"^  driven ", result.stdout, re.M) is None  # free ones are among them
 
 
 def test_info_has_the_whole_home_posture_and_the_path(mini):
@@ -168,6 +170,20 @@ def test_version_and_units_in_help():
     assert typed("--version").stdout == f"crane {crane.__version__}\n"
     text = " ".join(typed("simulate", "-h").stdout.split())
     assert "In seconds; that of the task" in text and "recorded instants in seconds" in text
+
+
+def test_without_a_task_a_controller_holds_and_none_lets_go(free_run, tmp_path):
+    assert free_run[1].stdout.startswith("# mini_forwarder: free motion\n")
+    time = "--duration", "0.02"
+    held = typed(
+        "simulate", "mini_forwarder", *time, "--controller", "pi", "--out", tmp_path / "h"
+    )
+    assert held.stdout.startswith("# mini_forwarder: hold\n")
+    runs = [crane.Recording.from_csv(x / "recording.csv") for x in (free_run[0], tmp_path / "h")]
+    assert (runs[0].tau == 0).all() and np.ptp(runs[0].q, axis=0).max() > 1e-5
+    assert np.ptp(runs[1].q, axis=0).max() < 1e-9
+    words = " ".join(typed("simulate", "-h").stdout.replace("│", " ").split())
+    assert "Without both it holds the home posture; if not given then, no drive acts" in words
 
 
 @pytest.mark.parametrize("arguments", [["list"], ["info", "ur5_robot"], ["--version"]])
