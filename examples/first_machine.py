@@ -8,15 +8,16 @@ import crane
 
 R, L = 0.05, 0.2  # crank and connecting rod [m]
 
+# z is up: a link along x rises with positive angles about the axis 0 -1 0
 Path("crank.urdf").write_text(f"""<robot name="crank">
   <link name="block"/>
   <joint name="crank" type="continuous">
-    <parent link="block"/><child link="crankshaft"/><axis xyz="0 1 0"/>
+    <parent link="block"/><child link="crankshaft"/><axis xyz="0 -1 0"/>
   </joint>
   <link name="crankshaft"><inertial><mass value="5"/>
     <inertia ixx="0.01" iyy="0.02" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
   <joint name="crank_pin" type="continuous"><origin xyz="{R} 0 0"/>
-    <parent link="crankshaft"/><child link="rod"/><axis xyz="0 1 0"/>
+    <parent link="crankshaft"/><child link="rod"/><axis xyz="0 -1 0"/>
   </joint>
   <link name="rod"><inertial><origin xyz="{L / 2} 0 0"/><mass value="0.6"/>
     <inertia ixx="0" iyy="0.002" izz="0.002" ixy="0" ixz="0" iyz="0"/></inertial></link>

@@ -199,6 +199,17 @@ def test_the_command_writes_tables_pictures_and_page(tmp_path):
     assert typed(*words, cwd=tmp_path).returncode == 2  # not over what is there
 
 
+def test_a_rule_of_what_tips_is_told_where_nothing_does(tmp_path):
+    words = "capacity", "patu655", "--step", "2", "--rule"
+    done = typed(*words, "sfs4677", "--out", "rated", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == (
+        "warning: 'patu655' has no supports, so that nothing tips and the rule's 90.9 % of the "
+        "tipping load are left out: name what it stands on under 'supports' of the machine file\n"
+    )
+    assert typed(*words, "none", "--out", "plain", cwd=tmp_path).stderr == ""
+
+
 @pytest.mark.parametrize(
     ("given", "said"),
     [

@@ -1,5 +1,6 @@
 """What `crane check` says of circuits: loose ends, ways back, regulators, other units."""
 
+import re
 import warnings
 from dataclasses import fields
 
@@ -116,6 +117,10 @@ WARNINGS = [
      "'second' gives what its valves ask for and has none, so that it gives nothing"),
     ({"supply": SENSING | {"relief": 2e7}}, "supply:",
      "relief of 'supply' is 2e+07 Pa, not above its pressure of 2.8e+07 Pa"),
+    # 3e-3 m3/s for 0.1 s into 2 l
+    ({"supply": SENSING | {"response": 0.1}}, "supply:",
+     "nothing relieves 'supply', which swings back within 0.1 s: once its valves close or what "
+     "they feed stalls, its line rises by up to 1.8e+08 Pa over its 2.8e+07 Pa, give 'relief'"),
 ]  # fmt: skip
 
 
@@ -135,6 +140,11 @@ def test_what_is_odd_is_a_warning(base, circuit, where, line):
         {"lines": {"back": {"volume": 1e-3}}, "elements": {"filter": RETURN},
          **valve(return_a="back", return_b="back")},
         {"supply": SENSING | {"relief": 3.2e7}},
+        {"supply": SENSING | {"relief": 3.2e7, "response": 0.1}},
+        {"supply": SENSING | {"response": 0.001}},
+        {"supply": SENSING | {"response": 0.1},
+         "elements": {"main": {"type": "relief", "from": "supply", "to": "tank", "gain": 1e-8,
+                               "pressure": 3e7}}},
         # a ride control: through the boom's chamber and its valve back to the tank
         {"accumulators": {"store": GAS},
          "elements": {"ride": {"type": "orifice", "from": "x.a", "to": "store",
@@ -154,6 +164,21 @@ def test_what_makes_sense_is_not_told(base, circuit):
     with warnings.catch_warnings():
         warnings.simplefilter("error", CraneWarning)
         crane.load(base[0] / "changed.yaml")
+
+
+def test_what_nothing_relieves_rises_as_far_as_is_told(base):
+    """A pump at full flow whose valve is shut at once: all that it still gives is in its line."""
+    pump = {"pressure": 2e7, "flow": 1e-3, "response": 0.1}
+    wide = {"type": "orifice"} | dict.fromkeys(("c1", "c2", "c3", "c4"), 2e-6)
+    path = written(base, supply=pump, valves={"x": wide})
+    (finding,) = check(path).findings
+    told = re.search("up to (.*) Pa over its (.*) Pa", finding.what).groups()
+    machine = crane.load(path)
+    time, signal = [0.0, 0.1, 0.1001, 0.8, 0.8001, 1.6], [0.0, 0.0, 10.0, 10.0, 0.0, 0.0]
+    run = crane.simulate(machine, crane.Signals(machine, time, {"x": signal}), duration=1.6)
+    assert run.channels["share_supply"].max() > 0.999
+    peak = run.channels["pressure_supply"].max()
+    assert 0.99 < peak / sum(map(float, told)) < 1.0
 
 
 def test_nodes_of_a_circuit(base):

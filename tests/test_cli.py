@@ -13,6 +13,9 @@ from typed import MAIN, typed
 
 import crane
 from crane.cli import entry
+from crane.cli.commands import list_machines
+from crane.common.errors import InputError
+from crane.description import bundled, examples
 
 
 def one_error(result) -> str:
@@ -48,8 +51,33 @@ def test_help_names_every_command_and_imports_nothing_heavy(tmp_path):
 def test_list():
     result = typed("list")
     assert result.returncode == 0
-    assert "  mini_forwarder\n" in result.stdout and "ur5_robot" in result.stdout
-    assert "some are refused" in result.stdout
+    lines = result.stdout.splitlines()
+    told = dict(line.strip().split(maxsplit=1) for line in lines if line.startswith("  "))
+    assert list(told) == list(bundled())
+    assert told["patu655"] == "The PATU 655, a full-size log crane"
+    # each says what it is, in a line of a terminal's width
+    assert all(what.startswith(("An ", "The ")) for what in told.values())
+    assert max(map(len, lines)) <= 100
+    assert len(lines) == len(bundled()) + 2
+    robots = len(examples())
+    assert lines[-1].startswith(f"{robots} robots of example-robot-data")
+    assert lines[-1].endswith(": crane list --robots")
+    others = typed("list", "--robots")
+    assert others.returncode == 0
+    assert others.stdout.splitlines()[1:] == [f"  {name}" for name in examples()]
+    assert "ur5_robot" in others.stdout and "some are refused" in others.stdout
+
+
+def test_no_robots_are_an_error_in_one_line(monkeypatch, capsys):
+    monkeypatch.setattr("crane.description.sources.example_root", lambda: None)
+    examples.cache_clear()
+    try:
+        with pytest.raises(InputError, match="no robots here, install example-robot-data"):
+            list_machines(robots=True)
+        list_machines(robots=False)
+        assert "robots" not in capsys.readouterr().out
+    finally:
+        examples.cache_clear()
 
 
 def test_info_says_what_the_machine_is():
@@ -59,6 +87,8 @@ def test_info_says_what_the_machine_is():
     assert "4: 8 independent equations, 12 redundant" in result.stdout
     assert "q4+q9, then q10+q2, then q6+q11, then q7+q3" in result.stdout
     assert "task        lift, 10 s: lifts along a straight line" in result.stdout
+    assert "\n  independent coordinates: condition 2.71 at home\n" in result.stdout
+    assert re.search(r"^  driven ", result.stdout, re.M) is None  # free ones are among them
 
 
 def test_info_has_the_whole_home_posture_and_the_path(mini):
@@ -140,6 +170,20 @@ def test_version_and_units_in_help():
     assert typed("--version").stdout == f"crane {crane.__version__}\n"
     text = " ".join(typed("simulate", "-h").stdout.split())
     assert "In seconds; that of the task" in text and "recorded instants in seconds" in text
+
+
+def test_without_a_task_a_controller_holds_and_none_lets_go(free_run, tmp_path):
+    assert free_run[1].stdout.startswith("# mini_forwarder: free motion\n")
+    time = "--duration", "0.02"
+    held = typed(
+        "simulate", "mini_forwarder", *time, "--controller", "pi", "--out", tmp_path / "h"
+    )
+    assert held.stdout.startswith("# mini_forwarder: hold\n")
+    runs = [crane.Recording.from_csv(x / "recording.csv") for x in (free_run[0], tmp_path / "h")]
+    assert (runs[0].tau == 0).all() and np.ptp(runs[0].q, axis=0).max() > 1e-5
+    assert np.ptp(runs[1].q, axis=0).max() < 1e-9
+    words = " ".join(typed("simulate", "-h").stdout.replace("│", " ").split())
+    assert "Without both it holds the home posture; if not given then, no drive acts" in words
 
 
 @pytest.mark.parametrize("arguments", [["list"], ["info", "ur5_robot"], ["--version"]])
@@ -311,7 +355,7 @@ def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
         (
             ["info", "zzzzzz"],
             "known: excavator, excavator_ls, excavator_two_pumps, kr300, mini_forwarder, patu655, "
-            "patu655_grapple, patu655_ls, tx40; crane list shows all names",
+            "patu655_grapple, patu655_ls, tx40; crane list --robots names more",
         ),
         (["demo", "--out", ""], "the name after --out is empty"),
         (["demo", "--out", "/dev/null"], "/dev/null: is a file"),

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarnin
 def page():
     """What is defined after the page's blocks."""
     blocks = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.DOTALL | re.MULTILINE)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     names: dict = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
@@ -39,6 +39,56 @@ def test_the_page_does_what_it_says(page):
         slow, fast = getattr(page["slow"], name), getattr(page["fast"], name)
         np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-9 * np.abs(slow).max())
     assert np.ptp(page["swinging"].q, axis=0).min() > 1e-6
+
+
+def test_errors_of_three_controllers_are_the_page_s(page):
+    machine, trajectory = page["machine"], page["trajectory"]
+    controllers = {
+        "`Held`": page["Held"](machine, trajectory, 50.0),
+        "`crane.PI`": crane.PI(machine, trajectory),
+        "`crane.ComputedTorque`": crane.ComputedTorque(machine, trajectory, 20.0),
+    }
+    for name, control in controllers.items():
+        run = crane.simulate(machine, control, step=0.01)
+        error = 1e3 * np.abs(run.q - trajectory.position(run.time))[:, 1:]
+        (row,) = [line for line in PAGE.read_text().splitlines() if line.startswith(f"| {name}")]
+        told = [float(cell) for cell in row.strip("|").split("|")[1:]]
+        np.testing.assert_allclose(told, [*error.max(axis=0), *error[-1]], atol=0.006)
+
+
+def test_held_knows_its_gains_by_what_friction_leaves(page):
+    """At rest kp e is the friction that sticks at most, which four times the kp shows."""
+    machine, trajectory, w = page["machine"], page["trajectory"], 50.0
+    ends = []
+    for fast in (w, 2 * w):
+        run = crane.simulate(machine, page["Held"](machine, trajectory, fast), step=0.01)
+        ends.append(run.q[-1] - trajectory.position(run.time[-1]))
+    np.testing.assert_allclose(ends[0][1:], 4.0 * np.array(ends[1][1:]), rtol=0.02)
+
+
+def test_a_law_sees_the_weight_alone_in_numbers_and_traced(page):
+    """Whatever moves: the forces that a run records are `gravity` of the postures it passed."""
+
+    machine, start = page["machine"], page["trajectory"].position(0.0)
+    push = np.array([0.5, 40.0, -60.0])  # more than its friction
+
+    class Weight(Law):
+        def begin(self, at):
+            return at.gravity()
+
+        def law(self, at):
+            return np.array(at.gravity()) + push, np.zeros(3)
+
+    dynamics, law = crane.Dynamics(machine), Weight(machine)
+    weight, moving = dynamics.gravity(start), np.array([0.5, 0.05, -0.05])
+    np.testing.assert_allclose(law.start(start), weight, rtol=0, atol=1e-12)
+    seen = law(0.0, start, moving, np.zeros(3))[0]
+    np.testing.assert_allclose(seen, weight + push, rtol=0, atol=1e-12)
+    coriolis = dynamics.inverse(start, moving, np.zeros(3)) - weight
+    assert np.abs(coriolis).max() > 1e-2
+    run = crane.simulate(machine, law, start, duration=0.1)
+    assert np.ptp(run.q, axis=0).min() > 1e-3
+    np.testing.assert_allclose(run.tau - push, dynamics.gravity(run.q), rtol=0, atol=1e-9)
 
 
 def test_laws_of_the_page_run_without_python(page, monkeypatch):

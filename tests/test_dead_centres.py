@@ -9,7 +9,6 @@ from scipy.integrate import solve_ivp
 
 import crane
 from crane.common.errors import CraneWarning, SimulationError
-from crane.control import controller
 from crane.motion.curves import point_to_point
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarning")
@@ -131,13 +130,29 @@ def test_a_rocker_that_turns_back_everywhere(tmp_path):
         np.testing.assert_allclose(other, runs[0], rtol=0, atol=1e-7)
 
 
-def test_inverse_dynamics_at_a_dead_centre_is_one_line(tmp_path):
+class Weighed(crane.Law):
+    """A spring along a reference, and what holds the weight."""
+
+    def __init__(self, machine, reference):
+        super().__init__(machine)
+        self.reference = reference
+
+    def references(self, times):
+        return self.reference.position(times)
+
+    def law(self, at):
+        error = np.array(at.reference) - np.array(at.q_a)
+        return np.array(at.gravity()) + 1e3 * error - 50.0 * np.array(at.v_a), ()
+
+
+@pytest.mark.parametrize("made", [crane.ComputedTorque, Weighed])
+def test_inverse_dynamics_at_a_dead_centre_is_one_line(tmp_path, made):
     machine = singular.slider_crank(tmp_path, "s", 0.3, 0.6)
     start = machine.home[machine.closure.active]
     path = point_to_point(start, [0.95], 1.0)  # the slider gets no farther than 0.9
     with warnings.catch_warnings(), pytest.raises(SimulationError) as caught:
         warnings.simplefilter("ignore", CraneWarning)
-        crane.simulate(machine, controller("computed-torque", machine, path))
+        crane.simulate(machine, made(machine, path))
     text = str(caught.value)
     assert "'s' comes to a dead centre" in text and "\n" not in text
 

@@ -294,11 +294,11 @@ class TestSources:
              "did you mean 'mini_forwarder'?"),
             ("ur5_robt", "no machine and no file is named 'ur5_robt', did you mean 'ur5_robot'?"),
             ("elephant", "no machine and no file is named 'elephant', known: {bundled}; "
-             "crane list shows all names"),
+             "crane list --robots names more"),
             ("crane.yaml", "crane.yaml: no such file, check the path"),
             ("folder/crane.urdf", "folder/crane.urdf: no such file, check the path"),
             ("a\0b", "no machine and no file is named 'a b', known: {bundled}; "
-             "crane list shows all names"),
+             "crane list --robots names more"),
             ("folder", f"folder: {NO_MACHINE}"),
             ("", f".: {NO_MACHINE}"),
             ("a.txt", f"a.txt: {NO_MACHINE}"),

@@ -270,11 +270,11 @@ BROKEN_FILES = {
     "no joint": ("time [s],q1 [rad]\n0,1\n", "no active joint among the columns 'time', 'q1'"),
     "gradians": (
         f"{HEAD}\n0,1,2,3\n".replace("[rad]", "[gon]"),
-        "column 'q1' is in [gon], give 'q1 [rad]' or 'q1 [m]'",
+        "column 'q1' is in [gon], give 'q1 [rad]'",
     ),
     "no unit": (
         f"{HEAD}\n0,1,2,3\n".replace(" [rad]", ""),
-        "column 'q1' has no unit, give 'q1 [rad]' or 'q1 [m]'",
+        "column 'q1' has no unit, give 'q1 [rad]'",
     ),
     "velocity of another kind": (
         f"{HEAD}\n0,1,2,3\n".replace("[rad/s]", "[m/s]"),
@@ -296,6 +296,22 @@ def test_broken_files(tmp_path, text, message):
     assert str(caught.value).startswith(f"{tmp_path / 'run.csv'}: ")
     assert str(caught.value).count("run.csv") == 1
     assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("others", "proposed"),
+    [
+        ("X_velocity [m/s],X_force [N]", "'X [m]'"),
+        ("X_force [N]", "'X [m]'"),
+        ("X_force [N m]", "'X [rad]'"),
+        ("X_velocity [m/s],X_force [N m]", "'X [rad]' or 'X [m]'"),  # which tell nothing
+    ],
+)
+def test_units_that_fit_the_other_columns_are_proposed(tmp_path, others, proposed):
+    with pytest.raises(RecordingError) as caught:
+        from_text(tmp_path, f"time [s],X [foo],{others}\n0,1,2{',3' * others.count(',')}\n")
+    told = str(caught.value).partition("run.csv: ")[2]
+    assert told == f"column 'X' is in [foo], give {proposed}"
 
 
 def test_velocities_may_be_missing(tmp_path):

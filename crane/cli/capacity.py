@@ -1,6 +1,7 @@
 """The command on what a machine lifts: capacity."""
 
 import dataclasses
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,7 +21,7 @@ from crane.cli.shared import (
     load,
     status,
 )
-from crane.common.errors import InputError
+from crane.common.errors import CraneWarning, InputError
 
 if TYPE_CHECKING:
     from crane.ratings import Rule
@@ -89,6 +90,7 @@ def capacity(
 
     from crane.cli.runs import check_folder, write_capacity
     from crane.common.samples import as_number
+    from crane.dynamics.stability import has_supports
     from crane.ratings import capacity as rate
     from crane.ratings import torques
 
@@ -97,6 +99,13 @@ def capacity(
     lean = radians(as_number(slope, "--slope", "degrees", most=45.0))
     slews = None if slew is None else [radians(x) for x in _angles(slew)]
     loaded = load(machine, lock, change, active, free, False, packages, argument)
+    if shares.tipping < 1 and not has_supports(loaded):
+        text = (
+            f"'{loaded.name}' has no supports, so that nothing tips and the rule's "
+            f"{100 * shares.tipping:.3g} % of the tipping load are left out: name what it stands "
+            "on under 'supports' of the machine file"
+        )
+        warnings.warn(text, CraneWarning, stacklevel=2)
     with status("rating"):
         chart = rate(
             loaded, frame, rule=shares, raising=raising or None, slews=slews,

@@ -38,18 +38,31 @@ RunMachine = Annotated[
 
 
 @app.command("list")
-def list_machines() -> None:
+def list_machines(
+    robots: Annotated[
+        bool, typer.Option("--robots", help="List the robots of example-robot-data instead.")
+    ] = False,
+) -> None:
     """List the machines that can be named."""
+    from crane.common.shown import counted
     from crane.description import bundled, examples
+    from crane.description.sources import about
 
-    print("Bundled machines:")
-    for name in bundled():
-        print(f"  {name}")
-    if examples():
-        print(
-            "Robots of example-robot-data (open chains; some are refused by the strict reading):"
-        )
-        print(f"  {', '.join(examples())}")
+    others = examples()
+    if robots:
+        if not others:
+            raise InputError("there are no robots here, install example-robot-data")
+        print("Robots of example-robot-data, open chains; some are refused by the strict reading:")
+        print("\n".join(f"  {name}" for name in others))
+        return
+    machines = bundled()
+    width = max(map(len, machines))
+    print("Bundled machines; crane info NAME says more of one:")
+    for name, path in machines.items():
+        print(f"  {name:{width}}  {about(path)}")
+    if others:
+        number = counted(len(others), "robot")
+        print(f"{number} of example-robot-data can be named likewise: crane list --robots")
 
 
 @app.command()

@@ -45,8 +45,10 @@ def simulate(
     controller: Annotated[
         str | None,
         typer.Option(
-            help="pi, computed-torque, valve-pd, valve-feedforward, tip-velocity; if not given, "
-            "the one that the machine has gains for. Without a task it holds the home posture."
+            help="pi, computed-torque, valve-pd, valve-feedforward, tip-velocity; along a task or "
+            "path, if not given, the one that the machine has gains for, else computed-torque. "
+            "Without both it holds the home posture; if not given then, no drive acts: forces "
+            "are zero, valves at their neutral signals."
         ),
     ] = None,
     sway: Annotated[
@@ -74,7 +76,8 @@ def simulate(
         ),
     ] = None,
     duration: Annotated[
-        float | None, typer.Option(help="In seconds; that of the task if not given.")
+        float | None,
+        typer.Option(help="In seconds; that of the task or path if not given."),
     ] = None,
     step: Annotated[float, typer.Option(help="Between recorded instants in seconds.")] = 1e-3,
     npz: Annotated[
@@ -107,7 +110,7 @@ def simulate(
     argument: Argument = None,
     force: Force = False,
 ) -> None:
-    """Simulate a task, measured inputs, or the motion from the home posture on its own."""
+    """Simulate a task, a path, measured inputs, or the home posture, held or let go."""
     from crane.cli.runs import check_folder, write_run
     from crane.motion.paths import read_path
     from crane.simulation import InterruptedRun

@@ -35,6 +35,13 @@ class Inverse(Protocol):
         """Active forces (n,) [N], [N m] of accelerations (n,), see `Dynamics.inverse`."""
 
 
+class Gravity(Protocol):
+    """Weight at an instant."""
+
+    def __call__(self) -> list[Number]:
+        """Active forces (n,) [N], [N m] that hold the weight alone, see `Dynamics.gravity`."""
+
+
 class At(NamedTuple):
     """What a law sees at an instant: floats, or formulas while it becomes machine code.
 
@@ -45,6 +52,7 @@ class At(NamedTuple):
         settings: (s,) its `settings`.
         reference: (c,) its row of `references`.
         inverse: The machine's inverse dynamics here.
+        gravity: What holds its weight here.
     """
 
     q_a: list[Number]
@@ -53,6 +61,7 @@ class At(NamedTuple):
     settings: list[Number]
     reference: list[Number]
     inverse: Inverse
+    gravity: Gravity
 
 
 @runtime_checkable
@@ -95,7 +104,13 @@ class Law(Brief):
         self.machine = machine
 
     def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
-        """Active forces (n,) [N], [N m], 0.0 of free joints, and rates (k,) of the states."""
+        """Active forces (n,) [N], [N m], 0.0 of free joints, and rates (k,) of the states.
+
+        Args:
+            at: What it sees, floats or formulas: `q_a`, `v_a` (n,), `state` (k,), `settings` (s,),
+                `reference` (c,), and, as `Dynamics` has them, `inverse(a_a, friction)` and
+                `gravity()`.
+        """
         raise NotImplementedError
 
     def of_driven(self, x: Sequence[Number]) -> list[Number]:
@@ -112,7 +127,7 @@ class Law(Brief):
         return ()
 
     def references(self, times: Array) -> Array:
-        """See `TracedController`."""
+        """All that depends on time alone, (N, c) at times (N,) [s]; none yet."""
         return np.zeros((len(times), 0))
 
     def start(self, q_a: Array) -> Array:
@@ -131,7 +146,11 @@ class Law(Brief):
             found: list[Number] = dynamics.tree.at(quantity, q, rest, np.array(a_a)).tolist()
             return found
 
-        at = self._numbers(0.0, q_a, rest, np.zeros(0), inverse)
+        def gravity() -> list[Number]:
+            found: list[Number] = dynamics.tree.at("gravity", q, rest, rest).tolist()
+            return found
+
+        at = self._numbers(0.0, q_a, rest, np.zeros(0), inverse, gravity)
         return np.array(self.begin(at), dtype=np.float64)
 
     def __call__(self, time: float, q_a: Array, v_a: Array, state: Array) -> tuple[Array, Array]:
@@ -140,7 +159,7 @@ class Law(Brief):
         return np.array(tau, dtype=np.float64), np.array(rate, dtype=np.float64)
 
     def trace(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
-        """See `TracedController`."""
+        """What `law` gives, as formulas."""
         return self.law(at)
 
     def at(self, time: float, q_a: Array, v_a: Array, state: Array) -> At:
@@ -151,13 +170,25 @@ class Law(Brief):
             found: list[Number] = self._dynamics.inverse(q_a, v_a, wanted, friction).tolist()
             return found
 
-        return self._numbers(time, q_a, v_a, state, inverse)
+        def gravity() -> list[Number]:
+            found: list[Number] = self._dynamics.gravity(q_a).tolist()
+            return found
 
-    def _numbers(self, time: float, q_a: Array, v_a: Array, state: Array, inverse: Inverse) -> At:
+        return self._numbers(time, q_a, v_a, state, inverse, gravity)
+
+    def _numbers(
+        self,
+        time: float,
+        q_a: Array,
+        v_a: Array,
+        state: Array,
+        inverse: Inverse,
+        gravity: Gravity,
+    ) -> At:
         reference = self.references(np.array([time]))[0]
         vectors = (q_a, v_a, state, self.settings, reference)
         own: list[list[Number]] = [vector.tolist() for vector in vectors]
-        return At(own[0], own[1], own[2], own[3], own[4], inverse)
+        return At(own[0], own[1], own[2], own[3], own[4], inverse, gravity)
 
     @cached_property
     def _dynamics(self) -> Dynamics:

@@ -130,7 +130,7 @@ class ValveDrive(Law):
         return np.array(self.command.signals(own), dtype=np.float64)
 
     def references(self, times: Array) -> Array:
-        """See `TracedController`; signals are those that reach the spools."""
+        """See `Law`; signals are those that reach the spools."""
         found = self._source.references(times)
         for delay in np.unique(self.delays[self.delays > 0]):
             late = np.flatnonzero(self.delays == delay)

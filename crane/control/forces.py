@@ -26,13 +26,14 @@ class PI(Law):
     Args:
         machine: The machine.
         reference: Reference of the driven joints, see `with_free`.
-        gains: By driven joint; those of the machine file if not given.
+        gains: `PIGains` by driven joint, as {"X1": crane.PIGains(kp, ki)}; those of the machine
+            file if not given.
         integral: (k,) int e dt of the driven joints at the start [m s], [rad s]. If not given, it
             carries the machine's weight, as it does when a machine under control stands still;
             with zeros the machine falls until the integrals have grown.
 
     Raises:
-        InputError: No gains for a joint.
+        InputError: No gains for a joint, or something else than `PIGains`.
     """
 
     def __init__(
@@ -43,12 +44,20 @@ class PI(Law):
         integral: ArrayLike | None = None,
     ):
         gains = machine.control if gains is None else gains
+        if not isinstance(gains, Mapping):
+            raise InputError(
+                f"gains are a {type(gains).__name__}, give them by joint: {_form('JOINT')}"
+            )
         driven = machine.driven_joints
         for joint in driven:
             if joint not in gains:
                 raise InputError(
                     f"no PI gains for driven joint '{joint}' of '{machine.name}', give kp and ki "
-                    "under 'control' of the machine file"
+                    f"under 'control' of the machine file, or in Python {_form(joint)}"
+                )
+            if not isinstance(gains[joint], PIGains):
+                raise InputError(
+                    f"gains of '{joint}' are a {type(gains[joint]).__name__}, give {_form(joint)}"
                 )
         super().__init__(machine)
         self.reference: Trajectory = with_free(machine, reference)
@@ -69,7 +78,7 @@ class PI(Law):
         return list(held / np.where(able, ki, 1.0))
 
     def references(self, times: Array) -> Array:
-        """See `TracedController`."""
+        """See `Law`."""
         return self.reference.position(times)[:, self.machine.driven]
 
     def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
@@ -132,7 +141,7 @@ class ComputedTorque(Law):
         )
 
     def references(self, times: Array) -> Array:
-        """See `TracedController`."""
+        """See `Law`."""
         return np.concatenate([x[:, self.machine.driven] for x in self.reference(times)], axis=1)
 
     def law(self, at: At) -> tuple[Sequence[Number], Sequence[Number]]:
@@ -147,3 +156,8 @@ class ComputedTorque(Law):
         ]
         tau, _ = hybrid(at.inverse, self.machine.driven.tolist(), wanted, friction=True)
         return self.spread(tau), ()
+
+
+def _form(joint: str) -> str:
+    """How gains are given in Python."""
+    return f"gains={{'{joint}': crane.PIGains(kp, ki)}}"

@@ -2,6 +2,7 @@
 
 import sys
 from functools import cache
+from itertools import takewhile
 from pathlib import Path
 
 from crane.common.errors import DescriptionError, known
@@ -20,6 +21,12 @@ def _models() -> Path:
 def bundled() -> dict[str, Path]:
     """Names and machine files of the machines that come with the package."""
     return {path.stem: path for path in sorted(_models().glob("*.yaml"))}
+
+
+def about(path: Path) -> str:
+    """What a bundled machine is: the first sentence of the comment that begins its file."""
+    lines = takewhile(lambda line: line.startswith("#"), path.read_text("utf-8").splitlines())
+    return " ".join(line.strip("# ") for line in lines).partition(". ")[0]
 
 
 @cache
@@ -98,5 +105,6 @@ def find(name: str | Path) -> Path:
         )
     hint = known([*machines, *robots], text)
     if hint.startswith("known"):
-        hint = f"{known(machines)}; crane list shows all names"
+        more = "; crane list --robots names more" if robots else ""
+        hint = f"{known(machines)}{more}"
     raise DescriptionError(f"no machine and no file is named '{text}', {hint}")

@@ -281,7 +281,9 @@ class Recording(Brief):
         free = tuple(filter(None, (x.strip() for x in table.notes.get(FREE, "").split(","))))
         joints = _some_joints(list(units), free)
         for joint in joints:
-            check_unit(joint, unit := units[joint], VELOCITY_UNITS)
+            unit = units[joint]
+            if unit not in VELOCITY_UNITS:
+                check_unit(joint, unit, _fitting(joint, units) or VELOCITY_UNITS)
             if joint + VELOCITY in units:
                 check_unit(joint + VELOCITY, units[joint + VELOCITY], [VELOCITY_UNITS[unit]])
             else:
@@ -386,6 +388,16 @@ def find_joints(names: Sequence[str], free: Sequence[str] = ()) -> tuple[str, ..
         if x not in there:
             raise RecordingError(f"column '{x}' of a free joint is missing, {known(names, x)}")
     return tuple(x for x in names if x + FORCE in there or x in free)
+
+
+def _fitting(joint: str, units: Mapping[str, str]) -> list[str]:
+    """Units of a joint that fit its velocity and force, as far as these have columns."""
+    return [
+        unit
+        for unit, rate in VELOCITY_UNITS.items()
+        if units.get(joint + VELOCITY, rate) == rate
+        and units.get(joint + FORCE, FORCE_UNITS[unit]) == FORCE_UNITS[unit]
+    ]
 
 
 def _some_joints(names: Sequence[str], free: Sequence[str]) -> tuple[str, ...]:

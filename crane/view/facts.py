@@ -118,7 +118,8 @@ def _drives(machine: Machine) -> Iterator[Fact]:
         drive = float(closure.condition(machine.home))
         better = [c for c in closure.proposals if drive > 10 and c.condition < drive / 2]
         others = f"; better with {better[0]}" if better else ""
-        yield Fact("driven", f"condition {drive:.3g} at home{others}")
+        # of free ones too, which nothing drives
+        yield Fact("independent", f"coordinates: condition {drive:.3g} at home{others}")
     if any(inertia.mass for inertia in list(machine.model.inertias)[1:]):
         backend = Dynamics(machine).backend_of("forward")
         reason = "" if backend == "compiled" else ", too large for machine code"

@@ -1,15 +1,16 @@
 """What of a hydraulic circuit can be and is hardly meant: its connections, and what pumps give."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from crane.common.errors import CraneWarning
 from crane.description import MachineSpec
-from crane.hydraulics.components import Hydraulics
+from crane.hydraulics.components import Hydraulics, Valve
 from crane.hydraulics.connections import drained, fed, joined, wanted
 from crane.hydraulics.sources import MAIN, TANK
 
 _SHORT = 1.01  # times a pump's flow from which on its valves take more than it has
+_HIGH = 0.1  # share of a pump's pressure by which a line may rise over it
 _LITRES = 6e4  # per minute in a m3/s
 
 
@@ -105,3 +106,22 @@ def _odd_pumps(hydraulics: Hydraulics) -> Iterator[tuple[str, str]]:
                 f"relief of '{name}' is {supply.relief:g} Pa, not above its pressure of "
                 f"{supply.pressure:g} Pa: what the pump gives flows off there, give a higher one",
             )
+        # what it gives until its displacement is back, in a line that no way leads out of
+        rise = supply.flow * supply.response * hydraulics.oil.bulk_modulus / supply.volume
+        if rise > _HIGH * supply.pressure and not _relieved(hydraulics, name, valves):
+            yield (
+                key,
+                f"nothing relieves '{name}', which swings back within {supply.response:g} s: once "
+                f"its valves close or what they feed stalls, its line rises by up to {rise:.3g} "
+                f"Pa over its {supply.pressure:.3g} Pa, give 'relief' [Pa]",
+            )
+
+
+def _relieved(hydraulics: Hydraulics, name: str, valves: Sequence[Valve]) -> bool:
+    """Whether a pump's line has a way out beside its closed valves, slip apart: that is slow."""
+    ways = [part for part in hydraulics.elements.values() if name in (part.source, part.target)]
+    return (
+        hydraulics.sources[name].relief > 0
+        or any(valve.centre > 0 for valve in valves)
+        or any(part.source == name or part.kind in ("orifice", "leak") for part in ways)
+    )

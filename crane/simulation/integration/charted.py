@@ -317,7 +317,7 @@ class ChartedSteps:
 
     @property
     def _inverted(self) -> bool:
-        """Whether the controller asks for inverse dynamics, which its own coordinates need."""
+        """Whether the controller asks for inverse dynamics or weight, of its own coordinates."""
         control, asked = self._control, 0
         if isinstance(control, ValveDrive) or not isinstance(control, TracedController):
             return False
@@ -328,10 +328,13 @@ class ChartedSteps:
             asked += 1
             return tape.loads(5, n * asked, n)  # others each time: laws divide by differences
 
+        def gravity() -> list[Number]:
+            return inverse([], False)
+
         columns = control.references(np.zeros(1)).shape[1]
         sizes = n, n, self._layout.parts["own"], len(control.settings), columns
         q_a, v_a, state, settings, reference = (tape.loads(i, 0, x) for i, x in enumerate(sizes))
-        control.trace(At(q_a, v_a, state, settings, reference, inverse))
+        control.trace(At(q_a, v_a, state, settings, reference, inverse, gravity))
         return asked > 0
 
     def _dead(self, time: float, q: Array, other: Chart) -> HaltedError:

@@ -65,7 +65,8 @@ class Traced:
     def seen(self, settings: list[Number], reference: list[Number]) -> At:
         """What a controller sees."""
         inverse = self.sweep.inverse if self.chart.own else _undetermined
-        return At(self.q_a, self.v_a, self.parts.own, settings, reference, inverse)
+        gravity = (lambda: list(self.sweep.weight)) if self.chart.own else _undetermined
+        return At(self.q_a, self.v_a, self.parts.own, settings, reference, inverse, gravity)
 
     def gripped(self, control: TracedController, at: At) -> "Traced":
         """The machine with the Coulomb friction that seals and brakes of a circuit add."""
@@ -121,7 +122,7 @@ class Traced:
         return [dot(tau, self.v_a), *self.outside.powers, self.sweep.dissipation]
 
 
-def _undetermined(a_a: Sequence[Number], friction: bool) -> list[Number]:
+def _undetermined(a_a: Sequence[Number] = (), friction: bool = False) -> list[Number]:
     raise InputError("inverse dynamics of coordinates that do not determine the motion")
 
 
@@ -284,7 +285,7 @@ def form_of(
 
     q_a, v_a, own = tape.loads(0, 0, n), tape.loads(1, 0, n), tape.loads(2, 0, states)
     settings, reference = settings_of(control, tape, 3, fold), tape.loads(4, 0, columns)
-    at = At(q_a, v_a, own, settings, reference, inverse)
+    at = At(q_a, v_a, own, settings, reference, inverse, lambda: tape.loads(6, 0, n))
     tau, rates = control.trace(at)
     if (len(tau), len(rates)) != (n, states):
         raise InputError(

@@ -176,7 +176,7 @@ class Drive:
         q_a, v_a, own = tape.loads(0, 0, n), tape.loads(0, n, n), tape.loads(0, 2 * n, k)
         settings, u = settings_of(control, tape, 1, fold=True), tape.loads(0, 2 * n + k, m)
         integrals: list[Number] = [0.0] * len(BALANCES)
-        at = At(q_a, v_a, [*own, *integrals], settings, u, _no_inverse)
+        at = At(q_a, v_a, [*own, *integrals], settings, u, _not_asked, _not_asked)
         tau, rates = control.trace(at)
         seen = [*control.look(at), *(tau[i] for i in self._forces)]
         if grip := control.grip(at):
@@ -220,5 +220,5 @@ class Drive:
         return values, slopes.reshape(len(values), -1)
 
 
-def _no_inverse(a_a: Sequence[Number], friction: bool) -> list[Number]:
+def _not_asked(a_a: Sequence[Number] = (), friction: bool = False) -> list[Number]:
     raise AssertionError("signals that are given do not ask for forces")
