@@ -121,6 +121,7 @@ if TYPE_CHECKING:
     )
     from crane.studies.design import Design, design
     from crane.view.page import report
+    from crane.view.page.identification import identification_report
     from crane.view.sketch import sketch, sketch_circuit
 
 __version__ = "0.2.0"
@@ -170,6 +171,7 @@ _HOMES = {
     "crane.studies": "PowerAccount PowerComparison Study SwayStudy power_account study sway_study",
     "crane.studies.design": "Design design",
     "crane.view.page": "report",
+    "crane.view.page.identification": "identification_report",
     "crane.view.sketch": "sketch sketch_circuit",
 }
 
@@ -184,11 +186,12 @@ __all__ = [
     "Sway", "SwayStudy", "TipVelocity", "ToolForce", "Torques", "Trajectory", "Transmission",
     "Turning", "ValveDrive", "ValveFeedforward", "ValvePD", "WorkingRange", "Workspace", "Wrench",
     "add_cylinder", "add_loops", "breakout", "calibrate", "capacity", "casadi_function", "check",
-    "cross_validate", "design", "excite", "excite_valves", "fastest", "gradient", "identify",
-    "identify_cylinder_friction", "identify_orifices", "identify_payload", "identify_valve",
-    "joystick", "linear_models", "linearize", "load", "point_to_point", "polynomial",
-    "power_account", "read_measured", "read_path", "replay", "report", "retimed",
-    "robot_description", "sensitivities", "simulate", "simulate_batch", "sketch", "sketch_circuit",
+    "cross_validate", "design", "excite", "excite_valves", "fastest", "gradient",
+    "identification_report", "identify", "identify_cylinder_friction", "identify_orifices",
+    "identify_payload", "identify_valve", "joystick", "linear_models", "linearize", "load",
+    "point_to_point", "polynomial", "power_account", "read_measured", "read_path", "replay",
+    "report", "retimed", "robot_description", "sensitivities", "simulate", "simulate_batch",
+    "sketch", "sketch_circuit",
     "study", "sway_study", "task_trajectory", "tip_trajectory", "tool_force", "torques",
     "via_attitudes", "via_points", "without_sway", "working_range", "workspace", "write_machine",
     "write_mjcf", "write_urdf_plus",

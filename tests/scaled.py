@@ -104,7 +104,8 @@ class Scale:
         for joint, law in told.get("friction", {}).items():
             law |= {key: law.get(key, value) for key, value in DEFAULTS.items()}
             told["friction"][joint] = {
-                k: float(v) * by(joint, FRICTION[k]) for k, v in law.items()
+                k: v if k == "drives" else float(v) * by(joint, FRICTION[k])
+                for k, v in law.items()
             }
         for law in told.get("forces", []):
             for key in law.keys() & ELEMENT.keys():

@@ -10,7 +10,7 @@ import pytest
 from broken import DATA, GROUND, LOOPED, MACHINE, MINI, MODELS, ROCKER, Edit, copy_machine, swap
 
 import crane
-from crane.common.errors import CraneError, CraneWarning, MechanismError, known
+from crane.common.errors import CraneError, CraneWarning, DescriptionError, MechanismError, known
 from crane.description import LOOP_TYPES, Friction, bundled, examples, inertia_problem
 from crane.description.sources import find
 
@@ -199,13 +199,15 @@ class TestWarnings:
                 "coulomb: 0.3,",
                 "coulomb: 0.3, coulomb_offset: -0.4,",
                 "four_bar.yaml:20: friction of 'crank' drives the joint in one direction "
-                "(|coulomb_offset| 0.4 > coulomb 0.3), a constant force may hide in it",
+                "(|coulomb_offset| 0.4 > coulomb 0.3), a constant force may hide in it; write "
+                "drives: true if it is meant",
             ),
             (
                 "viscous: 0.1,",
                 "viscous: 0.1, viscous_offset: 0.2,",
                 "four_bar.yaml:20: friction of 'crank' drives the joint in one direction "
-                "(|viscous_offset| 0.2 > viscous 0.1), a constant force may hide in it",
+                "(|viscous_offset| 0.2 > viscous 0.1), a constant force may hide in it; write "
+                "drives: true if it is meant",
             ),
         ],
         ids=["coulomb", "viscous"],
@@ -238,10 +240,20 @@ class TestWarnings:
             warnings.simplefilter("error")
             crane.load(name)
 
-    def test_a_copy_of_a_bundled_machine_warns_of_what_is_odd(self, tmp_path):
+    def test_what_is_odd_is_told_unless_the_file_says_that_it_is_meant(self, tmp_path):
+        path = copy_machine(MINI, tmp_path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            written = crane.write_machine(crane.load(path), tmp_path / "written")
+            assert crane.load(written).friction == crane.load("mini_forwarder").friction
+        text = path.read_text(encoding="utf-8")
+        path.write_text(text.replace(", drives: true", ""), encoding="utf-8")
         with pytest.warns(CraneWarning, match="friction of 'X2' drives the joint") as caught:
-            crane.load(copy_machine(MINI, tmp_path))
+            crane.load(path)
         assert len(caught) == 1
+        path.write_text(text.replace("drives: true", "drives: 1"), encoding="utf-8")
+        with pytest.raises(DescriptionError, match="'X2' is neither true nor false"):
+            crane.load(path)
 
 
 class TestSources:

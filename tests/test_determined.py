@@ -1,6 +1,7 @@
 """What a recording does not determine is said; deviations are those of what is printed."""
 
 import dataclasses
+import re
 import warnings
 from functools import partial
 
@@ -99,6 +100,8 @@ def test_a_combination_of_what_is_determined_is_named_without_a_warning(plain):
     vague[:, 3] *= 2
     found = dataclasses.replace(found, covariance=vague)
     assert found.doubt.startswith("this motion does not determine 1 of 75 base parameters, ")
+    # a motion last: excite may have found the best that the limits allow
+    assert re.search(": give a prior, ask for feasible bodies, or record one that ", found.doubt)
 
 
 def test_what_cannot_be_is_called_impossible(plain):

@@ -27,7 +27,6 @@ from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.passive import GasScale, SpringForce
 from crane.identification.mechanics.term import Direction
 from crane.identification.mechanics.terms import default_terms
-from crane.identification.mechanics.write import write_identified
 from crane.identification.signals.motion import Motion
 
 BOOM, STRUT = ("base", "link7"), ("link3_H", "A1_rod")  # of the mini forwarder
@@ -624,7 +623,7 @@ def test_identified_machines_keep_them(tmp_path):
     terms = [*default_terms(locked), GasScale(locked, "strut")]
     result = identify(locked, Motion(time[:, 0], q, v, a, tau), terms=terms, feasible=True)
     scale = result.parameters[result.model.names.index("strut.gas_scale")]
-    written = crane.load(write_identified(result, tmp_path / "out"))
+    written = crane.load(result.write_machine(tmp_path / "out"))
     assert written.ropes == machine.ropes and written.forces == machine.forces
     (gas,) = written.gas_springs
     assert gas.pressure == pytest.approx(3e5 * scale) and gas.between == STRUT

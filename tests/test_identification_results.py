@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 
 import crane
 from crane import cli
-from crane.cli.runs import read_run
+from crane.cli.runs import read_run, write_identification
 from crane.common.errors import CraneWarning, InputError, OutputError, RecordingError
 from crane.identification.mechanics.division import divided
 from crane.identification.mechanics.friction import friction
@@ -27,9 +27,7 @@ from crane.identification.mechanics.inertias import Inertial, body_names
 from crane.identification.mechanics.passive import SpringForce
 from crane.identification.mechanics.payload import identify_payload
 from crane.identification.mechanics.terms import default_terms
-from crane.identification.mechanics.write import write_identified, write_parameters
 from crane.identification.signals.motion import Motion
-from crane.view.page.identification import write_report
 
 HERE = Path(__file__).parents[1]
 RAW = HERE / ".." / "shared" / "data" / "patu655" / "lifting_first_half.csv"
@@ -61,7 +59,7 @@ def found(mini):
 def same_forces(result, machine, q, v, a):
     """Mass matrix, bias and friction against the regressor and what it predicts."""
     dynamics = crane.Dynamics(machine)
-    inertial = Inertial(result.machine)
+    inertial = Inertial(result.described)
     bodies = result.parameters[: 10 * len(result.model.bodies)]
 
     def forces(q, v, a):
@@ -89,7 +87,7 @@ def random_states(machine, count=40):
 
 
 def test_the_written_machine_is_the_identified_one(mini, found, tmp_path):
-    file = write_identified(found, tmp_path / "out")
+    file = found.write_machine(tmp_path / "out")
     assert file == tmp_path / "out" / "mini_forwarder.yaml"
     assert len(list(file.parent.iterdir())) == 6
     written = crane.load(file)
@@ -99,11 +97,15 @@ def test_the_written_machine_is_the_identified_one(mini, found, tmp_path):
     told = dict(zip(found.names, found.values.tolist(), strict=True))
     assert len(noted) > 3 and {float(value) for _, value, _ in noted} <= set(told.values())
     assert written.tasks == mini.tasks and written.end_stops == mini.end_stops
+    assert written.friction["X2"].drives  # as described, of which nothing is told either
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        crane.load(file)
     assert abs(written.model.inertias[1].mass - mini.model.inertias[1].mass) > 1e-6
 
 
 def test_only_inertials_change_in_a_urdf(mini, found, tmp_path):
-    write_identified(found, tmp_path)
+    found.write_machine(tmp_path)
     for chain in mini.chains:
         before, after = (
             etree.parse(str(file)).getroot() for file in (chain.urdf, tmp_path / chain.urdf.name)
@@ -160,9 +162,9 @@ def test_one_urdf_with_a_loop_becomes_a_machine_file(tmp_path):
     given = Motion(time[:, 0], q, v, a, 1.1 * tau + 0.1 * noise)
     result = identify(arm, given, prior=0.3, feasible=True)
     with pytest.raises(OutputError) as caught:
-        write_identified(result, tmp_path / "sub" / "..")
+        result.write_machine(tmp_path / "sub" / "..")
     assert "is what 'arm' was read from" in str(caught.value)
-    written = crane.load(write_identified(result, tmp_path / "out"))
+    written = crane.load(result.write_machine(tmp_path / "out"))
     at = result.model.samples(q, v, a)
     wanted = result.model.regressor(at) @ result.parameters
     again = crane.Dynamics(written).inverse(q, v, a, friction=True)
@@ -182,7 +184,7 @@ def test_the_load_that_a_machine_names_comes_along(edited, tmp_path):
     tau = crane.Dynamics(machine).inverse(q, v, a, friction=True)
     given = Motion(time[:, 0], q, v, a, tau + 0.1 * np.random.default_rng(0).normal(size=q.shape))
     result = identify(machine, given, prior=0.3, feasible=True)
-    file = write_identified(result, tmp_path / "out")
+    file = result.write_machine(tmp_path / "out")
     assert (file.parent / "load.urdf").read_bytes() == load.read_bytes()
     written, loaded = (crane.load(file, {"payload.mass": mass}) for mass in (0.0, 3.0))
     total = [sum(inertia.mass for inertia in m.model.inertias[1:]) for m in (written, loaded)]
@@ -221,13 +223,33 @@ def test_what_cannot_be_written(mini, found, tmp_path):
         ),
     ):  # fmt: skip
         with pytest.raises(InputError) as caught:
-            write_identified(result, tmp_path / "out")
+            result.write_machine(tmp_path / "out")
         assert str(caught.value).startswith(message), str(caught.value)
         assert list(tmp_path.iterdir()) == []
 
 
+def test_a_body_that_cannot_be_asks_for_feasible_ones(mini, found, tmp_path):
+    """Nobody can correct a line of a file that is not written."""
+    bodies = found.parameters.copy()
+    bodies[4:10] = [-1.0, 0.0, 1.0, 0.0, 0.0, 1.0]
+    parted = dataclasses.replace(found, parameters=bodies, feasible=False)
+    with pytest.raises(InputError) as caught:
+        parted.write_machine(tmp_path / "out")
+    link = found.model.bodies[0]
+    assert re.fullmatch(
+        f"the identified machine cannot be: link '{link}' has the negative principal moment of "
+        r"inertia -\S+ kg m2, give feasible=True",
+        str(caught.value),
+    )
+    with pytest.warns(CraneWarning, match="no machine files are written: .*") as told:
+        write_identification(tmp_path / "folder", parted)
+    assert str(told[0].message) == (
+        f"no machine files are written: {caught.value} (on the command line --feasible)"
+    )
+
+
 def test_the_parameters_as_a_table(found, tmp_path):
-    write_parameters(found, tmp_path / "p.csv")
+    found.to_csv(tmp_path / "p.csv")
     with (tmp_path / "p.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["parameter"] for row in rows] == list(found.names)
@@ -240,7 +262,9 @@ def test_the_parameters_as_a_table(found, tmp_path):
 
 
 def test_a_report_is_one_file_that_says_everything(mini, found, tmp_path):
-    path = write_report(found, tmp_path / "report.html", "train <1>.csv", "judge.csv")
+    path = crane.identification_report(
+        found, tmp_path / "report.html", "train <1>.csv", "judge.csv"
+    )
     text = path.read_text(encoding="utf-8")
     assert len(text) < 3e6
     bare = re.sub(r'src="data:image/png;base64,[^"]*"', "", text)
@@ -258,7 +282,7 @@ def test_a_report_is_one_file_that_says_everything(mini, found, tmp_path):
     unobservable = " ".join(tree.xpath("//h2[.='Not told']/following-sibling::p")[0].itertext())
     assert all(name in unobservable for name in found.base.unobservable)
     with pytest.raises(OutputError):
-        write_report(found, tmp_path / "report.pdf")
+        crane.identification_report(found, tmp_path / "report.pdf")
 
 
 # --- payload ---------------------------------------------------------------------------------
@@ -467,12 +491,12 @@ def test_a_locked_machine_is_written_with_all_its_joints(mini, tmp_path):
     noise = np.random.default_rng(0).normal(size=tau.shape) * NOISE[:2]
     given = Motion(time[:, 0], q, v, a, tau + noise)
     result = identify(locked, given, feasible=True)
-    file = write_identified(result, tmp_path / "out")
+    file = result.write_machine(tmp_path / "out")
     written = crane.load(file)
     assert written.joints == mini.joints and written.active == mini.active
     assert written.friction["X2"] == mini.friction["X2"]
     assert all(inertia.mass > 0 for inertia in written.model.inertias[1:])
-    again = crane.load(file, lock={"X2": 0.012})
+    again = crane.load(file, lock=result.described.locks)
     found = crane.Dynamics(again).inverse(q, v, a, friction=True)
     wanted = result.model.regressor(result.model.samples(q, v, a)) @ result.parameters
     assert np.abs(found - wanted).max() < 1e-9 * np.abs(wanted).max()

@@ -265,7 +265,7 @@ KEYS = [
     case(
         "friction without value",
         "four_bar.yaml:21: friction of 'coupler' is empty, its keys are coulomb, "
-        "coulomb_offset, viscous, viscous_offset, smoothing, stiction, stribeck",
+        "coulomb_offset, viscous, viscous_offset, smoothing, stiction, stribeck, drives",
         swap("{viscous: 0.01}", ""),
     ),
     case(

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from crane.common.errors import OutputError, RecordingError
+from crane.common.errors import InputError, OutputError, RecordingError
 from crane.recordings.recording import Recording
 
 
@@ -68,6 +68,50 @@ def test_round_trip(tmp_path):
     recording = make()
     recording.to_csv(tmp_path / "run.csv")
     assert_equal(Recording.from_csv(tmp_path / "run.csv"), recording)
+
+
+def test_noise_is_as_large_as_asked_for_and_leaves_nothing_exact():
+    time = np.arange(0.0, 40.0, 0.01)
+    q = np.column_stack([np.sin(time), 0.02 * np.cos(time)])
+    v = np.column_stack([np.cos(time), -0.02 * np.sin(time)])
+    channels = {"q2": time, "q2_velocity": 1 + 0 * time, "X_acceleration": -q[:, 1]}
+    exact = Recording(
+        time, ("q1", "X"), q, v, 30 * v, {"q1": "rad", "X": "m"}, channels,
+        {"q2": "rad", "q2_velocity": "rad/s", "X_acceleration": "m/s2"}, free=(),
+    )  # fmt: skip
+    asked = {"X": 1e-5, "X_force": 0.05, "q1": 1e-4, "q2": 1e-3}
+    noisy = exact.with_noise(asked, seed=3)
+    off = {name: x - exact.columns()[name] for name, x in noisy.columns().items()}
+    names = ["X", "X_force", "q1", "q2"]
+    for name in names:  # of 4000 normal numbers: 5 deviations of their mean and size
+        assert abs(off[name].std() / asked[name] - 1) < 5 / np.sqrt(8000)
+        assert abs(off[name].mean() / asked[name]) < 5 / np.sqrt(4000)
+    alike = np.corrcoef([off[name] for name in names]) - np.eye(4)
+    assert np.abs(alike).max() < 5 / np.sqrt(4000)
+    assert not off["time"].any() and not off["q1_force"].any()
+    np.testing.assert_array_equal(noisy.v, np.gradient(noisy.q, time, axis=0))
+    assert list(noisy.channels) == ["q2"]
+    back = dict(reversed(asked.items()))
+    np.testing.assert_array_equal(noisy.q, exact.with_noise(back, seed=3).q)
+    assert not np.array_equal(noisy.q, exact.with_noise(asked, seed=4).q)
+    measured = exact.with_noise({"X_velocity": 1e-3, "q2_velocity": 0.0})
+    assert 9e-4 < (measured.v - exact.v)[:, 1].std() < 1.1e-3
+    assert list(measured.channels) == ["q2", "q2_velocity"]
+
+
+@pytest.mark.parametrize(
+    ("deviations", "message"),
+    [
+        ({"X2": 1.0}, "noise of the column 'X2', "),
+        ({"time": 1.0}, "noise of the column 'time', "),
+        ({"q1": -1.0}, "the noise of 'q1' is -1, it must not be negative"),
+    ],
+)
+def test_noise_that_cannot_be(deviations, message):
+    one = Recording([0.0], ("q1",), [[0.0]], [[0.0]], [[0.0]], {"q1": "rad"})
+    with pytest.raises(InputError) as caught:
+        one.with_noise(deviations)
+    assert str(caught.value).startswith(message)
 
 
 def test_one_sample_without_channels_or_notes(tmp_path):

@@ -411,12 +411,11 @@ def write_identification(
     Raises:
         OutputError: The folder or a file cannot be written.
     """
-    from crane.identification.mechanics.write import write_parameters
-    from crane.view.page.identification import write_report
+    from crane.view.page.identification import identification_report
 
-    with staging(folder, force, _machine_files(folder, result.machine)) as part:
-        write_report(result, part / REPORT, recording, validation)
-        write_parameters(result, part / "parameters.csv")
+    with staging(folder, force, _machine_files(folder, result.described)) as part:
+        identification_report(result, part / REPORT, recording, validation)
+        result.to_csv(part / "parameters.csv")
         if result.parameters is not None:
             _write_machine(result, part / MACHINE)
 
@@ -433,12 +432,10 @@ def _machine_files(folder: Path, read: Machine) -> Sequence[str]:
 
 
 def _write_machine(result: "Identification", folder: Path) -> None:
-    from crane.identification.mechanics.write import write_identified
-
     try:
-        write_identified(result, folder)
+        result.write_machine(folder)
     except InputError as error:
-        hint = "" if result.feasible else " (on the command line --feasible)"
+        hint = " (on the command line --feasible)" if str(error).endswith("feasible=True") else ""
         text = f"no machine files are written: {error}{hint}"
         warnings.warn(text, CraneWarning, stacklevel=3)
 

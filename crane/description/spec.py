@@ -192,6 +192,11 @@ class Friction:
         return self.coulomb + self.stiction
 
     @property
+    def drives(self) -> bool:
+        """Whether it drives the joint in one direction: an offset is larger than its mean."""
+        return abs(self.coulomb_offset) > self.coulomb or abs(self.viscous_offset) > self.viscous
+
+    @property
     def sticks(self) -> bool:
         """Whether it holds a joint at rest."""
         return self.smoothing == 0 and self.breakaway > 0

@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from crane.common import scratch
-from crane.common.errors import RecordingError, at, known
-from crane.common.samples import Array
+from crane.common.errors import InputError, RecordingError, at, known
+from crane.common.samples import Array, as_number, as_seed
 from crane.common.shown import Brief, counted
 from crane.description.sensors import FORCE as FORCE
 from crane.description.sensors import FORCE_UNITS as FORCE_UNITS
@@ -41,6 +41,7 @@ from crane.recordings.timeseries import TIME, Table, check_unit
 
 SENSORS, IDEAL = "sensors", "ideal"  # a note of quantities themselves
 FREE = "free"  # a note of joints that nothing drives
+_ACCELERATION = "_acceleration"
 _LISTED = 40  # names in a message
 
 
@@ -215,6 +216,48 @@ class Recording(Brief):
             self, time=self.time[kept], q=self.q[kept], v=self.v[kept], tau=self.tau[kept],
             channels={name: values[kept] for name, values in self.channels.items()},
         )  # fmt: skip
+
+    def with_noise(self, deviations: Mapping[str, float], seed: int = 0) -> "Recording":
+        """What sensors with white, normally distributed noise would have read.
+
+        Velocities and accelerations are not kept: they would tell the motion without noise.
+        Velocities of joints are derivatives of the noisy coordinates instead, unless they have a
+        deviation, too.
+
+        Args:
+            deviations: Standard deviations by column, as {"X1": 1e-6, "X1_force": 0.05}, in the
+                units of `columns`; others stay as they are.
+            seed: Of the random numbers.
+
+        Raises:
+            InputError: There is no such column, or a deviation is no number or negative.
+        """
+        columns, rng = self.columns(), np.random.default_rng(as_seed(seed))
+        del columns[TIME]
+        for name, deviation in deviations.items():
+            if name not in columns:
+                raise InputError(f"noise of the column '{name}', {known(columns, name)}")
+            if as_number(deviation, f"the noise of '{name}'", "") < 0:
+                raise InputError(
+                    f"the noise of '{name}' is {deviation:g}, it must not be negative"
+                )
+        for name in [name for name in columns if name in deviations]:  # whatever order is given
+            columns[name] = columns[name] + deviations[name] * rng.normal(size=len(self.time))
+        for joint in self.joints:
+            if joint + VELOCITY not in deviations:
+                columns[joint + VELOCITY] = derivative(columns[joint], self.time)
+        none = np.zeros_like(self.time)
+        q, v, tau = (
+            np.column_stack([columns.get(x + suffix, none) for x in self.joints])
+            for suffix in ("", VELOCITY, FORCE)
+        )
+        channels = {
+            name: columns[name]
+            for name in self.channels
+            if name in deviations or not name.endswith((VELOCITY, _ACCELERATION))
+        }
+        units = {name: self.channel_units[name] for name in channels}
+        return replace(self, q=q, v=v, tau=tau, channels=channels, channel_units=units)
 
     def to_csv(self, path: str | Path) -> None:
         """Write the recording as CSV, whole or not at all.

@@ -14,7 +14,7 @@ def read_friction(top: Section, tree: TreeBuilder) -> dict[str, Friction]:
     found: dict[str, Friction] = {}
     keys = (
         "coulomb", "coulomb_offset", "viscous", "viscous_offset", "smoothing", "stiction",
-        "stribeck",
+        "stribeck", "drives",
     )  # fmt: skip
     for joint, item in top.mappings("friction", "friction of", *keys):
         with recoverable():
@@ -36,13 +36,16 @@ def _friction(joint: str, item: Section) -> Friction:
         stiction=item.number("stiction", 0.0, minimum=0.0),
         stribeck=stribeck,
     )
+    meant = item.raw("drives") if "drives" in item else False
+    if not isinstance(meant, bool):
+        raise item.fail("drives", f"'drives' of friction of '{joint}' is neither true nor false")
     for kind in ("coulomb", "viscous"):
         mean, offset = getattr(friction, kind), getattr(friction, f"{kind}_offset")
-        if abs(offset) > mean and not item.is_bundled:
+        if abs(offset) > mean and not meant:
             warnings.warn(
                 f"{item.where()}: friction of '{joint}' drives the joint in one direction "
                 f"(|{kind}_offset| {abs(offset):g} > {kind} {mean:g}), a constant force may hide "
-                "in it",
+                "in it; write drives: true if it is meant",
                 CraneWarning,
                 stacklevel=3,
             )

@@ -210,11 +210,6 @@ class Section:
         found: dict[str, Any] = _plain(self._data)
         return found
 
-    @property
-    def is_bundled(self) -> bool:
-        """Whether it is of a machine that comes with the package, whose file says what is odd."""
-        return self._place[0] in bundled().values()
-
     def only(self, *keys: str) -> None:
         """Raise for any other key.
 

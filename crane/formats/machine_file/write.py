@@ -13,7 +13,7 @@ from crane.common.errors import CraneError, CraneWarning, InputError, OutputErro
 from crane.common.output import file_name, staging
 from crane.description.phases import Phase
 from crane.description.sensors import unit_of
-from crane.description.spec import Task, Via
+from crane.description.spec import Friction, Task, Via
 from crane.formats.machine_file.circuit import MOTOR
 from crane.formats.machine_file.curves import curve_data
 from crane.formats.machine_file.estimation import estimation_data
@@ -241,9 +241,7 @@ def _content(machine: Machine) -> dict[str, Any]:
     data["active"] = _driven(machine)
     data["free"] = list(machine.free)
     data["home"] = dict(zip(machine.joints, machine.home.tolist(), strict=True))
-    data["friction"] = {
-        joint: _numbers(law) or {"viscous": 0.0} for joint, law in machine.friction.items()
-    }
+    data["friction"] = {joint: friction_data(law) for joint, law in machine.friction.items()}
     data["forces"] = [_numbers(item) for item in machine.forces]
     data["gas_springs"] = {item.joint: _numbers(item, "joint") for item in machine.gas_springs}
     data["ropes"] = [_numbers(item) for item in machine.ropes]
@@ -281,6 +279,11 @@ def _numbers(item: Any, *without: str) -> dict[str, Any]:
         for field in dataclasses.fields(item)
         if field.name not in without and getattr(item, field.name) != field.default
     }
+
+
+def friction_data(law: Friction) -> dict[str, Any]:
+    """What a machine file says of friction; that it drives was told where it comes from."""
+    return (_numbers(law) or {"viscous": 0.0}) | ({"drives": True} if law.drives else {})
 
 
 def _task(task: Task) -> dict[str, Any]:

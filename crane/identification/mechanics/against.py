@@ -13,7 +13,7 @@ import numpy as np
 from crane.common.errors import CraneWarning
 from crane.common.samples import Array
 from crane.identification.mechanics.checks import delay, doubt, shifted
-from crane.identification.mechanics.result import ForceComparison
+from crane.identification.mechanics.comparison import ForceComparison
 from crane.identification.signals.motion import Motion, sampling
 from crane.recordings.recording import Recording
 

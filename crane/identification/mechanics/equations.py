@@ -11,8 +11,8 @@ from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.identification.estimation.regressor import add_rows, triangular
 from crane.identification.mechanics.base import Base
+from crane.identification.mechanics.comparison import ForceComparison
 from crane.identification.mechanics.model import Model
-from crane.identification.mechanics.result import ForceComparison
 from crane.identification.mechanics.term import Samples
 from crane.identification.mechanics.undriven import related
 from crane.identification.signals.motion import Motion, filter_kernel, filter_rows, moving

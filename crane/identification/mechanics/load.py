@@ -9,9 +9,9 @@ from crane.common.samples import Array
 from crane.common.shown import Brief
 from crane.common.tables import aligned
 from crane.dynamics import Dynamics
+from crane.identification.mechanics.comparison import ForceComparison
 from crane.identification.mechanics.feasible import body_parameters, pseudo_inertia
 from crane.identification.mechanics.inertias import PER_BODY, inertial_columns
-from crane.identification.mechanics.result import ForceComparison
 from crane.identification.mechanics.term import Samples
 from crane.machine import Machine
 

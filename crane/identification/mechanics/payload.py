@@ -17,13 +17,13 @@ from crane.identification.estimation.regressor import triangular
 from crane.identification.mechanics.against import check_forces
 from crane.identification.mechanics.base import Base
 from crane.identification.mechanics.checks import doubt
+from crane.identification.mechanics.comparison import ForceComparison
 from crane.identification.mechanics.equations import Equations, Progress
 from crane.identification.mechanics.friction import friction
 from crane.identification.mechanics.identify import METHODS, equations_of, in_parts
 from crane.identification.mechanics.load import Load, PayloadEstimate
 from crane.identification.mechanics.model import Model
 from crane.identification.mechanics.reading import smoothed_motion
-from crane.identification.mechanics.result import ForceComparison
 from crane.identification.mechanics.statics import (
     LEAST_BAND,
     slowed,

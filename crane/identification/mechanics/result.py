@@ -1,74 +1,28 @@
 """What an identification found, and how well it predicts."""
 
+import csv
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from crane.common.output import replacing
 from crane.common.samples import Array
 from crane.common.shown import Brief
 from crane.common.tables import aligned
 from crane.identification.estimation.estimators import Estimate
 from crane.identification.mechanics.base import Base
+from crane.identification.mechanics.comparison import ForceComparison
 from crane.identification.mechanics.determined import weak_directions
 from crane.identification.mechanics.model import Model
 from crane.machine import Machine
 
 _IMPOSSIBLE = 10.0  # times its magnitude, what a parameter cannot be
 _SHOWN = 3  # directions that a table names
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class ForceComparison(Brief):
-    """Measured and modelled forces of one recording, both through the same filter.
-
-    Attributes:
-        time: (M,) [s].
-        measured: (M, n) [N], [N m].
-        modelled: (M, n).
-        moving: (M, n) which rows count: those away from zero velocity.
-        joints: Names (n,).
-    """
-
-    time: Array
-    measured: Array
-    modelled: Array
-    moving: np.ndarray
-    joints: tuple[str, ...]
-
-    @property
-    def residuals(self) -> Array:
-        """(M, n) measured less modelled."""
-        return self.measured - self.modelled
-
-    def _rms(self, values: Array) -> Array:
-        count = np.maximum(self.moving.sum(axis=0), 1)
-        return np.sqrt((np.where(self.moving, values, 0.0) ** 2).sum(axis=0) / count)
-
-    @property
-    def rmse(self) -> Array:
-        """(n,) root mean square of the residuals [N], [N m]."""
-        return self._rms(self.residuals)
-
-    @property
-    def relative(self) -> Array:
-        """(n,) the same over the root mean square of the measured force, nan of a free joint."""
-        size = self._rms(self.measured)
-        return np.divide(self.rmse, size, out=np.full_like(size, np.nan), where=size > 0)
-
-    @property
-    def percentage_error(self) -> Array:
-        """(n,) equation (9) of the reduced-scale forwarder paper [%]: 100 relative^2."""
-        return 100 * self.relative**2
-
-    @property
-    def stacked(self) -> float:
-        """Norm of all residuals over that of all measured forces, nan where these are zero."""
-        left, size = (np.linalg.norm(x[self.moving]) for x in (self.residuals, self.measured))
-        return float(left / size) if size else math.nan
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -122,7 +76,7 @@ class Identification(Brief):
             if fit is not None and not math.isnan(fit.stacked)
         )
         return (
-            f"Identification of '{self.machine.name}': {len(self.values)} base parameters, "
+            f"Identification of '{self.described.name}': {len(self.values)} base parameters, "
             f"{kind}{self.method}{''.join(told)}"
         )
 
@@ -164,10 +118,10 @@ class Identification(Brief):
 
     @property
     def remedy(self) -> str:
-        """What would determine more."""
+        """What would determine more; a motion last, as this one may be the best there is."""
         if self.parameters is not None:
-            return f"{self.advice}, or leave such terms out"
-        return f"{self.advice}, or give a prior, or ask for feasible bodies"
+            return f"leave such terms out, or {self.advice}"
+        return f"give a prior, ask for feasible bodies, or {self.advice}"
 
     @property
     def doubt(self) -> str:
@@ -214,14 +168,14 @@ class Identification(Brief):
         return W @ self.values + self.model.known(at)
 
     @property
-    def machine(self) -> Machine:
-        """As it was described; `crane identify` writes it as it was identified."""
+    def described(self) -> Machine:
+        """The machine as it was described; as identified it is what `write_machine` writes."""
         return self.model.machine
 
     def to_text(self) -> str:
         """Tables of the fit and of the parameters."""
         lines = [
-            f"{self.machine.name}: {self.base.rank} base parameters of {len(self.base.names)}, "
+            f"{self.described.name}: {self.base.rank} base parameters of {len(self.base.names)}, "
             f"{self.method}{', feasible' if self.feasible else ''}; condition number "
             f"{self.estimate.condition:.3g}, columns scaled {self.estimate.scaled_condition:.3g}",
             "",
@@ -231,9 +185,9 @@ class Identification(Brief):
                 continue
             rows = [["force", "RMS error", "", "relative", "PE (9)"]]
             for i, joint in enumerate(fit.joints):
-                unit = "N" if self.machine.unit(joint) == "m" else "N m"
+                unit = "N" if self.described.unit(joint) == "m" else "N m"
                 shares = [f"{100 * fit.relative[i]:.2f} %", f"{fit.percentage_error[i]:.3f} %"]
-                if joint in self.machine.free:
+                if joint in self.described.free:
                     shares = ["free", ""]
                 told = [joint, f"{fit.rmse[i]:.4g}", unit, *shares]
                 rows.append(told if fit.moving[:, i].any() else [joint, "-", "", "-", "-"])
@@ -256,3 +210,52 @@ class Identification(Brief):
                 lines.append(f"  and {more} more directions")
             lines.append(self.remedy)
         return "\n".join(lines) + "\n"
+
+    def to_csv(self, path: str | Path) -> None:
+        """Write the base parameters: value, deviation, 95 % interval, description, mark, group.
+
+        Raises:
+            OutputError: It cannot be written there.
+        """
+        columns = [self.values, self.std, *self.interval().T, self.nominal]
+        with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as file:
+            table = csv.writer(file, lineterminator="\n")
+            table.writerow(
+                ["parameter", "value", "std", "lower", "upper", "description", "mark", "group"]
+            )
+            for name, numbers, mark, words in zip(
+                self.names, np.column_stack(columns).tolist(), self.marks, self.base.groups,
+                strict=True,
+            ):  # fmt: skip
+                table.writerow([name, *map(repr, numbers), mark, words])
+
+    def write_machine(self, folder: str | Path) -> Path:
+        """Write the identified machine: a machine file with a URDF per sub-chain beside it.
+
+        `crane.load` gives it from there, with what was locked as all else:
+        `crane.load(found.write_machine("identified"), lock=found.described.locks)`.
+
+        Each body's parameters stand in the link that its joint moves, and the inertials of links
+        fixed to it are removed. Friction, rotor inertias and pressures of gas are the identified
+        ones, other passive forces the machine's. Friction that a machine file has no law for is
+        written as the nearest law at steady speeds, with a warning that says how near. A motor
+        that turns with several joints becomes a rotor that a coupling turns. What locked joints
+        made one body is divided among its links as they are described. Everything else is as in
+        the files that the machine was read from; what they draw is found where it is. The written
+        files are loaded, and compared where the machine was locked, before they are put in place.
+
+        Args:
+            folder: Created where there is none; files of the same names are replaced.
+
+        Returns:
+            The machine file.
+
+        Raises:
+            InputError: The identified machine cannot be, forces alone determined no more than base
+                parameters, the machine comes from another format or is not as its files describe
+                it, or a machine file cannot hold the model's terms.
+            OutputError: The folder cannot be written, or holds what the machine was read from.
+        """
+        from crane.identification.mechanics.write import write_identified
+
+        return write_identified(self, folder)

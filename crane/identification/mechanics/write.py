@@ -1,83 +1,48 @@
 """An identified machine as files: its URDFs and its machine file with other numbers."""
 
-import csv
 import dataclasses
 import shutil
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pinocchio as pin
 from lxml import etree
 
 from crane.common.errors import CraneError, CraneWarning, InputError, OutputError
-from crane.common.output import replacing, staging
+from crane.common.output import staging
+from crane.common.samples import Array
 from crane.description import Chain, Friction, MachineSpec, locked
+from crane.description.inertia import inertia_problem
 from crane.dynamics import Dynamics
 from crane.formats import load, read
 from crane.formats.machine_file.read import plain_data
 from crane.formats.machine_file.text import Way, yaml_text
+from crane.formats.machine_file.write import friction_data
 from crane.formats.parallel_robots import is_parallel_robot
 from crane.identification.mechanics.base import random_samples
 from crane.identification.mechanics.division import divided
 from crane.identification.mechanics.inertias import PER_BODY
 from crane.identification.mechanics.laws import Frictional, Written, laws
 from crane.identification.mechanics.motors import combinations, motor_chain
-from crane.identification.mechanics.result import Identification
 from crane.identification.mechanics.urdf import changed_urdf
 from crane.machine import Machine
+
+if TYPE_CHECKING:
+    from crane.identification.mechanics.result import Identification
 
 _SAME = 1e-9  # of the largest force, by which the written machine may differ
 _FRICTION = tuple(item.name for item in dataclasses.fields(Friction))
 
 
-def write_parameters(result: Identification, path: str | Path) -> None:
-    """Write the base parameters as CSV: value, deviation, 95 % interval, description, mark.
+def write_identified(result: "Identification", folder: str | Path) -> Path:
+    """What `Identification.write_machine` does, see there.
 
-    Raises:
-        OutputError: It cannot be written there.
+    See `laws.laws` for the nearest friction, `division.divided` for what locks made one body.
     """
-    columns = [result.values, result.std, *result.interval().T, result.nominal]
-    with replacing(path) as part, part.open("w", encoding="utf-8", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(
-            ["parameter", "value", "std", "lower", "upper", "description", "mark", "group"]
-        )
-        for name, numbers, mark, words in zip(
-            result.names, np.column_stack(columns).tolist(), result.marks, result.base.groups,
-            strict=True,
-        ):  # fmt: skip
-            table.writerow([name, *map(repr, numbers), mark, words])
-
-
-def write_identified(result: Identification, folder: str | Path) -> Path:
-    """Write the identified machine: a URDF per sub-chain and a machine file beside them.
-
-    Each body's parameters stand in the link that its joint moves, and the inertials of links
-    fixed to it are removed. Friction, rotor inertias and pressures of gas are the identified ones,
-    other passive forces the machine's. Friction that a machine file has no law for is written as
-    the nearest law at steady speeds, with a warning that says how near, see `laws.laws`. A motor
-    that turns with several joints becomes a rotor that a coupling turns.
-    What locked joints made one body is divided among its links as they are described, see
-    `division.divided`. Everything else is as in the files that the machine was read from; what
-    they draw is found where it is. The written files are loaded, and compared where the machine
-    was locked, before they are put in place.
-
-    Args:
-        result: With `parameters`, so of a prior or a feasible estimate.
-        folder: Created where there is none; files of the same names are replaced.
-
-    Returns:
-        The machine file.
-
-    Raises:
-        InputError: The machine comes from another format, there are no parameters, the machine is
-            not as its files describe it, or a machine file cannot hold the model's terms.
-        CraneError: The parameters belong to no possible machine.
-        OutputError: The folder cannot be written, or holds the files that the machine came from.
-    """
-    machine, parameters = result.machine, result.parameters
+    machine, parameters = result.described, result.parameters
     check_rewritable(machine)
     if parameters is None or not result.model.bodies:
         raise InputError("forces determine base parameters only: give prior or feasible=True")
@@ -110,7 +75,7 @@ def write_identified(result: Identification, folder: str | Path) -> Path:
         for name, text in more.items():
             (part / name).write_text(text, encoding="utf-8")
         (part / file).write_text(content, encoding="utf-8")
-        _check(result, part / file, exact=not any(each.off for each in written.values()))
+        _check(result, bodies, part / file, exact=not any(each.off for each in written.values()))
     _tell(machine, written)
     return Path(folder) / file
 
@@ -134,6 +99,17 @@ def check_rewritable(machine: Machine) -> None:
             f"'{machine.name}' was loaded with changed numbers, identify it as its files "
             "describe it"
         )
+
+
+def _impossible(bodies: Mapping[str, Array]) -> str | None:
+    """The first of the bodies that cannot exist, and why."""
+    for link, body in bodies.items():
+        if body[0] < 0:
+            return f"link '{link}' has the negative mass {body[0]:.4g} kg"
+        inertia = pin.Inertia.FromDynamicParameters(body)
+        if problem := inertia_problem(float(inertia.mass), inertia.inertia):
+            return f"link '{link}' has {problem.rpartition(', ')[0]}"  # without what to do
+    return None
 
 
 def _names(spec: MachineSpec) -> dict[str, str]:
@@ -164,14 +140,14 @@ def _carried(spec: MachineSpec) -> set[str]:
 
 
 def _content(
-    result: Identification,
+    result: "Identification",
     spec: MachineSpec,
     names: Mapping[str, str],
     how: str,
     written: Mapping[str, Written],
 ) -> tuple[str, dict[str, str]]:
     """The machine file, and the URDFs of motors that turn with several joints, by name."""
-    machine = result.machine
+    machine = result.described
     data: dict[str, Any]
     if machine.path.suffix.lower() == ".urdf":
         data = {"name": machine.name, "chains": [{"name": spec.chains[0].name}]}
@@ -220,7 +196,7 @@ def _content(
     return yaml_text(data, _notes(result, data)), more
 
 
-def _notes(result: Identification, data: Mapping[str, Any]) -> dict[Way, str]:
+def _notes(result: "Identification", data: Mapping[str, Any]) -> dict[Way, str]:
     """How well friction and rotor inertias are known that the recording tells by themselves."""
     found: dict[Way, str] = {}
     half = 0.5 * np.diff(result.interval(), axis=1)[:, 0]
@@ -236,7 +212,7 @@ def _notes(result: Identification, data: Mapping[str, Any]) -> dict[Way, str]:
     return found
 
 
-def _values(result: Identification, kind: str) -> dict[str, float]:
+def _values(result: "Identification", kind: str) -> dict[str, float]:
     """Identified parameters of a kind by what they are of."""
     assert result.parameters is not None
     named = zip(result.model.names, result.parameters.tolist(), strict=True)
@@ -245,7 +221,7 @@ def _values(result: Identification, kind: str) -> dict[str, float]:
     }
 
 
-def _rotors(result: Identification, spec: MachineSpec) -> dict[str, float]:
+def _rotors(result: "Identification", spec: MachineSpec) -> dict[str, float]:
     """Rotor inertia by joint, the described one where none was identified."""
     described = {joint.name: joint.rotor_inertia for joint in spec.tree.moving}
     found = described | _values(result, "rotor_inertia")
@@ -256,16 +232,16 @@ def _rotors(result: Identification, spec: MachineSpec) -> dict[str, float]:
 
 
 def _friction(
-    result: Identification, spec: MachineSpec, written: Mapping[str, Written]
-) -> dict[str, dict[str, float]]:
+    result: "Identification", spec: MachineSpec, written: Mapping[str, Written]
+) -> dict[str, dict[str, Any]]:
     """Friction by joint; one that the model gives none has none, whatever its files say."""
-    machine = result.machine
+    machine = result.described
     friction = {
-        joint: _numbers(spec.friction[joint]) for joint in spec.friction if joint in machine.locks
+        joint: friction_data(law) for joint, law in spec.friction.items() if joint in machine.locks
     }
     for joint in (*machine.joints, *(x.name for x in combinations(result.model))):
         if joint in written:
-            friction[joint] = _numbers(written[joint].law) or {"viscous": 0.0}
+            friction[joint] = friction_data(written[joint].law)
         elif joint in spec.friction:
             friction[joint] = {"viscous": 0.0}
     return friction
@@ -282,7 +258,7 @@ def _tell(machine: Machine, written: Mapping[str, Written]) -> None:
             f"nearest law at steady speeds is written, off by at most {off[worst]:.3g} {unit} "
             f"({worst})"
         )
-        warnings.warn(text, CraneWarning, stacklevel=3)
+        warnings.warn(text, CraneWarning, stacklevel=4)
 
 
 def _numbers(item: Any, **changed: Any) -> dict[str, Any]:
@@ -296,21 +272,24 @@ def _numbers(item: Any, **changed: Any) -> dict[str, Any]:
     return {key: value for key, value in values.items() if value != defaults[key]}
 
 
-def _check(result: Identification, file: Path, exact: bool) -> None:
+def _check(result: "Identification", bodies: Mapping[str, Array], file: Path, exact: bool) -> None:
     """Load what was written and compare its forces with those of the parameters.
 
     Args:
         result: See above.
+        bodies: Parameters (10,) by link.
         file: The machine file.
         exact: Whether friction is the identified one; where it is not, all else is compared.
     """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CraneWarning)
-            written = load(file, lock=dict(result.machine.locks))
+            written = load(file, lock=dict(result.described.locks))
     except CraneError as error:
-        hint = "" if result.feasible else ", give feasible=True"
-        raise InputError(f"the identified machine cannot be: {error}{hint}") from None
+        # a body is no slip in a file, which is not there yet: not to be corrected by hand
+        body = None if result.feasible else _impossible(bodies)
+        why = f"{body}, give feasible=True" if body else error
+        raise InputError(f"the identified machine cannot be: {why}") from None
     model, parameters = result.model, result.parameters
     assert parameters is not None
     at = random_samples(model, 20)

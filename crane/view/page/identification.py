@@ -22,7 +22,7 @@ _CORRELATED = 0.9
 _VALIDATION = "#2a9d6f"
 
 
-def write_report(
+def identification_report(
     result: Identification, path: str | Path, recording: str = "", validation: str = ""
 ) -> Path:
     """Write what an identification found as one HTML file that needs no network.
@@ -52,11 +52,11 @@ def write_report(
             "<h2>Correlations</h2>", _correlations(result),
             "<h2>Not told</h2>", _unobservable(result),
         ]  # fmt: skip
-    return write_document(path, title(result.machine.name, "identification"), parts)
+    return write_document(path, title(result.described.name, "identification"), parts)
 
 
 def _summary(result: Identification, recording: str, validation: str) -> str:
-    machine, fit = result.machine, result.training
+    machine, fit = result.described, result.training
     how = {"ols": "ordinary least squares", "wls": "least squares weighted by each joint's noise"}
     how["huber"] = "robust (Huber)"
     method = how.get(result.method, result.method)
@@ -100,7 +100,7 @@ def _stacked(result: Identification) -> str:
 
 
 def _unit(result: Identification, joint: str) -> str:
-    return FORCE_UNITS[result.machine.unit(joint)]
+    return FORCE_UNITS[result.described.unit(joint)]
 
 
 def _fit(result: Identification) -> str:
@@ -114,7 +114,7 @@ def _fit(result: Identification) -> str:
                 f"{100 * fit.relative[i]:.3g} %",
                 f"{fit.percentage_error[i]:.3g} %",
             ]
-            if joint in result.machine.free:
+            if joint in result.described.free:
                 told[1:] = "free", ""
             row += told if fit.moving[:, i].any() else ["-", "-", "-"]
         rows.append(row)

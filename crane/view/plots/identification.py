@@ -6,7 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from crane.common.samples import Array
-from crane.identification.mechanics.result import ForceComparison, Identification
+from crane.identification.mechanics.comparison import ForceComparison
+from crane.identification.mechanics.result import Identification
 from crane.recordings.recording import FORCE_UNITS
 from crane.view.plots.recording import DASHED, INK
 from crane.view.plots.text import plain
@@ -90,6 +91,6 @@ def matrix_figure(R: Array, names: Sequence[str]) -> Figure:
 def force_figures(result: Identification) -> list[Figure]:
     """Measured and modelled forces of the training, a figure per drive."""
     return [
-        time_figure(result.training, i, FORCE_UNITS[result.machine.unit(joint)], joint)
+        time_figure(result.training, i, FORCE_UNITS[result.described.unit(joint)], joint)
         for i, joint in enumerate(result.training.joints)
     ]

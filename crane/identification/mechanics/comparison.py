@@ -1,0 +1,59 @@
+"""Measured forces beside modelled ones."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from crane.common.samples import Array
+from crane.common.shown import Brief
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ForceComparison(Brief):
+    """Measured and modelled forces of one recording, both through the same filter.
+
+    Attributes:
+        time: (M,) [s].
+        measured: (M, n) [N], [N m].
+        modelled: (M, n).
+        moving: (M, n) which rows count: those away from zero velocity.
+        joints: Names (n,).
+    """
+
+    time: Array
+    measured: Array
+    modelled: Array
+    moving: np.ndarray
+    joints: tuple[str, ...]
+
+    @property
+    def residuals(self) -> Array:
+        """(M, n) measured less modelled."""
+        return self.measured - self.modelled
+
+    def _rms(self, values: Array) -> Array:
+        count = np.maximum(self.moving.sum(axis=0), 1)
+        return np.sqrt((np.where(self.moving, values, 0.0) ** 2).sum(axis=0) / count)
+
+    @property
+    def rmse(self) -> Array:
+        """(n,) root mean square of the residuals [N], [N m]."""
+        return self._rms(self.residuals)
+
+    @property
+    def relative(self) -> Array:
+        """(n,) the same over the root mean square of the measured force, nan of a free joint."""
+        size = self._rms(self.measured)
+        return np.divide(self.rmse, size, out=np.full_like(size, np.nan), where=size > 0)
+
+    @property
+    def percentage_error(self) -> Array:
+        """(n,) equation (9) of the reduced-scale forwarder paper [%]: 100 relative^2."""
+        return 100 * self.relative**2
+
+    @property
+    def stacked(self) -> float:
+        """Norm of all residuals over that of all measured forces, nan where these are zero."""
+        left, size = (np.linalg.norm(x[self.moving]) for x in (self.residuals, self.measured))
+        return float(left / size) if size else math.nan
