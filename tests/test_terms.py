@@ -301,18 +301,18 @@ def test_a_window_is_trained_on_and_the_rest_judges(tmp_path, crank):
     [
         (["--train", "0:9"], "nothing of use lies outside of --train 0:9, so nothing judges"),
         (
-            ["--train", "0:7.7"],
+            ["--train", "0:7.7", "--bandwidth", "10"],
             "1 of 1 validations are too short for a low-pass of 10 Hz and judge",
         ),
         (
-            ["--train", "0:6", "--slow", "crank=1.03"],
+            ["--train", "0:6", "--slow", "crank=1.03", "--bandwidth", "40"],  # else 4 rows
             "no validation moves faster than what counts",
         ),
     ],
 )
 def test_what_judges_nothing_is_told(tmp_path, crank, arguments, message):
     """And the machine is identified all the same; no report says that it was judged."""
-    done = typed("identify", *crank, *arguments, "--bandwidth", "10", "--prior", "0.3",
+    done = typed("identify", *crank, *arguments, "--prior", "0.3",
                  "--out", tmp_path / "out")  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert message in done.stderr and "validation, moving rows" not in done.stdout
