@@ -17,6 +17,7 @@ from crane.simulation.integration.switching import Switching
 _CHUNK = 5000  # steps between reports of progress
 _BACK, _AHEAD = 40, 20  # steps before and after a halt that are done anew with finer ones
 _FINER = (2, 8)  # how much finer
+_FEW = 100  # starts and stops within a finer step: one that needs more is no remedy
 
 
 class Steps(Switching):
@@ -118,6 +119,7 @@ class Steps(Switching):
         """See `Switching.finer`."""
         done = self.done
         back, beyond = max(0, done - _BACK), min(done + _AHEAD, len(times))
+        self._most = _FEW
         for share in _FINER:
             part = step / share
             again = times[back] + part * np.arange(share * (beyond - back))

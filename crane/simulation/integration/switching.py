@@ -49,6 +49,8 @@ class Switching:
         offset: When the state is, after the next instant without a row [s].
     """
 
+    _most = _MOST
+
     def __init__(self, chart: Chart, control: Controller, own: int, fast: Compiled | None):
         self.slow = PythonStepper(chart, control, own)
         self.done = self.reached = 0
@@ -150,11 +152,11 @@ class Switching:
         if time > self._since + step:
             self._since, self._switches = time, 0
         self._switches += 1
-        if self._switches > _MOST:
+        if self._switches > self._most:
             raise HaltedError(
                 time,
                 self.slow.here(state),
-                f" joints stick and slip more than {_MOST} times within {step:g} s",
+                f" joints stick and slip more than {self._most} times within {step:g} s",
                 ": forces that jump with the sign of a velocity fight their friction, smooth them",
             )
 
