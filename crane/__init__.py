@@ -61,6 +61,7 @@ if TYPE_CHECKING:
     from crane.identification.mechanics.identify import identify
     from crane.identification.mechanics.payload import identify_payload
     from crane.identification.mechanics.result import Identification
+    from crane.identification.mechanics.write import write_identified
     from crane.machine import Machine, Payload
     from crane.motion import (
         Kinematics,
@@ -157,6 +158,7 @@ _HOMES = {
     "crane.identification.mechanics.identify": "identify",
     "crane.identification.mechanics.payload": "identify_payload",
     "crane.identification.mechanics.result": "Identification",
+    "crane.identification.mechanics.write": "write_identified",
     "crane.machine": "Machine Payload",
     "crane.motion": "Kinematics Sway Trajectory Transmission Turning point_to_point polynomial "
     "read_path retimed task_trajectory tip_trajectory via_attitudes via_points without_sway",
@@ -193,8 +195,8 @@ __all__ = [
     "report", "retimed", "robot_description", "sensitivities", "simulate", "simulate_batch",
     "sketch", "sketch_circuit",
     "study", "sway_study", "task_trajectory", "tip_trajectory", "tool_force", "torques",
-    "via_attitudes", "via_points", "without_sway", "working_range", "workspace", "write_machine",
-    "write_mjcf", "write_urdf_plus",
+    "via_attitudes", "via_points", "without_sway", "working_range", "workspace",
+    "write_identified", "write_machine", "write_mjcf", "write_urdf_plus",
 ]  # fmt: skip
 
 

@@ -623,7 +623,7 @@ def test_identified_machines_keep_them(tmp_path):
     terms = [*default_terms(locked), GasScale(locked, "strut")]
     result = identify(locked, Motion(time[:, 0], q, v, a, tau), terms=terms, feasible=True)
     scale = result.parameters[result.model.names.index("strut.gas_scale")]
-    written = crane.load(result.write_machine(tmp_path / "out"))
+    written = crane.load(crane.write_identified(result, tmp_path / "out"))
     assert written.ropes == machine.ropes and written.forces == machine.forces
     (gas,) = written.gas_springs
     assert gas.pressure == pytest.approx(3e5 * scale) and gas.between == STRUT

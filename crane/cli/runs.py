@@ -432,8 +432,10 @@ def _machine_files(folder: Path, read: Machine) -> Sequence[str]:
 
 
 def _write_machine(result: "Identification", folder: Path) -> None:
+    from crane.identification.mechanics.write import write_identified
+
     try:
-        result.write_machine(folder)
+        write_identified(result, folder)
     except InputError as error:
         hint = " (on the command line --feasible)" if str(error).endswith("feasible=True") else ""
         text = f"no machine files are written: {error}{hint}"

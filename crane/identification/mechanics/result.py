@@ -169,7 +169,7 @@ class Identification(Brief):
 
     @property
     def described(self) -> Machine:
-        """The machine as it was described; as identified it is what `write_machine` writes."""
+        """The machine as it was described; as identified it is what `write_identified` writes."""
         return self.model.machine
 
     def to_text(self) -> str:
@@ -228,34 +228,3 @@ class Identification(Brief):
                 strict=True,
             ):  # fmt: skip
                 table.writerow([name, *map(repr, numbers), mark, words])
-
-    def write_machine(self, folder: str | Path) -> Path:
-        """Write the identified machine: a machine file with a URDF per sub-chain beside it.
-
-        `crane.load` gives it from there, with what was locked as all else:
-        `crane.load(found.write_machine("identified"), lock=found.described.locks)`.
-
-        Each body's parameters stand in the link that its joint moves, and the inertials of links
-        fixed to it are removed. Friction, rotor inertias and pressures of gas are the identified
-        ones, other passive forces the machine's. Friction that a machine file has no law for is
-        written as the nearest law at steady speeds, with a warning that says how near. A motor
-        that turns with several joints becomes a rotor that a coupling turns. What locked joints
-        made one body is divided among its links as they are described. Everything else is as in
-        the files that the machine was read from; what they draw is found where it is. The written
-        files are loaded, and compared where the machine was locked, before they are put in place.
-
-        Args:
-            folder: Created where there is none; files of the same names are replaced.
-
-        Returns:
-            The machine file.
-
-        Raises:
-            InputError: The identified machine cannot be, forces alone determined no more than base
-                parameters, the machine comes from another format or is not as its files describe
-                it, or a machine file cannot hold the model's terms.
-            OutputError: The folder cannot be written, or holds what the machine was read from.
-        """
-        from crane.identification.mechanics.write import write_identified
-
-        return write_identified(self, folder)

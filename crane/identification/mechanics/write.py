@@ -5,7 +5,7 @@ import shutil
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -27,24 +27,45 @@ from crane.identification.mechanics.division import divided
 from crane.identification.mechanics.inertias import PER_BODY
 from crane.identification.mechanics.laws import Frictional, Written, laws
 from crane.identification.mechanics.motors import combinations, motor_chain
+from crane.identification.mechanics.result import Identification
 from crane.identification.mechanics.urdf import changed_urdf
 from crane.machine import Machine
-
-if TYPE_CHECKING:
-    from crane.identification.mechanics.result import Identification
 
 _SAME = 1e-9  # of the largest force, by which the written machine may differ
 _FRICTION = tuple(item.name for item in dataclasses.fields(Friction))
 
 
-def write_identified(result: "Identification", folder: str | Path) -> Path:
-    """What `Identification.write_machine` does, see there.
+def write_identified(found: Identification, folder: str | Path) -> Path:
+    """Write the identified machine: a machine file with a URDF per sub-chain beside it.
 
-    See `laws.laws` for the nearest friction, `division.divided` for what locks made one body.
+    `crane.load` gives it from there, with what was locked as all else:
+    `crane.load(crane.write_identified(found, "identified"), lock=found.described.locks)`.
+
+    Each body's parameters stand in the link that its joint moves, and the inertials of links
+    fixed to it are removed. Friction, rotor inertias and pressures of gas are the identified
+    ones, other passive forces the machine's. Friction that a machine file has no law for is
+    written as the nearest law at steady speeds, with a warning that says how near. A motor
+    that turns with several joints becomes a rotor that a coupling turns. What locked joints
+    made one body is divided among its links as they are described. Everything else is as in
+    the files that the machine was read from; what they draw is found where it is. The written
+    files are loaded, and compared where the machine was locked, before they are put in place.
+
+    Args:
+        found: With all parameters, so of a prior or of a feasible estimate.
+        folder: Created where there is none; files of the same names are replaced.
+
+    Returns:
+        The machine file.
+
+    Raises:
+        InputError: The identified machine cannot be, forces alone determined no more than base
+            parameters, the machine comes from another format or is not as its files describe
+            it, or a machine file cannot hold the model's terms.
+        OutputError: The folder cannot be written, or holds what the machine was read from.
     """
-    machine, parameters = result.described, result.parameters
+    machine, parameters = found.described, found.parameters
     check_rewritable(machine)
-    if parameters is None or not result.model.bodies:
+    if parameters is None or not found.model.bodies:
         raise InputError("forces determine base parameters only: give prior or feasible=True")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)  # told when the machine was loaded
@@ -59,11 +80,11 @@ def write_identified(result: "Identification", folder: str | Path) -> Path:
             raise OutputError(
                 f"{place}: is what '{machine.name}' was read from, choose another folder"
             )
-    how = f"identified by {result.method}{', feasible' if result.feasible else ''}"
-    if vague := result.marks.count("not determined"):
-        how += f", {vague} of {len(result.marks)} base parameters not determined"
-    written = laws(result.model, parameters, result.speeds)
-    content, more = _content(result, spec, names, how, written)
+    how = f"identified by {found.method}{', feasible' if found.feasible else ''}"
+    if vague := found.marks.count("not determined"):
+        how += f", {vague} of {len(found.marks)} base parameters not determined"
+    written = laws(found.model, parameters, found.speeds)
+    content, more = _content(found, spec, names, how, written)
     with staging(folder) as part:
         for chain in spec.chains:
             tree = changed_urdf(chain.urdf, bodies, _carried(spec), how)
@@ -75,7 +96,7 @@ def write_identified(result: "Identification", folder: str | Path) -> Path:
         for name, text in more.items():
             (part / name).write_text(text, encoding="utf-8")
         (part / file).write_text(content, encoding="utf-8")
-        _check(result, bodies, part / file, exact=not any(each.off for each in written.values()))
+        _check(found, bodies, part / file, exact=not any(each.off for each in written.values()))
     _tell(machine, written)
     return Path(folder) / file
 
@@ -140,7 +161,7 @@ def _carried(spec: MachineSpec) -> set[str]:
 
 
 def _content(
-    result: "Identification",
+    result: Identification,
     spec: MachineSpec,
     names: Mapping[str, str],
     how: str,
@@ -196,7 +217,7 @@ def _content(
     return yaml_text(data, _notes(result, data)), more
 
 
-def _notes(result: "Identification", data: Mapping[str, Any]) -> dict[Way, str]:
+def _notes(result: Identification, data: Mapping[str, Any]) -> dict[Way, str]:
     """How well friction and rotor inertias are known that the recording tells by themselves."""
     found: dict[Way, str] = {}
     half = 0.5 * np.diff(result.interval(), axis=1)[:, 0]
@@ -212,7 +233,7 @@ def _notes(result: "Identification", data: Mapping[str, Any]) -> dict[Way, str]:
     return found
 
 
-def _values(result: "Identification", kind: str) -> dict[str, float]:
+def _values(result: Identification, kind: str) -> dict[str, float]:
     """Identified parameters of a kind by what they are of."""
     assert result.parameters is not None
     named = zip(result.model.names, result.parameters.tolist(), strict=True)
@@ -221,7 +242,7 @@ def _values(result: "Identification", kind: str) -> dict[str, float]:
     }
 
 
-def _rotors(result: "Identification", spec: MachineSpec) -> dict[str, float]:
+def _rotors(result: Identification, spec: MachineSpec) -> dict[str, float]:
     """Rotor inertia by joint, the described one where none was identified."""
     described = {joint.name: joint.rotor_inertia for joint in spec.tree.moving}
     found = described | _values(result, "rotor_inertia")
@@ -232,7 +253,7 @@ def _rotors(result: "Identification", spec: MachineSpec) -> dict[str, float]:
 
 
 def _friction(
-    result: "Identification", spec: MachineSpec, written: Mapping[str, Written]
+    result: Identification, spec: MachineSpec, written: Mapping[str, Written]
 ) -> dict[str, dict[str, Any]]:
     """Friction by joint; one that the model gives none has none, whatever its files say."""
     machine = result.described
@@ -272,7 +293,7 @@ def _numbers(item: Any, **changed: Any) -> dict[str, Any]:
     return {key: value for key, value in values.items() if value != defaults[key]}
 
 
-def _check(result: "Identification", bodies: Mapping[str, Array], file: Path, exact: bool) -> None:
+def _check(result: Identification, bodies: Mapping[str, Array], file: Path, exact: bool) -> None:
     """Load what was written and compare its forces with those of the parameters.
 
     Args:
