@@ -121,8 +121,25 @@ def test_columns_are_grouped_and_read_in_handy_units(machine, recording):
 
 def test_every_column_is_on_the_page_once(machine, recording):
     names = [column.name for column in columns(machine, recording)]
-    references = {"reference_X1"}
-    assert sorted(names) == sorted(set(recording.columns()) - {"time"} - references)
+    references, derived = {"reference_X1"}, {"error_X1"}
+    assert sorted(names) == sorted(set(recording.columns()) - {"time"} - references | derived)
+
+
+def test_errors_and_the_sum_of_energies_are_plotted(machine, recording):
+    energies = {"kinetic": recording.time**2, "potential": 1 - recording.time}
+    energetic = dataclasses.replace(
+        recording,
+        channels=recording.channels | energies,
+        channel_units=recording.channel_units | dict.fromkeys(energies, "J"),
+    )
+    found = groups(machine, energetic, Grid.of(energetic, np.arange(401)))
+    group, there = line(found, "error_X1")
+    assert (group["title"], group["unit"], there["label"]) == ("Errors", "mm", "X1")
+    np.testing.assert_allclose(decoded(there["series"]["low"]), 1.0, rtol=1e-6)
+    group, there = line(found, "kinetic + potential")
+    assert (group["title"], group["unit"]) == ("Energies", "J")
+    expected = sum(energies.values())
+    np.testing.assert_allclose(decoded(there["series"]["low"]), expected, rtol=1e-6)
 
 
 def test_equal_runs_give_equal_pages(machine, recording, tmp_path):

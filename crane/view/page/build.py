@@ -14,7 +14,7 @@ import numpy as np
 from crane.common.errors import OutputError, RecordingError
 from crane.common.output import replacing
 from crane.machine import Machine
-from crane.recordings.summary import points, subject, title
+from crane.recordings.summary import points, title
 from crane.view.page.arrays import packed
 from crane.view.page.channels import Grid, groups
 from crane.view.page.motion import (
@@ -109,7 +109,7 @@ def open_in_browser(path: str | Path) -> bool:
 def _about(machine: Machine, scene: Scene, recording: "Recording | None") -> dict[str, Any]:
     """What is known of the machine itself."""
     return {
-        "machine": machine.name if recording is None else subject(recording, machine.name),
+        "machine": machine.name,
         "task": "home posture" if recording is None else recording.task,
         "tree": tree(machine),
         "tip": None if machine.tip is None else place(machine, machine.tip),
