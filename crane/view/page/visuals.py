@@ -39,10 +39,10 @@ def read_visuals(machine: Machine) -> list[Visual]:
         more = f" ({len(problems)} such, crane check lists them)" if len(problems) > 1 else ""
         _warn(f"{problems[0]}{more}")
     frames = machine.model.frames
-    drawn = {frames[machine.frame(visual.link)].parentJoint for visual in visuals}
+    shown = {frames[machine.frame(visual.link)].parentJoint for visual in visuals}
     if all(visual.shape is box for visual in visuals):
         visuals += skeleton(machine)
-    return visuals + blocks(machine, drawn)
+    return visuals + blocks(machine, shown)
 
 
 def _warn(text: str) -> None:
