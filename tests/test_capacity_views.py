@@ -168,7 +168,7 @@ def test_labels_of_contours_are_not_upon_one_another(turns):
     x, y = np.linspace(-3, 3, 61), np.linspace(-3, 3, 61)
     far = np.hypot(*np.meshgrid(x, y))
     share = np.arctan2(*np.meshgrid(y, x, indexing="ij")) / (np.pi * turns)
-    loads = np.where((share > 0) & (share < 1) & (far < 1.6), 100 * 25**share, np.nan)
+    loads = np.where((share > 0) & (share < 1) & (far < 2.2), 100 * 25**share, np.nan)
     figure = Figure(figsize=(4, 4), layout="constrained")
     axes = figure.subplots()
     axes.set(xlim=(-3, 3), ylim=(-3, 3), aspect="equal")
