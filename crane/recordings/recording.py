@@ -236,7 +236,10 @@ class Recording(Brief):
         if joint not in followed:
             text = known(followed, joint) if followed else "the run followed none"
             raise RecordingError(f"'{joint}' has no reference in this recording, {text}")
-        return np.asarray(self.channels[REFERENCE + joint] - columns[joint])
+        wanted, there = self.channels[REFERENCE + joint], columns[joint]
+        return scratch.in_blocks(
+            lambda part: (wanted[part] - there[part])[:, None], len(self.time)
+        )[:, 0]
 
     def to_csv(self, path: str | Path) -> None:
         """Write the recording as CSV, whole or not at all.

@@ -214,12 +214,14 @@ def _off(recording: Recording, held: Sequence[str], given: Sequence[str]) -> Arr
     seen, units = recording.channels, recording.channel_units
     if any(units.get(name) != "J" for name in (*held, *given)):
         return None
-    gap = np.zeros(len(recording.time))
-    for sign, names in ((1.0, held), (-1.0, given)):
-        for name in names:
-            release()
-            gap += sign * (seen[name] - seen[name][0])
-    return gap
+
+    def since_start(names: Sequence[str], part: slice) -> Array:
+        return np.sum([seen[name][part] - seen[name][0] for name in names], axis=0)
+
+    return in_blocks(
+        lambda part: (since_start(held, part) - since_start(given, part))[:, None],
+        len(recording.time),
+    )[:, 0]
 
 
 def _balance(recording: Recording) -> str:

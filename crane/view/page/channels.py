@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crane.common.samples import Array
-from crane.common.scratch import release
+from crane.common.scratch import in_blocks, release
 from crane.common.units import reading
 from crane.machine import Machine
 from crane.recordings.recording import FORCE_UNITS, REFERENCE, VELOCITY, VELOCITY_UNITS
@@ -226,10 +226,14 @@ def columns(machine: Machine, recording: "Recording") -> Iterator[Column]:
         yield Column(name, group, label, unit, values, reference(name))
         if name == "potential" and unit == recording.channel_units.get("kinetic") == "J":
             both = "kinetic + potential"
-            yield Column(both, group, both, unit, channels["kinetic"] + values)
+            yield Column(both, group, both, unit, _sum(channels["kinetic"], values))
     for name, values in channels.items():
         if name.startswith(REFERENCE) and name not in used:
             yield Column(name, "Other", name, recording.channel_units[name], values)
+
+
+def _sum(one: Array, other: Array) -> Array:
+    return in_blocks(lambda part: (one[part] + other[part])[:, None], len(one))[:, 0]
 
 
 def _place(machine: Machine, name: str, unit: str) -> tuple[str, str]:

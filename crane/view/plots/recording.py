@@ -86,11 +86,22 @@ LINES: Mapping[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class _Panel:
-    """One quantity of one joint over time [SI]: lines (N,) by what they are called."""
+    """One quantity of one joint over time [SI]: lines (N,) by what they are called.
+
+    With what they should be, errors to that: computed as they are drawn, as a long recording is
+    more than memory has room for.
+    """
 
     quantity: str
     unit: str
     lines: dict[str, Array]
+    wanted: Array | None = None
+
+    def drawn(self) -> Iterator[tuple[str, Array]]:
+        """Each line with its values (N,)."""
+        for label, values in self.lines.items():
+            release()
+            yield label, values if self.wanted is None else self.wanted - values
 
 
 def plot_recording(recording: Recording, path: str | Path) -> None:
@@ -173,8 +184,11 @@ def _panels(recording: Recording, column: int) -> list[_Panel]:
             FORCE_UNITS[unit],
             {} if name in recording.free else lines(recording.tau),
         ),
-        _Panel("error", unit, {"recording": recording.error(name)} if wanted in channels else {}),
     ]
+    if wanted in channels:
+        found.append(_Panel("error", unit, lines(recording.q), channels[wanted]))
+    else:
+        found.append(_Panel("error", unit, {}))
     for quantity, shown, names in HYDRAULIC_ROWS:
         own = [label for label, channel in names.items() if channel.format(name) != channel]
         there = {
@@ -190,16 +204,14 @@ def _scales(panels: Sequence[_Panel]) -> dict[str, tuple[str, float]]:
     """The unit that panels of a row are read in, and its scale, the same for equal units."""
     peaks: dict[str, float] = {}
     for panel in panels:
-        for values in panel.lines.values():
-            release()
+        for _, values in panel.drawn():
             peaks[panel.unit] = max(peaks.get(panel.unit, 0.0), float(np.abs(values).max()))
     return {unit: reading(unit, peak) for unit, peak in peaks.items()}
 
 
 def _draw_panel(axes: Axes, time: Array, panel: _Panel, unit: str, scale: float) -> None:
     marker = "o" if len(time) == 1 else None
-    for label, values in panel.lines.items():
-        release()
+    for label, values in panel.drawn():
         axes.plot(*envelope(time, scale * values), marker=marker, label=label, **LINES[label])
     axes.set_ylabel(f"{panel.quantity} [{unit}]")
     axes.margins(x=0.0, y=0.08)
