@@ -16,6 +16,7 @@ from crane.cli import entry
 from crane.cli.commands import list_machines
 from crane.common.errors import InputError
 from crane.description import bundled, examples
+from crane.view.plots.recording import recording_figure
 
 
 def one_error(result) -> str:
@@ -261,6 +262,22 @@ def test_an_interrupted_run_leaves_what_it_has(tmp_path):
     assert "cut at" in (out / "summary.md").read_text().splitlines()[0]
     whole = crane.simulate(machine, duration=0.5)
     np.testing.assert_allclose(recording.q[: len(whole.time)], whole.q, rtol=0, atol=1e-12)
+
+
+def test_results_are_headed_with_the_machine_s_own_name(tmp_path):
+    data, other = Path(__file__).parent / "data", tmp_path / "my.yaml"
+    text = (data / "slider_crank.yaml").read_text().replace("urdf: ", f"urdf: {data}/")
+    other.write_text(text.replace("name: slider_crank\n", "name: Press No. 1\n"))
+    out = tmp_path / "run"
+    for command in (
+        ("simulate", other, "--duration", "0.05", "--out", out), ("view", out, "--no-open"),
+    ):  # fmt: skip
+        result = typed(*command)
+        assert result.returncode == 0, result.stderr
+    assert (out / "summary.md").read_text().startswith("# Press No. 1: free motion\n")
+    assert "<title>Press No. 1: free motion</title>" in (out / "view.html").read_text()
+    figure = recording_figure(crane.Recording.read(out / "recording.csv"))
+    assert figure.get_suptitle() == "Press No. 1: free motion"
 
 
 def test_check_tells_warnings_by_its_status(tmp_path):

@@ -5,6 +5,7 @@ import dataclasses
 import itertools
 import shutil
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -18,6 +19,7 @@ from crane.view.page.channels import Grid, columns, groups
 from crane.view.page.summary import limits_hit, mechanical_work, run_summary
 from crane.view.page.visuals import read_visuals
 
+DATA = Path(__file__).parent / "data"
 WEBGL = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 CORNERS = [[0.0, 0.0221, 0.0108], [0.4, 0.03, 0.0], [1.1, 0.0, 0.03], [-0.7, 0.002, 0.004]]
 
@@ -121,8 +123,25 @@ def test_columns_are_grouped_and_read_in_handy_units(machine, recording):
 
 def test_every_column_is_on_the_page_once(machine, recording):
     names = [column.name for column in columns(machine, recording)]
-    references = {"reference_X1"}
-    assert sorted(names) == sorted(set(recording.columns()) - {"time"} - references)
+    references, derived = {"reference_X1"}, {"error_X1"}
+    assert sorted(names) == sorted(set(recording.columns()) - {"time"} - references | derived)
+
+
+def test_errors_and_the_sum_of_energies_are_plotted(machine, recording):
+    energies = {"kinetic": recording.time**2, "potential": 1 - recording.time}
+    energetic = dataclasses.replace(
+        recording,
+        channels=recording.channels | energies,
+        channel_units=recording.channel_units | dict.fromkeys(energies, "J"),
+    )
+    found = groups(machine, energetic, Grid.of(energetic, np.arange(401)))
+    group, there = line(found, "error_X1")
+    assert (group["title"], group["unit"], there["label"]) == ("Errors", "mm", "X1")
+    np.testing.assert_allclose(decoded(there["series"]["low"]), 1.0, rtol=1e-6)
+    group, there = line(found, "kinetic + potential")
+    assert (group["title"], group["unit"]) == ("Energies", "J")
+    expected = sum(energies.values())
+    np.testing.assert_allclose(decoded(there["series"]["low"]), expected, rtol=1e-6)
 
 
 def test_equal_runs_give_equal_pages(machine, recording, tmp_path):
@@ -323,6 +342,42 @@ def test_arrows_turn_with_the_sign_of_the_force(machine, recording, opened):
     (f1, l1), (f2, l2), _, (f4, l4) = found
     assert l1 / l2 == pytest.approx(f1 / f2, rel=1e-3)
     assert l1 / l4 == pytest.approx(f1 / f4, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_springs_reach_from_frame_to_frame(opened, tmp_path):
+    text = (DATA / "slider_crank.yaml").read_text().replace("urdf: ", f"urdf: {DATA}/")
+    text += "forces: [{between: [base, slider], stiffness: 30, rest: 0.1, damping: 1}]\n"
+    (tmp_path / "sprung.yaml").write_text(text)
+    sprung = crane.load(tmp_path / "sprung.yaml")
+    run = crane.simulate(sprung, duration=0.2)
+    page = opened(sprung, run)
+    for sample in (0, 120, 200):
+        page.evaluate("(time) => crane.seek(time)", run.time[sample])
+        sample = int(np.argmin(abs(run.time - page.evaluate("crane.time"))))
+        start, end = page.evaluate(
+            """() => {
+                const { link: { object, long } } = crane.marks.springs[0];
+                object.updateMatrix();
+                const wire = long[0][0];
+                wire.updateMatrix();
+                const { array } = wire.geometry.attributes.position;
+                const count = array.length / 3 / 301;  // points around the wire
+                const centre = (i) => {
+                    const sum = object.position.clone().set(0, 0, 0);
+                    for (let k = 0; k < count - 1; k++) {
+                        const at = 3 * (i * count + k);
+                        sum.add(sum.clone().set(...array.slice(at, at + 3)));
+                    }
+                    sum.multiplyScalar(1 / (count - 1));
+                    return sum.applyMatrix4(wire.matrix).applyMatrix4(object.matrix).toArray();
+                };
+                return [centre(0), centre(300)];
+            }"""
+        )
+        q = np.array([run.columns()[joint][sample] for joint in sprung.joints])
+        np.testing.assert_allclose(start, world(sprung, q, "base")[:3, 3], atol=1e-5)
+        np.testing.assert_allclose(end, world(sprung, q, "slider")[:3, 3], atol=1e-5)
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from dataclasses import replace
 from string import ascii_lowercase
 
 import numpy as np
@@ -73,17 +74,19 @@ def test_displacements_velocities_and_forces(recording):
         (1, 1): ("velocity [mm/s]", 1e3 * recording.v[:, 1]),
         (2, 0): ("torque [N m]", recording.tau[:, 0]),
         (2, 1): ("force [N]", recording.tau[:, 1]),
+        (3, 0): ("error [deg]", np.full(201, np.rad2deg(0.1))),
+        (3, 1): ("error [mm]", np.full(201, -1.0)),
     }
     for place, (label, values) in expected.items():
         assert grid[place].get_ylabel() == label
         time, drawn = curve(grid[place], "recording")
         np.testing.assert_array_equal(time, recording.time)
-        np.testing.assert_allclose(drawn, values, rtol=1e-14)
+        np.testing.assert_allclose(drawn, values, rtol=1e-14 if place[0] < 3 else 1e-12)
         low, high = grid[place].get_ylim()
         assert low < values.min() and values.max() < high
         assert grid[place].get_xlim() == (recording.time[0], recording.time[-1])
     assert [grid[0, i].get_title() for i in (0, 1)] == ["$q_{1}$", "$X_{1}$"]
-    assert [grid[2, i].get_xlabel() for i in (0, 1)] == ["time [s]"] * 2
+    assert [grid[3, i].get_xlabel() for i in (0, 1)] == ["time [s]"] * 2
     assert [grid[0, i].get_xlabel() for i in (0, 1)] == [""] * 2
 
 
@@ -126,6 +129,44 @@ def test_path_of_the_tip(recording):
     error = panels(figure)[2, 2]
     assert error.get_ylabel() == "tip to reference [mm]"
     np.testing.assert_allclose(curve(error, "recording")[1], 10 * np.sqrt(3))
+
+
+@pytest.mark.parametrize(
+    ("sizes", "plane"),
+    [
+        ((1.0, 0.0, 0.5), "xz"),
+        ((1.0, 0.5, 0.004), "xy"),
+        ((1e-17, 1.0, 0.5), "yz"),
+        ((1.0, 0.0, 0.0), "xz"),  # straight
+        ((0.0, 1.0, 0.0), "yz"),
+        ((0.0, 0.0, 1.0), "xz"),
+        ((1.0, 0.5, 0.02), ""),
+    ],
+)
+def test_a_path_in_a_plane_is_drawn_in_it(recording, sizes, plane):
+    tip = (
+        3.0
+        + np.array(sizes)
+        * np.column_stack([np.cos(recording.time), recording.time**2, 0 * recording.time]).cumsum(
+            axis=0
+        )
+        / 100
+    )
+    tip[:, 2] = 3.0 + sizes[2] * np.sin(recording.time)
+    channels = recording.channels | {f"tip_{axis}": tip[:, i] for i, axis in enumerate("xyz")}
+    channels |= {f"reference_tip_{axis}": tip[:, i] for i, axis in enumerate("xyz")}
+    figure = recording_figure(replace(recording, channels=channels))
+    (path,) = (axes for axes in figure.axes if axes.get_title() == "path of the tip")
+    if not plane:
+        assert path.name == "3d"
+        return
+    assert (path.get_xlabel(), path.get_ylabel()) == tuple(f"{axis} [m]" for axis in plane)
+    for label in ("recording", "reference"):
+        for values, axis in zip(curve(path, label), plane, strict=True):
+            np.testing.assert_array_equal(values, tip[:, "xyz".index(axis)])
+    FigureCanvasAgg(figure).draw()
+    one, other = np.diff(path.transData.transform([[3, 3], [4, 4]]), axis=0)[0]
+    assert one == pytest.approx(other, rel=1e-9)  # to scale
 
 
 def test_without_tip_or_references(recording):
@@ -203,13 +244,12 @@ def boxes(figure):
 @pytest.mark.parametrize(
     "end",
     [
-        (0.42, 0.0, 0.13),
-        (0.38, 0.0, 0.13),
+        (0.42, 0.01, 0.13),
+        (0.38, 0.01, 0.13),
         (0.12, -0.25, 0.1),
-        (0.36, 0.0, 0.0),
-        (0.4, 0.7, -0.07),
+        (0.361, 0.01, 0.0),
+        (0.4, 0.7, -0.05),
         (2.4, 3.7, 9.1),
-        (0.36, 0.0, -0.07),
     ],
 )
 def test_words_at_the_axes_of_the_path_keep_apart(end):

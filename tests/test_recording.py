@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from crane.common.errors import InputError, OutputError, RecordingError
 from crane.recordings.recording import Recording
+from crane.recordings.summary import subject
 
 
 def make(**changes):
@@ -163,6 +164,30 @@ def test_any_recording_survives_the_round_trip(tmp_path_factory, recording):
     path = tmp_path_factory.mktemp("run") / "run.csv"
     recording.to_csv(path)
     assert_equal(Recording.from_csv(path), recording)
+
+
+def test_errors_are_references_less_coordinates():
+    channels = {"reference_X1": [0.02] * 3, "q2": [0.5, 0.6, 0.7], "reference_q2": [1.0] * 3}
+    recording = make(channels=channels, channel_units={})
+    np.testing.assert_allclose(recording.error("X1"), [0.01, 0.0, -0.01], atol=1e-15)
+    np.testing.assert_allclose(recording.error("q2"), [0.5, 0.4, 0.3], atol=1e-15)
+    with pytest.raises(RecordingError, match="^'q1' has no reference in this recording, known"):
+        recording.error("q1")
+    with pytest.raises(RecordingError, match="recording, the run followed none$"):
+        make().error("X1")
+
+
+def test_a_machine_s_own_name_is_kept_where_its_file_has_another(tmp_path):
+    for name, machine, noted in (
+        ("Crane No. 1", "/there/my.yaml", True), ("my", "/there/my.yaml", False),
+        ("patu655", 'patu655 with {"lock": {"slew": 0.0}}', False),
+    ):  # fmt: skip
+        recording = make(machine=machine, machine_name=name)
+        for file in (tmp_path / "a.csv", tmp_path / "a.npz"):
+            (recording.to_csv if file.suffix == ".csv" else recording.to_npz)(file)
+            assert Recording.read(file).machine_name == (name if noted else "")
+            assert subject(Recording.read(file)) == name
+    assert subject(make(machine="/there/my.yaml")) == "my"
 
 
 def test_failed_writing_leaves_nothing(tmp_path):

@@ -1,8 +1,14 @@
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from crane import load, simulate
 from crane.recordings.recording import Recording
-from crane.recordings.summary import points, rms, summarize
+from crane.recordings.summary import energy_balance, points, rms, summarize
+
+DATA = Path(__file__).parent / "data"
 
 
 def make(time, **channels):
@@ -76,6 +82,82 @@ def test_markdown():
         "| X1 | 20.00 to 20.00 mm | 0.00 mm/s | 50 N | 50 N | 0.500 mm | 0.354 mm |",
         "| tip |  |  |  |  | 2.000 mm | 2.000 mm |",
     ]
+
+
+def energies(time):
+    """A free fall by 3 m with friction, pushed by a drive and by a load, and an oil besides."""
+    time = np.asarray(time)
+    return {
+        "kinetic": 8 * time, "potential": 20 - 7 * time, "dissipated": 2 * time,
+        "work": 5 + time, "work_wind": 2 * time, "hydraulic_loss": 3 * time,
+        "oil_energy": time, "pump_work": 5 * time,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("off", "expected"),
+    [
+        ({}, "off by at most 0 J, of the oil off by at most 0 J"),
+        (
+            {"kinetic": 0.25},
+            "off by at most 0.25 J, of the oil off by at most 0 J",
+        ),
+        (
+            {"work_wind": -0.5},
+            "off by at most 0.5 J, of the oil off by at most 0 J",
+        ),
+        ({"work": 0.5}, "off by at most 0.5 J, of the oil off by at most 0.5 J"),
+        ({"pump_work": 2}, "off by at most 0 J, of the oil off by at most 2 J"),
+    ],
+)
+def test_the_balance_of_energy(off, expected):
+    time = np.arange(5.0)
+    channels = energies(time)
+    for name, most in off.items():
+        channels[name] = channels[name] + np.array([0, 0, most, 0, 0])
+    units = dict.fromkeys(channels, "J")
+    recording = replace(make(time, **channels), channel_units=units)
+    assert summarize(recording).to_markdown().splitlines()[-2:] == [
+        "",
+        f"energy balance: {expected}",
+    ]
+    assert summarize(make(time, **channels)).balance == ""  # of no energies
+
+
+def test_a_balance_that_is_simulated(slider_crank):
+    recording = simulate(slider_crank, lambda t, q, v: [2.0 - v[0]], duration=0.2)
+    gap = energy_balance(recording)
+    assert 0 < np.abs(gap).max() < 1e-6 < np.ptp(recording.channels["work"])
+    assert summarize(recording).balance == f"off by at most {np.abs(gap).max():.2g} J"
+
+
+def test_potential_energy_counts_weight_from_the_world_s_origin_and_springs_from_their_rest(
+    tmp_path,
+):
+    text = (DATA / "slider_crank.yaml").read_text().replace(": slider_", f": {DATA}/slider_")
+    text = text.replace(f"name: {DATA}/", "name: ")
+    springs = """forces:
+  - {between: [base, slider], stiffness: 300, rest: 0.2}
+  - {joint: theta, stiffness: 4, rest: 0.5}
+  - {joint: phi, force: 3}
+end_stops: {theta: {stiffness: 1.0e+3}}
+"""
+    (tmp_path / "my.yaml").write_text(text + springs)
+    machine = load(tmp_path / "my.yaml")
+    recording = simulate(machine, initial=([0.2], [-2.0]), duration=0.08)
+    theta, phi, s = (recording.columns()[joint] for joint in ("theta", "phi", "s"))
+    assert theta.min() < 0.1  # in the end stop
+    along, across = np.cos(theta), np.sin(theta)
+    crank = 0.07 * across + 0.01 * along
+    rod = 0.2 * across + 0.16 * np.sin(theta + phi) - 0.02 * np.cos(theta + phi)
+    expected = (
+        9.81 * (0.8 * crank + 0.5 * rod + 1.3 * 0.3)  # the guide is 0.3 m high
+        + 150 * (np.hypot(s, 0.3) - 0.2) ** 2
+        + 2 * (theta - 0.5) ** 2
+        - 3 * phi
+        + 500 * np.maximum(0.1 - theta, 0) ** 2
+    )
+    np.testing.assert_allclose(recording.channels["potential"], expected, atol=1e-9)
 
 
 def test_rounding_noise_reads_as_zero():

@@ -120,6 +120,7 @@ def view(
     """Write a page that shows a machine, or a run with its forces and numbers, and open it."""
     from crane.cli.runs import PAGE, check_free, machine_of, read_run
     from crane.common.output import file_name
+    from crane.recordings.overlay import differences
     from crane.view.page.build import open_in_browser, report
 
     recording = other = None
@@ -143,6 +144,9 @@ def view(
         page = out or Path(file_name(loaded.name) + ".html")
     check_free(page, force)
     report(loaded, recording, page, other)
+    if recording is not None and other is not None:
+        for one in differences(recording, other):
+            print(f"{one.joint} differs by at most {' at '.join(one.words)}")
     print(f"written to {page}")
     if not no_open and not open_in_browser(page):
         print("no browser found here, open the page yourself")

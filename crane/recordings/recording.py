@@ -13,7 +13,8 @@ drives such a joint, its force is zero and has no column. X_velocity may be miss
 derivative of X then. X_velocity and X_force without X is an error. Every other column is a
 channel, such as the angle q2 of a joint that is not active, with q2_velocity beside it or without.
 The order of the columns is any, the joints come in the order of their displacements. The comment
-lines may be left out where no joint is free. Other units are converted where
+lines may be left out where no joint is free; `machine name` is there where the machine calls
+itself something else than its file. Other units are converted where
 crane.recordings.timeseries knows them. An npz file serves, too: one array per column, named like
 those of the CSV, and the comment lines as the comment of the archive. What a crane's sensors tell
 instead of displacements and forces, crane.recordings.measured turns into them.
@@ -36,11 +37,14 @@ from crane.description.sensors import FORCE as FORCE
 from crane.description.sensors import FORCE_UNITS as FORCE_UNITS
 from crane.description.sensors import VELOCITY as VELOCITY
 from crane.description.sensors import VELOCITY_UNITS as VELOCITY_UNITS
+from crane.description.sources import unchanged
 from crane.recordings import timeseries
 from crane.recordings.timeseries import TIME, Table, check_unit
 
+REFERENCE = "reference_"  # before the name of what a channel is the reference of
 SENSORS, IDEAL = "sensors", "ideal"  # a note of quantities themselves
 FREE = "free"  # a note of joints that nothing drives
+NAME = "machine name"  # a note where the machine's own is not that of its file
 _ACCELERATION = "_acceleration"
 _LISTED = 40  # names in a message
 
@@ -68,6 +72,7 @@ class Recording(Brief):
         ideal: Whether the columns are the quantities themselves, simulated or corrected by what
             is known of the sensors, which a file says in its note `sensors`.
         free: Those of the joints that nothing drives, whose forces are zero.
+        machine_name: What the machine calls itself, "" if not known.
     """
 
     time: Array
@@ -83,6 +88,7 @@ class Recording(Brief):
     controller: str = ""
     ideal: bool = False
     free: tuple[str, ...] = ()
+    machine_name: str = ""
     copy: InitVar[bool] = True
 
     def __post_init__(self, copy: bool) -> None:
@@ -129,7 +135,7 @@ class Recording(Brief):
         units = self._units()
         for name, unit in units.items():
             timeseries.check_column(name, unit)
-        for name in ("machine", "task", "controller"):
+        for name in ("machine", "task", "controller", "machine_name"):
             text = getattr(self, name)
             if text != text.strip() or not text.isprintable():
                 raise RecordingError(f"{name} {text!r} is not one line of text, give one")
@@ -259,6 +265,25 @@ class Recording(Brief):
         units = {name: self.channel_units[name] for name in channels}
         return replace(self, q=q, v=v, tau=tau, channels=channels, channel_units=units)
 
+    def error(self, joint: str) -> Array:
+        """Tracking error (N,) of a joint [rad or m]: its reference less its coordinate.
+
+        Args:
+            joint: A joint with the channel reference_<joint>, active or with a channel of its own.
+
+        Raises:
+            RecordingError: It has no reference, or is not recorded.
+        """
+        columns = {**self.channels, **dict(zip(self.joints, self.q.T, strict=True))}
+        followed = [x for x in columns if REFERENCE + x in self.channels]
+        if joint not in followed:
+            text = known(followed, joint) if followed else "the run followed none"
+            raise RecordingError(f"'{joint}' has no reference in this recording, {text}")
+        wanted, there = self.channels[REFERENCE + joint], columns[joint]
+        return scratch.in_blocks(
+            lambda part: (wanted[part] - there[part])[:, None], len(self.time)
+        )[:, 0]
+
     def to_csv(self, path: str | Path) -> None:
         """Write the recording as CSV, whole or not at all.
 
@@ -279,6 +304,8 @@ class Recording(Brief):
 
     def _notes(self) -> dict[str, str]:
         notes = {"crane recording": "", "machine": self.machine, "task": self.task}
+        if self.machine_name not in ("", Path(unchanged(self.machine)).stem):
+            notes[NAME] = self.machine_name
         if self.controller:
             notes["controller"] = self.controller
         if self.ideal:
@@ -359,6 +386,7 @@ class Recording(Brief):
             controller=table.notes.get("controller", ""),
             ideal=table.notes.get(SENSORS) == IDEAL,
             free=free,
+            machine_name=table.notes.get(NAME, ""),
             copy=False,
         )
 

@@ -1,5 +1,6 @@
 """The few numbers that sum a recording up."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from crane.common.samples import Array
 from crane.common.scratch import in_blocks, release
 from crane.common.units import quantity
 from crane.description.sources import unchanged
-from crane.recordings.recording import FORCE_UNITS, Recording
+from crane.recordings.recording import FORCE_UNITS, REFERENCE, Recording
 
 SUPPORT = "support_"
 _LIFTED = 0.05  # [s] in the air that is worth telling
@@ -55,6 +56,7 @@ class Summary:
         tip_peak_error: Largest distance of the tip from its reference [m]; None without one.
         tip_rms_error: Root of the time average of its square [m]; None without one.
         stability: How far it is from tipping, in words, "" where that is not recorded.
+        balance: How far the balance of energy is off, see `energy_balance`, likewise.
     """
 
     duration: float
@@ -62,6 +64,7 @@ class Summary:
     tip_peak_error: float | None
     tip_rms_error: float | None
     stability: str = ""
+    balance: str = ""
 
     def to_markdown(self) -> str:
         """A table with one row per joint, in degrees and millimetres."""
@@ -95,7 +98,8 @@ class Summary:
             errors = (_measure(x, 1e3, "mm") for x in (self.tip_peak_error, self.tip_rms_error))
             rows.append(("tip", "", "", "", "", *errors))
         table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
-        return f"{table}\n{self.stability}\n" if self.stability else table
+        balance = f"energy balance: {self.balance}" if self.balance else ""
+        return "\n".join([table, *(f"{text}\n" for text in (self.stability, balance) if text)])
 
 
 def tipping(recording: Recording) -> str:
@@ -148,9 +152,9 @@ def title(machine: str, what: str = "") -> str:
     return ": ".join(word for word in (machine, what) if word)
 
 
-def subject(recording: Recording, otherwise: str = "") -> str:
-    """Name of what a recording is of: of the bundled machine or file that it names, or else."""
-    return Path(unchanged(recording.machine)).stem or otherwise
+def subject(recording: Recording) -> str:
+    """Name of what a recording is of: the machine's own, or else of the file that it names."""
+    return recording.machine_name or Path(unchanged(recording.machine)).stem
 
 
 def summarize(recording: Recording) -> Summary:
@@ -164,8 +168,7 @@ def summarize(recording: Recording) -> Summary:
     for i, name in enumerate(recording.joints):
         release()
         q, v, tau = recording.q[:, i], recording.v[:, i], recording.tau[:, i]
-        reference = channels.get(f"reference_{name}")
-        error = None if reference is None else q - reference
+        error = recording.error(name) if REFERENCE + name in channels else None
         joints.append(
             JointSummary(
                 name=name,
@@ -186,6 +189,45 @@ def summarize(recording: Recording) -> Summary:
         tip_peak_error=None if distance is None else _peak(distance),
         tip_rms_error=None if distance is None else rms(time, distance),
         stability=_stability(recording),
+        balance=_balance(recording),
+    )
+
+
+def energy_balance(recording: Recording) -> Array | None:
+    """Energy (N,) that came from nowhere since the start [J], None where it is not recorded.
+
+    kinetic + potential + dissipated less work of the active forces and of the loads, less its
+    first value: zero but for the error of the integration. The work of a circuit's forces is in
+    `work`, see `oil_balance` for where that comes from.
+    """
+    loads = [x for x in recording.channels if x.startswith("work_")]
+    return _off(recording, ("kinetic", "potential", "dissipated"), ("work", *loads))
+
+
+def oil_balance(recording: Recording) -> Array | None:
+    """The same of a circuit: work + hydraulic_loss + oil_energy less pump_work (N,) [J]."""
+    return _off(recording, ("work", "hydraulic_loss", "oil_energy"), ("pump_work",))
+
+
+def _off(recording: Recording, held: Sequence[str], given: Sequence[str]) -> Array | None:
+    """What channels hold [J] beyond what was given since the start; None if one is not there."""
+    seen, units = recording.channels, recording.channel_units
+    if any(units.get(name) != "J" for name in (*held, *given)):
+        return None
+
+    def since_start(names: Sequence[str], part: slice) -> Array:
+        return np.sum([seen[name][part] - seen[name][0] for name in names], axis=0)
+
+    return in_blocks(
+        lambda part: (since_start(held, part) - since_start(given, part))[:, None],
+        len(recording.time),
+    )[:, 0]
+
+
+def _balance(recording: Recording) -> str:
+    balances = (("", energy_balance(recording)), ("of the oil ", oil_balance(recording)))
+    return ", ".join(
+        f"{what}off by at most {_peak(gap):.2g} J" for what, gap in balances if gap is not None
     )
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from crane.codegen import Parts
 from crane.common import scratch
 from crane.common.samples import Array
+from crane.common.shown import shortened
 from crane.control import Controller, Free, ValveDrive, reference_of
 from crane.description.external import PARTS
 from crane.dynamics.joint_forces import sticking
@@ -52,6 +53,7 @@ def recorded(
         controller=_name_of(control),
         ideal=True,
         free=machine.free,
+        machine_name=shortened(machine.name).strip(),
         copy=False,
     )
 

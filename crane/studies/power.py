@@ -21,7 +21,6 @@ from crane.hydraulics.sources import MAIN
 from crane.machine import Machine
 from crane.recordings import Recording
 from crane.recordings.missing import check_there
-from crane.recordings.summary import subject
 from crane.recordings.timeseries import TIME, check_unit, write_columns
 
 DIESEL = 840.0  # [kg/m3]
@@ -273,7 +272,7 @@ def power_account(machine: Machine, recording: Recording) -> PowerAccount:
             fuel = float(np.trapezoid(burning, recording.time))
     return PowerAccount(
         recording.time, {name: powers[name] for name in names}, pumps, circuit.joints, given_by,
-        fuel, subject(recording, machine.name), recording.task,
+        fuel, machine.name, recording.task,
     )  # fmt: skip
 
 

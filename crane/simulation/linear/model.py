@@ -13,7 +13,7 @@ from crane.common.errors import OutputError
 from crane.common.extras import library
 from crane.common.output import replacing
 from crane.common.samples import Array, as_sample
-from crane.common.shown import Brief, counted
+from crane.common.shown import Brief, counted, shortened
 from crane.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -223,6 +223,7 @@ class LinearModel(Brief):
             machine=machine.call,
             task="modes in slow motion",
             free=machine.free,
+            machine_name=shortened(machine.name).strip(),
         )
 
     def to_control(self) -> Any:

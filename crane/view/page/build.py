@@ -9,14 +9,14 @@ from pathlib import Path
 from string import Template
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from crane.common.errors import OutputError, RecordingError
 from crane.common.output import replacing
 from crane.machine import Machine
-from crane.recordings.summary import points, subject, title
+from crane.recordings.overlay import differences, shift_of
+from crane.recordings.summary import points, title
 from crane.view.page.arrays import packed
 from crane.view.page.channels import Grid, groups
+from crane.view.page.marks import actuators, loads, springs
 from crane.view.page.motion import (
     check_joints,
     frame_rows,
@@ -41,8 +41,6 @@ VIEWS = {
 }  # fmt: skip
 # In the order in which they use each other.
 SCRIPTS = ("data", "kinematics", "timeline", "scene", "marks", "plots", "channels", "main")
-_FULL = 99.5  # percentile of the forces that has a full arrow: a single spike does not count
-_NOTHING = 1e-6  # share of the machine's weight that is rounding noise, as a force or torque
 
 
 def report(
@@ -109,7 +107,7 @@ def open_in_browser(path: str | Path) -> bool:
 def _about(machine: Machine, scene: Scene, recording: "Recording | None") -> dict[str, Any]:
     """What is known of the machine itself."""
     return {
-        "machine": machine.name if recording is None else subject(recording, machine.name),
+        "machine": machine.name,
         "task": "home posture" if recording is None else recording.task,
         "tree": tree(machine),
         "tip": None if machine.tip is None else place(machine, machine.tip),
@@ -117,6 +115,7 @@ def _about(machine: Machine, scene: Scene, recording: "Recording | None") -> dic
         "pins": [place(machine, loop.predecessor) for loop in machine.closure.equations.loops],
         "actuators": [],
         "loads": [],
+        "springs": springs(machine, scene.q),
         "lower": scene.lower.tolist(),
         "upper": scene.upper.tolist(),
         "ground": scene.ground,
@@ -124,6 +123,7 @@ def _about(machine: Machine, scene: Scene, recording: "Recording | None") -> dic
         "summary": run_summary(machine, recording),
         "runs": [{"motion": motion(scene.time, scene.q)}],
         "groups": [],
+        "differences": [],
         "reference": "",
     }
 
@@ -141,90 +141,33 @@ def _runs(
     runs: list[dict[str, Any]] = [
         {"motion": motion(scene.time, scene.q), "axis": grid.axis(), "label": recording.task}
     ]
-    second = None
+    second, apart = None, []
     if other is not None:
         try:
             check_joints(machine, other)
         except RecordingError as error:
             raise RecordingError(f"the second recording: {error}") from None
         rows = frame_rows(other.time, share)
-        apart = other.time[0] > recording.time[-1] or other.time[-1] < recording.time[0]
         over = Grid.of(other, rows, spans)
         runs.append(
             {
                 "motion": motion(other.time[rows], postures(machine, other, rows)),
                 "axis": over.axis(),
                 "label": other.task,
-                "shift": float(recording.time[0] - other.time[0]) if apart else 0.0,
+                "shift": shift_of(recording, other),
             }
         )
         second = (other, over)
+        apart = [(one.joint, *one.words) for one in differences(recording, other)]
     wanted = points(recording, "reference_tip")
     return {
-        "actuators": _actuators(machine, recording, scene.rows),
-        "loads": _loads(machine, recording, scene.rows),
+        "actuators": actuators(machine, recording, scene.rows),
+        "loads": loads(machine, recording, scene.rows),
         "runs": runs,
         "groups": groups(machine, recording, grid, second),
+        "differences": apart,
         "reference": "" if wanted is None else packed(wanted[scene.rows], "f4"),
     }
-
-
-def _actuators(machine: Machine, recording: "Recording", rows: np.ndarray) -> list[dict[str, Any]]:
-    """Where the active joints act and how strongly, in shares of the largest of their kind."""
-    model = machine.model
-    ends = [loop.successor for loop in machine.closure.equations.loops]
-    ends += [loop.predecessor for loop in machine.closure.equations.loops]
-    places = [place(machine, end) for end in ends]
-    forces = {joint: recording.tau[:, recording.joints.index(joint)] for joint in machine.active}
-    weight = 9.81 * sum(inertia.mass for inertia in model.inertias)
-    full = dict.fromkeys(("m", "rad"), _NOTHING * weight)
-    for joint, force in forces.items():
-        unit = machine.unit(joint)
-        full[unit] = max(full[unit], float(np.percentile(np.abs(force), _FULL)))
-    shown = {joint: force[rows] for joint, force in forces.items()}
-    shares = {
-        joint: np.where(np.abs(force) > _NOTHING * weight, force, 0.0) / full[machine.unit(joint)]
-        for joint, force in shown.items()
-    }
-    found = []
-    for joint in machine.driven_joints:
-        index, unit = model.getJointId(joint) - 1, machine.unit(joint)
-        eyes = [there for there in places if there["joint"] == index] if unit == "m" else []
-        found.append(
-            {
-                "joint": index,
-                "at": eyes[0]["placement"][12:15] if eyes else [0.0, 0.0, 0.0],
-                "name": joint,
-                "share": packed(shares[joint], "f4"),
-            }
-        )
-    return found
-
-
-def _loads(machine: Machine, recording: "Recording", rows: np.ndarray) -> list[dict[str, Any]]:
-    """Where forces from outside act and how strongly, in shares of the largest."""
-    known = [*machine.external, *(x for task in machine.tasks.values() for x in task.loads)]
-    frames = {link: link for link in machine.tree.links} | {x.name: x.frame for x in known}
-    seen, forces = recording.channels, {}
-    for column in seen:
-        name = column.removeprefix("load_").removesuffix("_force_x")
-        if column == f"load_{name}_force_x" and name in frames:
-            axes = (seen.get(f"load_{name}_force_{axis}") for axis in "xyz")
-            forces[name] = [np.zeros(len(recording.time)) if x is None else x for x in axes]
-    for name in machine.supports:
-        if f"support_{name}" in seen and name not in forces:
-            forces[name] = [np.zeros(len(recording.time))] * 2 + [seen[f"support_{name}"]]
-    if not forces:
-        return []
-    sizes = [np.linalg.norm(force, axis=0) for force in forces.values()]
-    full = float(np.percentile(np.maximum.reduce(sizes), _FULL)) or 1.0
-    return [
-        {
-            "name": name, "place": place(machine, frames[name]), "full": full,
-            "share": [packed((x / full)[rows], "f4") for x in force],
-        }
-        for name, force in forces.items()
-    ]  # fmt: skip
 
 
 def _html(about: dict[str, Any], scene: Scene) -> str:

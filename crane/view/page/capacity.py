@@ -113,7 +113,7 @@ def _cells(
             _number(chart.radii[j]), _number(chart.heights[i]),
             _number(chart.loads[k, i, j], _OF_LOADS), int(chart.cause[k, i, j]),
             [_number(x, _OF_LOADS) for x in chart.each[k, i, j]],
-            [_number(x) for x in scales * posture[active]], held, number,
+            [_tenths(x) for x in scales * posture[active]], held, number,
         ])  # fmt: skip
     return out
 
@@ -152,6 +152,11 @@ def _unit(unit: str) -> tuple[str, float]:
 
 def _between(values: Array) -> float:
     return float(np.diff(values).min()) if len(values) > 1 else 0.0
+
+
+def _tenths(value: float) -> float:
+    """Strokes and angles to 0.1 mm or deg, without rounding noise at their limits."""
+    return round(float(value), 1) + 0.0  # no -0.0
 
 
 def _number(value: float, digits: int = _DIGITS) -> float | None:

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from crane.common.samples import Array
-from crane.common.scratch import release
+from crane.common.scratch import in_blocks, release
 from crane.common.units import reading
 from crane.machine import Machine
-from crane.recordings.recording import FORCE_UNITS, VELOCITY, VELOCITY_UNITS
+from crane.recordings.recording import FORCE_UNITS, REFERENCE, VELOCITY, VELOCITY_UNITS
 from crane.view.page.arrays import packed
 
 if TYPE_CHECKING:
@@ -27,10 +27,13 @@ SPANS_PER_SECOND = 15.0  # in a long one
 MOST_SPANS = 1_100_000  # in all columns of a page
 SHOWN = 8  # lines that a plot shows at first
 
-ANGLES, STROKES = "Angles", "Strokes"
+ANGLES, STROKES, ERRORS = "Angles", "Strokes", "Errors"
 TORQUES, FORCES = "Torques", "Forces"
 # Groups in the order of the page; those of the first tuple are open at first.
-OPEN = (STROKES, FORCES, "Pressures", ANGLES, TORQUES, "Stroke velocities", "Angular velocities")
+OPEN = (
+    STROKES, FORCES, "Pressures", ANGLES, TORQUES, ERRORS, "Stroke velocities",
+    "Angular velocities",
+)  # fmt: skip
 CLOSED = (
     "Valve voltages", "Spools", "Flows", "Tip", "Passive angles", "Passive strokes",
     "Passive velocities", "Friction", "Energies", "Powers", "Volumes", "Signals", "Other",
@@ -40,7 +43,7 @@ _BY_UNIT = {
     "m3": "Volumes", "": "Signals",
 }  # fmt: skip
 _PREFIXES = ("pressure_", "voltage_", "spool_", "flow_", "friction_")
-_REFERENCE = "reference_"
+_ERROR = "error_"  # of a joint to its reference
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,13 +174,17 @@ def groups(
 
 
 def columns(machine: Machine, recording: "Recording") -> Iterator[Column]:
-    """All columns but time, each in its group; references with what they are references of."""
+    """All columns but time, each in its group; references with what they are references of.
+
+    Beside them what follows from them: errors, references less coordinates, and the sum of
+    kinetic and potential energy.
+    """
     channels = recording.channels
     used = set()
 
     def reference(name: str) -> Array | None:
-        used.add(_REFERENCE + name)
-        return channels.get(_REFERENCE + name)
+        used.add(REFERENCE + name)
+        return channels.get(REFERENCE + name)
 
     for i, joint in enumerate(recording.joints):
         unit = recording.units[joint]
@@ -204,20 +211,29 @@ def columns(machine: Machine, recording: "Recording") -> Iterator[Column]:
         rates = VELOCITY_UNITS[unit]
         wanted = reference(f"velocity_{joint}")
         yield Column(joint + VELOCITY, titles[1], joint, rates, recording.v[:, i], wanted)
+        if REFERENCE + joint in channels:
+            yield Column(_ERROR + joint, ERRORS, joint, unit, recording.error(joint))
         if joint in recording.free:
             continue
         yield Column(f"{joint}_force", titles[2], joint, FORCE_UNITS[unit], recording.tau[:, i])
     for name, values in channels.items():
-        if name.startswith(_REFERENCE):
+        if name.startswith(REFERENCE):
             continue
         unit = recording.channel_units[name]
         if not unit and name in machine.joints:
             unit = machine.unit(name)
         group, label = _place(machine, name, unit)
         yield Column(name, group, label, unit, values, reference(name))
+        if name == "potential" and unit == recording.channel_units.get("kinetic") == "J":
+            both = "kinetic + potential"
+            yield Column(both, group, both, unit, _sum(channels["kinetic"], values))
     for name, values in channels.items():
-        if name.startswith(_REFERENCE) and name not in used:
+        if name.startswith(REFERENCE) and name not in used:
             yield Column(name, "Other", name, recording.channel_units[name], values)
+
+
+def _sum(one: Array, other: Array) -> Array:
+    return in_blocks(lambda part: (one[part] + other[part])[:, None], len(one))[:, 0]
 
 
 def _place(machine: Machine, name: str, unit: str) -> tuple[str, str]:

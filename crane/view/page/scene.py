@@ -75,7 +75,8 @@ def build_scene(
     links = tuple(dict.fromkeys(visual.link for visual in visuals))
     some = np.unique(np.linspace(0, len(q) - 1, _LOOKED_AT).astype(int))
     poses = link_poses(machine, q[some], links)
-    lower, upper = _bounds(visuals, poses)
+    between = {link for item in machine.elements for link in item.between or ()}
+    lower, upper = _bounds(visuals, poses, link_poses(machine, q[some], between))
     floor = ground(machine, visuals)
     lower[2], upper[2] = min(lower[2], floor), max(upper[2], floor)
 
@@ -145,9 +146,11 @@ def _heading(machine: Machine, q: Array, size: float) -> float:
     return float(np.arctan2(y, x)) if np.hypot(x, y) > 1e-3 * size else 0.0
 
 
-def _bounds(visuals: Sequence[Visual], poses: Mapping[str, Array]) -> tuple[Array, Array]:
-    """Lowest and highest corner of everything in all frames."""
-    points = []
+def _bounds(
+    visuals: Sequence[Visual], poses: Mapping[str, Array], ends: Mapping[str, Array]
+) -> tuple[Array, Array]:
+    """Lowest and highest corner of everything in all frames, ends of springs included."""
+    points = [pose[:, :3, 3] for pose in ends.values()]
     for visual in visuals:
         pose, corners = poses[visual.link], visual.corners()
         moved = corners @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]

@@ -56,6 +56,8 @@ def run_summary(machine: Machine, recording: "Recording | None") -> dict[str, An
         change = float(channels[name][-1] - channels[name][0])
         if _number(change) != "0":
             facts.append((words, _quantity(change, "J")))
+    if count > 1 and summary.balance:
+        facts.append(("energy balance", summary.balance.replace("-", "\u2212")))
     if summary.tip_rms_error is not None and summary.tip_peak_error is not None:
         peak, rms = 1e3 * summary.tip_peak_error, 1e3 * summary.tip_rms_error
         facts.append(("tip to reference", f"{rms:.3g} mm RMS, {peak:.3g} mm peak"))

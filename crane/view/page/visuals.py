@@ -1,6 +1,7 @@
 """What a machine looks like: what its URDFs draw, or a skeleton."""
 
 import warnings
+from collections.abc import Collection
 
 import numpy as np
 import pinocchio as pin
@@ -16,7 +17,8 @@ def read_visuals(machine: Machine) -> list[Visual]:
     """The visuals of every link, or a skeleton where no URDF has any.
 
     A mesh whose file is missing or damaged is a box, and what cannot be drawn is left out, with a
-    warning; where nothing but boxes would be left, the skeleton is there, too.
+    warning; where nothing but boxes would be left, the skeleton is there, too. Bodies that slide
+    and have no visuals are blocks.
     """
     visuals: list[Visual] = []
     missing: list[str] = []
@@ -36,9 +38,11 @@ def read_visuals(machine: Machine) -> list[Visual]:
     if problems:
         more = f" ({len(problems)} such, crane check lists them)" if len(problems) > 1 else ""
         _warn(f"{problems[0]}{more}")
+    frames = machine.model.frames
+    shown = {frames[machine.frame(visual.link)].parentJoint for visual in visuals}
     if all(visual.shape is box for visual in visuals):
         visuals += skeleton(machine)
-    return visuals
+    return visuals + blocks(machine, shown)
 
 
 def _warn(text: str) -> None:
@@ -51,25 +55,63 @@ def _reach(machine: Machine) -> float:
     return max(float(np.linalg.norm(place.translation)) for place in places) or 1.0
 
 
-def skeleton(machine: Machine) -> list[Visual]:
-    """Bars from each joint to the joints and frames of the body it moves."""
+def _ends(machine: Machine) -> list[tuple[int, Array, str]]:
+    """Of each body, by its joint, where its frames and the next joints are (3,) [m]; names."""
     model = machine.model
-    links: dict[int, str] = {}  # joint -> the first link of the body it moves
-    ends: list[tuple[int, Array]] = []
-    for frame in model.frames:
+    bodies = (frame for frame in model.frames if frame.type == pin.FrameType.BODY)
+    ends = [(frame.parentJoint, frame.placement.translation, frame.name) for frame in bodies]
+    for joint in range(1, model.njoints):
+        end = model.jointPlacements[joint].translation
+        ends.append((model.parents[joint], end, model.names[joint]))
+    return ends
+
+
+def longest(machine: Machine) -> float:
+    """Largest distance from a joint to a frame of the body it moves [m]; 1 where all meet."""
+    return max(float(np.linalg.norm(end)) for _, end, _ in _ends(machine)) or 1.0
+
+
+def _links(machine: Machine) -> dict[int, str]:
+    """The first link of the body that each joint moves."""
+    links: dict[int, str] = {}
+    for frame in machine.model.frames:
         if frame.type == pin.FrameType.BODY:
             links.setdefault(frame.parentJoint, frame.name)
-            ends.append((frame.parentJoint, frame.placement.translation))
+    return links
+
+
+def blocks(machine: Machine, drawn: Collection[int]) -> list[Visual]:
+    """A block for each body with mass that slides, but for those that are drawn, by joints."""
+    model, links, width = machine.model, _links(machine), 0.11 * longest(machine)
+    found = []
     for joint in range(1, model.njoints):
-        ends.append((model.parents[joint], model.jointPlacements[joint].translation))
-    radius = 0.03 * max(float(np.linalg.norm(end)) for _, end in ends) or 0.02
+        column = model.joints[joint].idx_v
+        slides = column not in machine.coordinates.floating and machine.coordinates.slides[column]
+        if not slides or joint in drawn or not model.inertias[joint].mass:
+            continue
+        axis = np.ravel(model.joints[joint].createData().S)[:3]
+        along = pin.SE3(pin.Quaternion.FromTwoVectors(pin.XAxis, axis), np.zeros(3))
+        in_link = model.frames[machine.frame(links[joint])].placement.inverse() * along
+        size = (1.5 * width, width, width)
+        found.append(Visual(links[joint], Box(size), in_link.homogeneous, PLAIN))
+    return found
+
+
+def skeleton(machine: Machine) -> list[Visual]:
+    """Bars from each joint to the joints and frames of the body it moves.
+
+    Where springs are held by what stands still there is a ball alone: a bar would hide them.
+    """
+    model, links, radius = machine.model, _links(machine), 0.03 * longest(machine)
+    held = {link for item in machine.elements for link in item.between or ()}
     visuals = []
-    for body, end in ends:
+    for body, end, name in _ends(machine):
         in_link = model.frames[machine.frame(links[body])].placement.inverse()
         ball = in_link.homogeneous
         ball[:3, 3] = in_link.act(end)
         visuals.append(Visual(links[body], Sphere(1.5 * radius), ball, PLAIN))
-        if length := float(np.linalg.norm(end)):
+        length = float(np.linalg.norm(end))
+        if length and (body or name not in held):
             along = pin.Quaternion.FromTwoVectors(pin.ZAxis, end)
             bar = (in_link * pin.SE3(along, end / 2)).homogeneous
             visuals.append(Visual(links[body], Cylinder(radius, length), bar, PLAIN))

@@ -1,6 +1,6 @@
 """Rated loads over radius and height: contours, coloured by what ends them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import matplotlib as mpl
@@ -28,6 +28,8 @@ TINTS = (
 )  # fmt: skip
 _FREE = "#eeeeee"  # where nothing ends a load
 BODY, ROD = "#4a4f57", "#8b929b"
+_FONT, _LETTER, _APART = 7, 0.62, 1.5  # of labels: points, width, distance by that
+_TRIED = (0.5, 0.35, 0.65, 0.2, 0.8, 0.1, 0.9)  # shares of a line
 _LEVELS, _SHOWN = 8, (0.05, 0.9)  # contours at most, and between which quantiles of the loads
 _ROUND = np.array([1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
 
@@ -170,9 +172,49 @@ def _draw_contours(axes: Axes, chart: Capacity, k: int) -> None:
     lines = axes.contour(chart.radii, chart.heights, loads, levels, colors=[INK],
                          linewidths=0.9, zorder=4)  # fmt: skip
     unit, scale = reading("kg", max(level for level, _ in found))
-    words = axes.clabel(lines, fmt=lambda x: f"{scale * x:g} {unit}", fontsize=7)
+
+    def said(level: float) -> str:
+        return f"{scale * level:g} {unit}"
+
+    axes.apply_aspect()
+    size = float(np.ptp(axes.transData.transform([(0, 0), (1, 0)])[:, 0])) * 72 / axes.figure.dpi
+    places = label_places([(said(level), lines) for level, lines in found], size)
+    if not places:
+        return
+    words = axes.clabel(lines, fmt=said, fontsize=_FONT, manual=places)
     for word in words or ():
         word.set_path_effects([withStroke(linewidth=1.6, foreground="white")])
+
+
+def label_places(
+    lines: Sequence[tuple[str, list[Array]]], size: float
+) -> list[tuple[float, float]]:
+    """Where on lines there is room for their labels: none upon another, few on a bundle of lines.
+
+    Args:
+        lines: Words, and lines (n, 2) [m] that they stand on.
+        size: Points of a metre.
+    """
+    taken = np.empty((0, 2))
+    places: list[tuple[float, float]] = []
+    for words, ways in lines:
+        wide = _LETTER * _FONT * len(words) / size
+        high = _APART * _FONT / size
+        for way in ways:
+            along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1)))
+            if along[-1] < 1.5 * wide:
+                continue
+            for share in _TRIED:
+                at = along[-1] * share + wide * np.linspace(-0.5, 0.5, 5)
+                if at[0] < 0 or at[-1] > along[-1]:
+                    continue
+                spots = np.column_stack([np.interp(at, along, x) for x in way.T])
+                apart = np.linalg.norm(spots[:, None] - taken, axis=2)
+                if (apart > high).all():
+                    taken = np.concatenate([taken, spots])
+                    places.append((float(spots[2, 0]), float(spots[2, 1])))
+                    break
+    return places
 
 
 def _levels(low: float, high: float) -> list[float]:

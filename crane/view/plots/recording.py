@@ -62,6 +62,7 @@ STYLE: Any = {
 }
 # Distances of words from the axes of a box [points], of which matplotlib adds the last by itself.
 TICK_OFFSET, LABEL_OFFSET, PAD_OFFSET = 8.0, 14.0, 8.0
+_FLAT = 0.01  # of a path's size, what it may leave a plane by
 MOST_COLUMNS = 5  # joints beside each other
 # Least height of an axis [SI], so that rounding noise of a joint at rest looks like rest.
 LEAST_SPAN = {
@@ -85,11 +86,22 @@ LINES: Mapping[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class _Panel:
-    """One quantity of one joint over time [SI]: lines (N,) by what they are called."""
+    """One quantity of one joint over time [SI]: lines (N,) by what they are called.
+
+    With what they should be, errors to that: computed as they are drawn, as a long recording is
+    more than memory has room for.
+    """
 
     quantity: str
     unit: str
     lines: dict[str, Array]
+    wanted: Array | None = None
+
+    def drawn(self) -> Iterator[tuple[str, Array]]:
+        """Each line with its values (N,)."""
+        for label, values in self.lines.items():
+            release()
+            yield label, values if self.wanted is None else self.wanted - values
 
 
 def plot_recording(recording: Recording, path: str | Path) -> None:
@@ -122,11 +134,13 @@ def recording_figure(recording: Recording) -> Figure:
     One column per active joint with its displacement, velocity and force over time, in the units
     that the page of a run has, many joints in several bands below each other; of cylinders with
     valves also pressures, flows and signals. Where the channels tip_x, tip_y, tip_z exist, the
-    path of the tip is beside them. References (channels reference_<joint>,
-    reference_velocity_<joint>, reference_tip_x, ...) are dashed; with one for the tip comes its
-    distance from it.
+    path of the tip is beside them, in space, or in the plane of two coordinates where the third
+    hardly changes. References (channels reference_<joint>,
+    reference_velocity_<joint>, reference_tip_x, ...) are dashed; errors (references less
+    displacements) have a row of their own, and the tip its distance from its reference.
     """
     tip, joints = points(recording, "tip"), recording.joints
+    level = None if tip is None else _plane(tip, points(recording, "reference_tip"))
     by_joint = [_panels(recording, index) for index in range(len(joints))]
     kept = [i for i in range(len(by_joint[0])) if any(x[i].lines for x in by_joint)]
     panels = [[column[row] for column in by_joint] for row in kept]
@@ -134,9 +148,10 @@ def recording_figure(recording: Recording) -> Figure:
     with mpl.rc_context(STYLE):
         bands = -(-len(joints) // MOST_COLUMNS)
         columns = -(-len(joints) // bands)
-        widths = [1.0] * columns + [1.6] * (tip is not None)
+        in_space = tip is not None and level is None
+        widths = [1.0] * columns + [1.6 if in_space else 1.0] * (tip is not None)
         width = 2.4 * sum(widths) + 0.3
-        margin = 0.3 if tip is not None else 0.0  # the layout overlooks the label of the z axis
+        margin = 0.3 if in_space else 0.0  # the layout overlooks the label of the z axis
         layout = ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0 - margin / width, 1.0))
         figure = Figure(figsize=(width, 2.0 * rows * bands), layout=layout)
         grid = figure.add_gridspec(rows * bands, len(widths), width_ratios=widths)
@@ -146,13 +161,13 @@ def recording_figure(recording: Recording) -> Figure:
             places = {i: grid[rows * band + row, i - beside.start] for i in beside}
             _draw_row(figure, places, recording, panels, row, letters)
         if tip is not None:
-            _draw_tip(figure, grid, recording, tip, letters)
+            _draw_tip(figure, grid, recording, tip, level, letters)
         _caption(figure, recording)
     return figure
 
 
 def _panels(recording: Recording, column: int) -> list[_Panel]:
-    """Displacement, velocity and force of an active joint, and its cylinder's; some are empty."""
+    """Displacement, velocity, force and error of an active joint, its cylinder's; some empty."""
     name, channels = recording.joints[column], recording.channels
     unit = recording.units[name]
     turns, wanted = unit == "rad", f"reference_{name}"
@@ -170,6 +185,10 @@ def _panels(recording: Recording, column: int) -> list[_Panel]:
             {} if name in recording.free else lines(recording.tau),
         ),
     ]
+    if wanted in channels:
+        found.append(_Panel("error", unit, lines(recording.q), channels[wanted]))
+    else:
+        found.append(_Panel("error", unit, {}))
     for quantity, shown, names in HYDRAULIC_ROWS:
         own = [label for label, channel in names.items() if channel.format(name) != channel]
         there = {
@@ -185,16 +204,14 @@ def _scales(panels: Sequence[_Panel]) -> dict[str, tuple[str, float]]:
     """The unit that panels of a row are read in, and its scale, the same for equal units."""
     peaks: dict[str, float] = {}
     for panel in panels:
-        for values in panel.lines.values():
-            release()
+        for _, values in panel.drawn():
             peaks[panel.unit] = max(peaks.get(panel.unit, 0.0), float(np.abs(values).max()))
     return {unit: reading(unit, peak) for unit, peak in peaks.items()}
 
 
 def _draw_panel(axes: Axes, time: Array, panel: _Panel, unit: str, scale: float) -> None:
     marker = "o" if len(time) == 1 else None
-    for label, values in panel.lines.items():
-        release()
+    for label, values in panel.drawn():
         axes.plot(*envelope(time, scale * values), marker=marker, label=label, **LINES[label])
     axes.set_ylabel(f"{panel.quantity} [{unit}]")
     axes.margins(x=0.0, y=0.08)
@@ -231,14 +248,20 @@ def _draw_row(
 
 
 def _draw_tip(
-    figure: Figure, grid: GridSpec, recording: Recording, tip: Array, letters: Iterator[str]
-) -> None:
+    figure: Figure, grid: GridSpec, recording: Recording, tip: Array,
+    level: tuple[int, int] | None, letters: Iterator[str],
+) -> None:  # fmt: skip
     """The path of the tip in the last column, and its distance from a reference below it."""
     reference, distance = points(recording, "reference_tip"), tip_error(recording)
     tall = slice(3) if reference is None else slice(2)
-    space = figure.add_subplot(grid[tall, -1], projection="3d")
-    _draw_path(space, tip, reference)
-    _letter(space, letters)
+    if level is None:
+        space = figure.add_subplot(grid[tall, -1], projection="3d")
+        _draw_path(space, tip, reference)
+        _letter(space, letters)
+    else:
+        flat = figure.add_subplot(grid[tall, -1])
+        _draw_flat_path(flat, tip, reference, level)
+        _letter(flat, letters)
     if distance is None:
         return
     axes = figure.add_subplot(grid[2, -1])
@@ -248,13 +271,57 @@ def _draw_tip(
     axes.set_xlabel("time [s]")
 
 
+def _plane(tip: Array, reference: Array | None) -> tuple[int, int] | None:
+    """The two coordinates that a path lies in the plane of, but for 1 % of its size; else None.
+
+    Of a straight path upright planes go first, that of x and z before that of y and z.
+    """
+    low, high = _ends(tip, reference)
+    flat = high - low <= _FLAT * (high - low).max()
+    planes = (((0, 2), 1), ((1, 2), 0), ((0, 1), 2))
+    return next((plane for plane, across in planes if flat[across]), None)
+
+
+def _ends(tip: Array, reference: Array | None) -> tuple[Array, Array]:
+    """Lowest and highest corner (3,) of a path and its reference [m]."""
+    shown = [tip] if reference is None else [tip, reference]
+    low, high = zip(*((x.min(axis=0), x.max(axis=0)) for x in shown), strict=True)
+    return np.min(low, axis=0), np.max(high, axis=0)
+
+
+def _around(tip: Array, reference: Array | None) -> tuple[Array, Array]:
+    """Corners (3,) of a box around them that is nowhere flat [m]."""
+    low, high = _ends(tip, reference)
+    span = np.maximum(high - low, 0.4 * max(float((high - low).max()), 1e-2)) * 1.1
+    return (low + high - span) / 2, (low + high + span) / 2
+
+
+def _draw_flat_path(
+    axes: Axes, tip: Array, reference: Array | None, plane: tuple[int, int]
+) -> None:
+    """The path of the tip [m] in a plane, to scale."""
+    i, j = plane
+    x, y = thinned(tip)[:, plane].T
+    axes.plot(x, y, color=RECORDED, label="recording")
+    if reference is not None:
+        axes.plot(*thinned(reference)[:, plane].T, label="reference", **DASHED)
+    ends = ((0, "start", "white"), (-1, "end", RECORDED))
+    for end, name, face in ends:
+        place = x[end], y[end]
+        axes.plot(*place, "o", color=RECORDED, markerfacecolor=face, ms=5, label=name)
+        axes.annotate(name, place, (5, 4), textcoords="offset points", fontsize=7.5)
+    axes.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]", title="path of the tip")
+    low, high = _around(tip, reference)
+    axes.set(xlim=(low[i], high[i]), ylim=(low[j], high[j]), aspect="equal", anchor="N")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
+
+
 def _draw_path(axes: Axes3D, tip: Array, reference: Array | None) -> None:
     """The path of the tip [m] in space, to scale, with its shadow on the ground of the box."""
     tip, reference = thinned(tip), None if reference is None else thinned(reference)
-    shown = tip if reference is None else np.vstack([tip, reference])
-    low, high = shown.min(axis=0), shown.max(axis=0)
-    span = np.maximum(high - low, 0.4 * max(float((high - low).max()), 1e-2)) * 1.1
-    low, high = (low + high - span) / 2, (low + high + span) / 2
+    low, high = _around(tip, reference)
+    span = high - low
     x, y, z = tip.T
     axes.plot(x, y, np.full_like(z, low[2]), color="#a8a8a8", linewidth=1.0, label="shadow")
     axes.plot(x, y, z, color=RECORDED, label="recording")

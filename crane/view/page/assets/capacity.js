@@ -144,7 +144,7 @@ function show() {
   const pressed = here[PRESSURES].some((x) => x.length);
   const head = ["drive", "at", ...(pressed ? ["A [bar]", "B [bar]", "at most"] : [])];
   byId("drives").replaceChildren(make("table", {}, row("th", ...head), ...data.drives.map((one, i) =>
-    row("td", one.joint, `${number(here[STROKES][i])} ${one.unit}`,
+    row("td", one.joint, `${number(here[STROKES][i], 5)} ${one.unit}`,
       ...(pressed ? pressures(here[PRESSURES][i], one.limits) : [])))));
 }
 

@@ -79,12 +79,16 @@ function showLayers() {
     });
 }
 
-function showSummary({ facts, forces, limits }) {
+function showSummary({ facts, forces, limits }, differences) {
     const row = (cells, tag = "td") => make("tr", {}, ...cells.map((text, i) => make(i ? tag : "th", { textContent: text })));
     element("facts").append(make("table", {}, ...facts.map((cells) => row(cells))));
     if (forces.length) {
         const head = row(["", "range", "peak", "RMS"], "th");
         element("facts").append(make("table", {}, head, ...forces.map((cells) => row(cells))));
+    }
+    if (differences.length) {
+        const head = row(["second run", "differs by", "at"], "th");
+        element("facts").append(make("table", {}, head, ...differences.map((cells) => row(cells))));
     }
     for (const text of limits) element("facts").append(make("p", { textContent: text }));
 }
@@ -96,7 +100,7 @@ if (runs.length > 1) {
     element("over").textContent = `over: ${label || "second run"}${shift ? ` (its clock moved by ${spoken(shift)} s)` : ""}`;
     element("over").hidden = false;
 }
-showSummary(page.summary);
+showSummary(page.summary, page.differences);
 if (!page.groups.length) element("summary").querySelector("summary").textContent = "Machine";
 
 // On a small page the numbers stand below the plots, else in the corner of the picture.

@@ -1,6 +1,6 @@
 // What is drawn on the machine: forces, the tip's way, centres of mass, pins.
 
-const COLOURS = { push: "#cf4520", pull: "#1d63c9", tip: "#0d7d72", reference: "#e39a12", mass: "#1d2733", payload: "#7a3db8", pin: "#5d6b7a", load: "#b0257d" };
+const COLOURS = { push: "#cf4520", pull: "#1d63c9", tip: "#0d7d72", reference: "#e39a12", mass: "#1d2733", payload: "#7a3db8", pin: "#5d6b7a", load: "#b0257d", spring: "#56616d" };
 const FULL_TURN = 1.7 * Math.PI; // what the largest torque winds
 
 // Always visible, also within a cylinder's barrel.
@@ -61,6 +61,52 @@ class RoundArrow {
         this.tip.rotation.z = end;
         this.tip.scale.setScalar(Math.min(1, 0.6 * this.radius * end / this.head));
         paint(this.material, share);
+    }
+}
+
+// A spring, damper, gas strut or rope between two points, as long as they are apart.
+class Link {
+    constructor(parts, size, length, least) {
+        const radius = Math.min(0.025 * size, 0.15 * length);
+        const steel = new THREE.MeshPhongMaterial({ color: COLOURS.spring });
+        const bar = (thick) => new THREE.Mesh(new THREE.CylinderGeometry(thick, thick, 1, 16), steel);
+        this.object = new THREE.Group();
+        this.long = []; // parts of unit length along y, which follow it
+        if (parts.includes("coil")) {
+            const turns = 9, straight = 0.1; // of its length at each end
+            const coil = new THREE.Curve();
+            coil.getPoint = (t) => {
+                const wound = Math.min(Math.max((t - straight) / (1 - 2 * straight), 0), 1);
+                const out = radius * Math.min(1, 12 * wound, 12 * (1 - wound));
+                const angle = 2 * Math.PI * turns * wound;
+                return new THREE.Vector3(out * Math.cos(angle), t * length, out * Math.sin(angle));
+            };
+            const wire = new THREE.Mesh(new THREE.TubeGeometry(coil, 300, 0.13 * radius, 8), steel);
+            this.long.push([wire, (now) => { wire.scale.y = now / length; }]);
+        }
+        if (parts.includes("strut")) {
+            const [barrel, rod] = [bar(0.5 * radius), bar(0.22 * radius)];
+            barrel.scale.y = 0.7 * least;
+            barrel.position.y = 0.35 * least;
+            this.object.add(barrel);
+            this.long.push([rod, (now) => { [rod.scale.y, rod.position.y] = [now, now / 2]; }]);
+        }
+        if (parts.includes("line")) {
+            const line = bar(0.16 * radius);
+            this.long.push([line, (now) => { [line.scale.y, line.position.y] = [now, now / 2]; }]);
+        }
+        this.object.add(...this.long.map(([part]) => part));
+        this.object.traverse((item) => { item.castShadow = item.isMesh === true; });
+    }
+
+    set(start, end) {
+        const way = new THREE.Vector3(...end).sub(new THREE.Vector3(...start));
+        const now = way.length();
+        this.object.visible = now > 0;
+        if (!now) return;
+        this.object.position.fromArray(start);
+        this.object.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), way.divideScalar(now));
+        for (const [, follow] of this.long) follow(now);
     }
 }
 
@@ -193,6 +239,11 @@ class Marks {
             const title = `loads, ${metric(page.loads[0].full)}N at full length`;
             this.add("loads", title, [COLOURS.load], this.loads.map(({ arrow }) => arrow.object));
         }
+        this.springs = page.springs.map(({ name, ends, parts, length, least }) => (
+            { name, ends, link: new Link(parts, size, length || least || size, least) }));
+        if (this.springs.length) {
+            this.add("springs", "springs", [COLOURS.spring], this.springs.map(({ link }) => link.object));
+        }
         if (page.tip && motion.time.length > 1) {
             const way = some(motion.time.length).map((k) => this.tipAt(page.tip, motion.frame(k)));
             this.add("path", "tip path", [COLOURS.tip], [tube(way, 0.0022 * size, COLOURS.tip)]);
@@ -239,6 +290,9 @@ class Marks {
             const force = share.map((part) => this.motion.read(part, time));
             arrow.set(Array.from(this.tree.pose(poses, place).slice(12, 15)), force, Math.hypot(...force));
             arrow.material.color.set(COLOURS.load);
+        }
+        for (const { ends, link } of this.springs) {
+            link.set(...ends.map((place) => Array.from(this.tree.pose(poses, place).slice(12, 15))));
         }
         for (const move of this.moving) move(poses);
         viewer.set_dirty();
