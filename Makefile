@@ -10,13 +10,14 @@ INSTALL := $(BIN)/python -m pip install --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test slow lint docs bench reproduce clean
+.PHONY: help setup demo test slow long lint docs bench reproduce clean
 
 help:
 	@echo "make setup   create .venv and install the package with its extras and development tools"
 	@echo "make demo    simulate the mini forwarder; results in demo-output/"
 	@echo "make test    fast tests"
 	@echo "make slow    slow tests: browser, MuJoCo, long simulations"
+	@echo "make long    more of the same for an hour, before a release"
 	@echo "make lint    ruff and mypy"
 	@echo "make docs    the site, its tutorials executed and its links followed; build/site/index.html"
 	@echo "make bench   measure speed; results in docs/performance.md"
@@ -54,7 +55,10 @@ test: $(READY_DEV)
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 slow: $(READY_DEV)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "slow and not long"
+
+long: $(READY_DEV)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m long
 
 lint: $(READY_DEV)
 	$(BIN)/python -m ruff check .

@@ -31,14 +31,18 @@ def test_some_odd_graphs(kind):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("count", [60, pytest.param(200, marks=pytest.mark.long)])
 @pytest.mark.parametrize("kind", GRAPHS)
-def test_hundreds_of_odd_graphs(kind):
-    run(kind, 0, 200, "graphs.py")
+def test_more_odd_graphs(kind, count):
+    run(kind, 0, count, "graphs.py")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", range(2))
+@pytest.mark.parametrize(("first", "count"), [
+    (0, 200), pytest.param(0, 700, marks=pytest.mark.long),
+    pytest.param(2500, 700, marks=pytest.mark.long),
+])  # fmt: skip
 @pytest.mark.parametrize("kind", FORMATS)
-def test_hundreds_of_changed_files(kind, part):
-    """More by hand: python tests/fuzz.py KIND FIRST COUNT."""
-    run(kind, 2500 * part, 700)
+def test_more_changed_files(kind, first, count):
+    """Still more by hand: python tests/fuzz.py KIND FIRST COUNT."""
+    run(kind, first, count)

@@ -26,7 +26,7 @@ from crane.simulation.integration.stepwise import PythonStepper
 
 G, TANK = 9.81, 1e5
 SEAL, BRAKE = 1.5e-4, 2000.0
-METHODS = ("rosenbrock", "DOP853", pytest.param("Radau", marks=pytest.mark.slow))
+METHODS = ("rosenbrock", "DOP853", pytest.param("Radau", marks=pytest.mark.long))
 
 
 def run(*args, **options):
@@ -304,7 +304,7 @@ def test_machine_code_and_pinocchio_agree_along_a_motion(smoothing):
     assert rested > 0 or smoothing
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_backends_agree_over_a_motion(tmp_path):
     """Two loads that share a pump, by rosenbrock in machine code and scipy's BDF on Pinocchio."""
     machine = rig(tmp_path, ORIFICE | {"dead_band": 0.05}, joints=("x", "y"),

@@ -161,7 +161,7 @@ HYDRAULIC = ("payload.mass", "oil.bulk_modulus", "valve.X_lift.c1", "cylinder.X_
 @pytest.mark.parametrize(
     ("sticks", "share"),
     [
-        (True, 1e-4),
+        pytest.param(True, 1e-4, marks=pytest.mark.long),
         (False, 3e-4),
     ],
 )
