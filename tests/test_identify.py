@@ -195,6 +195,7 @@ def test_a_resting_joint_is_left_out(mini):
     assert result.base.rank < 60
     assert not any(name.startswith("q1.") for name in result.names)
     assert np.all(result.training.relative[1:] < 0.02)
+    assert np.isnan([result.training.rmse[0], result.training.relative[0]]).all()
 
 
 def test_recordings_of_simulations_serve(mini):

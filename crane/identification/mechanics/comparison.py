@@ -33,17 +33,20 @@ class ForceComparison(Brief):
         return self.measured - self.modelled
 
     def _rms(self, values: Array) -> Array:
-        count = np.maximum(self.moving.sum(axis=0), 1)
-        return np.sqrt((np.where(self.moving, values, 0.0) ** 2).sum(axis=0) / count)
+        squares = (np.where(self.moving, values, 0.0) ** 2).sum(axis=0)
+        count = self.moving.sum(axis=0)
+        return np.sqrt(
+            np.divide(squares, count, out=np.full_like(squares, np.nan), where=count > 0)
+        )
 
     @property
     def rmse(self) -> Array:
-        """(n,) root mean square of the residuals [N], [N m]."""
+        """(n,) root mean square of the residuals [N], [N m], nan where nothing moves."""
         return self._rms(self.residuals)
 
     @property
     def relative(self) -> Array:
-        """(n,) the same over the root mean square of the measured force, nan of a free joint."""
+        """(n,) the same over the root mean square of the measured force, nan of a free one."""
         size = self._rms(self.measured)
         return np.divide(self.rmse, size, out=np.full_like(size, np.nan), where=size > 0)
 
