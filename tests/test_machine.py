@@ -285,8 +285,7 @@ class TestDrivenBy:
             ),
             MINI,
         ).apply(tmp_path)
-        with pytest.warns(crane.CraneWarning):
-            machine = crane.load(path)
+        machine = crane.load(path)
         assert machine.driven_by(["q1", "q2", "q3"]).hydraulics is None
         assert machine.driven_by(["q1", "X2", "q2"]).hydraulics.joints == ("X2",)
         circuit = machine.driven_by(["X2", "X1", "q1"]).hydraulics

@@ -208,8 +208,7 @@ def test_a_recorded_force_wins_over_pressures(machine, columns, tmp_path):
 
 
 def test_a_locked_joint_needs_no_columns(path, columns, truth, tmp_path):
-    with pytest.warns(CraneWarning):
-        planar = crane.load(path, lock={"q1": 0.0})
+    planar = crane.load(path, lock={"q1": 0.0})
     del columns["q1 [deg]"], columns["q1_force [N m]"]
     recording = read_measured(planar, write(tmp_path, columns))
     assert recording.joints == ("X1", "X2")
@@ -218,8 +217,7 @@ def test_a_locked_joint_needs_no_columns(path, columns, truth, tmp_path):
 
 def test_other_joints_with_forces_are_joints_too(path, columns, truth, tmp_path):
     """What was held may be recorded as well; identification takes the joints that it needs."""
-    with pytest.warns(CraneWarning):
-        planar = crane.load(path, lock={"q1": 0.0})
+    planar = crane.load(path, lock={"q1": 0.0})
     recording = read_measured(planar, write(tmp_path, columns))
     assert recording.joints == ("X1", "X2", "q1")
     assert close(recording.tau[:, 2], truth["tau"][:, 0])
@@ -445,9 +443,7 @@ def test_beyond_a_dead_centre(machine, columns, truth, tmp_path):
 class TestRuns:
     def test_a_run_is_completed_by_its_machine(self, machine, path, columns, truth, tmp_path):
         file = write(tmp_path, columns, f"# machine: {path}")
-        with pytest.warns(CraneWarning):
-            named = read_run(file)
-        for recording in (named, read_run(file, machine)):
+        for recording in (read_run(file), read_run(file, machine)):
             assert np.abs(recording.q - truth["q"]).max() < 1e-12
 
     def test_without_a_machine_forces_are_wanted(self, columns, tmp_path):
