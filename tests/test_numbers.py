@@ -142,7 +142,7 @@ def test_titles():
         named = crane.Recording(
             [0.0], ("q",), [[0.0]], [[0.0]], [[0.0]], {"q": "rad"}, machine=machine
         )
-        assert subject(named, "arm") == name
+        assert subject(named) == name
 
 
 def test_what_a_notebook_shows_is_short(mini):
