@@ -49,7 +49,7 @@ def test_threads_of_the_linear_algebra_change_no_digit(recorded):
     found = []
     for threads in (1, 2):
         with threadpool_limits(threads, "blas"):
-            assert crane_sees() == 1 and {_["num_threads"] for _ in blas()} == {threads}
+            assert crane_sees() == 1 and max(one["num_threads"] for one in blas()) == threads
             found.append(crane.identify(machine, recording))
     assert found[0].names == found[1].names
     np.testing.assert_array_equal(found[0].values, found[1].values)

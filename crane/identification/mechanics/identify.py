@@ -139,7 +139,7 @@ def identify(
     if before is None:
         _check_scale(machine, rows)
     elif not feasible:
-        T = selection @ told.grouping
+        T = rows.base.grouping
         check_told(model.names, np.vstack(list(rows.factors[:, :, :-1] @ T)), before)
 
     def estimated(values: Array) -> tuple[Estimate, Array]:
@@ -159,7 +159,9 @@ def identify(
         parameters = estimate.values
         values = told.values(parameters)
         covariance = told.grouping @ estimate.covariance @ told.grouping.T
-    training, judged = rows.compare(selection @ values), None
+    # what is known of all parameters predicts another motion better than what this one tells
+    predicting = selection @ values if parameters is None else rows.base.values(parameters)
+    training, judged = rows.compare(predicting), None
     base, bandwidth, limits, remedy = (
         rows.base,
         rows.bandwidth,
@@ -173,7 +175,7 @@ def identify(
         judging = [motion for motion in others if long_enough(motion, bandwidth)]
         if judging:
             judge = Equations(model, base, judging, bandwidth, limits, progress)
-            judged = judge.compare(selection @ values) if judge.moving.any() else None
+            judged = judge.compare(predicting) if judge.moving.any() else None
         if judged is None or len(judging) < len(others):
             _tell_short(others, judging, bandwidth)
         if judged is not None:
