@@ -63,7 +63,11 @@ def test_methods_agree_on_two_pumps_and_an_accumulator(tmp_path, method, backend
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "backend", "tolerance"),
-    [("Radau", "compiled", 1e-10), ("DOP853", "compiled", 1e-12), ("LSODA", "pinocchio", 1e-10)],
+    [
+        pytest.param("Radau", "compiled", 1e-10, marks=pytest.mark.long),
+        ("DOP853", "compiled", 1e-12),
+        pytest.param("LSODA", "pinocchio", 1e-10, marks=pytest.mark.long),
+    ],
 )
 def test_other_methods_agree(whole, method, backend, tolerance):
     machine, signals, run = whole
