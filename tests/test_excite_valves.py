@@ -154,7 +154,7 @@ def test_a_start_that_is_given_is_what_the_machine_has(machine):
     assert told.variant({"load_x.mass": 1900.0}).changes["load_x.mass"] == 1900.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_estimates_spread_as_expected_and_less_than_of_a_joystick(machine, tmp_path):
     """Of twenty recordings, fitted from numbers that are wrong, by chi-square bounds of 99.9 %.
 
@@ -192,7 +192,7 @@ def test_estimates_spread_as_expected_and_less_than_of_a_joystick(machine, tmp_p
     assert np.prod(gain) > 2.0 ** len(FIT)  # a volume: one number may be given up for another
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_of_a_log_crane_they_tell_more_than_its_task_of_levers():
     """In the twenty seconds of the machine's own task, ln det and every deviation."""
     machine = crane.load("patu655", lock={"slew": 0.0}, changes={"payload.mass": 211.4})
