@@ -12,7 +12,7 @@ from hypothesis import settings  # noqa: E402
 
 import crane  # noqa: E402
 from crane.codegen import package  # noqa: E402
-from crane.codegen.llvm import objects  # noqa: E402
+from crane.common import cache  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
 
@@ -57,9 +57,9 @@ def place(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(crane, "LOADED", time.time() + 60.0)
     package._digest.cache_clear()
-    if tmp_path not in objects.folder().parents:
+    if tmp_path not in cache.folder().parents:
         pytest.skip("folders of the user are elsewhere here")
-    yield objects.folder()
+    yield cache.folder()
     package._digest.cache_clear()
 
 

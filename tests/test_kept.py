@@ -18,7 +18,8 @@ import crane
 from crane.closure.traced import Bodies
 from crane.codegen import TooLongError, package, program
 from crane.codegen.kept import place_of
-from crane.codegen.llvm import engine, objects
+from crane.codegen.llvm import engine
+from crane.common import cache
 from crane.dynamics.traced import Sweep
 
 PACKAGE = Path(crane.__file__).parent
@@ -238,8 +239,8 @@ def test_the_folder_is_bounded(place, monkeypatch):
     killed = place / ".left.1.part"
     killed.write_bytes(bytes(one))
     (place / "folder").mkdir()
-    monkeypatch.setattr(objects, "MOST", 4 * one)
-    monkeypatch.setattr(objects, "_left", {})  # a process that has not looked yet
+    monkeypatch.setattr(cache, "MOST", 4 * one)
+    monkeypatch.setattr(cache, "_left", {})  # a process that has not looked yet
     for factor in range(4, 12):
         for file in place.iterdir():  # a while later
             os.utime(file, (file.stat().st_mtime - 10,) * 2)

@@ -323,7 +323,7 @@ import json, sys, warnings
 import numpy as np
 import crane
 from crane.codegen.kept import Note
-from crane.codegen.llvm import objects
+from crane.common import cache
 warnings.simplefilter("ignore")
 crane.LOADED += 3600.0
 import test_kept_keys
@@ -348,7 +348,7 @@ for name in sys.argv[1:]:
             controllers.append(crane.control.controller(usual, machine, reference))
         for controller in controllers:
             crane.simulate(machine, controller, duration=0.002)
-for file in sorted(objects.folder().glob("*.note")):
+for file in sorted(cache.folder().glob("*.note")):
     note = Note.read(file.name)
     notes[file.name] = [note.code, note.longest, repr(note.functions)]
 print(json.dumps(notes))

@@ -244,11 +244,58 @@ def test_a_small_file_that_repeats_its_parts_is_drawn_up_to_a_bound(tmp_path):
     assert len(part.faces) == 90_000 and part.faces.max() == len(part.vertices) - 1
 
 
-def test_a_reader_that_ends_costs_one_mesh(tmp_path, monkeypatch):
+def test_what_a_mesh_holds_is_kept_by_its_content(tmp_path, place, monkeypatch):
+    """No process is started for it, and a copy or another name change nothing."""
+    (tmp_path / "a.stl").write_bytes(stl(5, 5))
+    (tmp_path / "a.off").write_bytes(stl(5, 5))
+    triangle = "usemtl red\nv 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n"
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\n" + triangle)
+    (tmp_path / "a.mtl").write_text("newmtl red\nKd 1 0 0\n")
+    asked, ask = [], meshes._ask
+
+    def told(names):
+        asked.clear()
+        return list(meshes.read_meshes(tmp_path / name for name in names).values())
+
+    def counted(files, triangles):
+        asked.append([file.name for file in files])
+        return ask(files, triangles)
+
+    monkeypatch.setattr(meshes, "_ask", counted)
+    names = ["a.stl", "a.off", "a.obj"]
+    (first,), wrong, (red,) = told(names)
+    assert asked == [names] and isinstance(wrong, str) and red.colour == (1, 0, 0, 1)
+    assert len(list(place.glob("*.mesh"))) == 1
+    (tmp_path / "b.stl").write_bytes(stl(5, 5))
+    (later,) = told(["b.stl"])[0]
+    assert not asked and later.colour == first.colour
+    assert np.array_equal(later.vertices, first.vertices)
+    assert np.array_equal(later.faces, first.faces)
+    # another file may colour it, and what is wrong may have been the moment's
+    (tmp_path / "a.mtl").write_text("newmtl red\nKd 0 1 0\n")
+    (green,) = told(names)[2]
+    assert asked == [names[1:]] and green.colour == (0, 1, 0, 1)
+    (tmp_path / "b.stl").write_bytes(stl(6, 6))
+    assert len(told(["b.stl"])[0][0].faces) == 6 and asked == [["b.stl"]]
+    for file in place.glob("*.mesh"):
+        file.write_bytes(file.read_bytes()[:-1])
+    assert len(told(["a.stl"])[0][0].faces) == 5 and asked == [["a.stl"]]
+
+
+def test_kept_meshes_count_as_triangles_to_draw(tmp_path, place, monkeypatch):
+    for faces in (30, 20):
+        (tmp_path / f"{faces}.stl").write_bytes(stl(faces, faces))
+    assert not isinstance(meshes.read_meshes([tmp_path / "30.stl"])[tmp_path / "30.stl"], str)
+    monkeypatch.setattr(mesh_process, "TRIANGLES", 49)
+    kept, wrong = meshes.read_meshes([tmp_path / "30.stl", tmp_path / "20.stl"]).values()
+    assert len(kept[0].faces) == 30 and wrong.startswith("with it there are more than")
+
+
+def test_a_reader_that_ends_costs_one_mesh(tmp_path, place, monkeypatch):
     """It begins anew after the file at which it ended."""
     source = Path(mesh_process.__file__).read_text()
     opened, imported = (
-        "            parts, arrays = _read(file, left)\n",
+        "            head, arrays = _read(file, left)\n",
         "import trimesh  # noqa: F401",
     )
     assert opened in source and imported in source
@@ -256,7 +303,7 @@ def test_a_reader_that_ends_costs_one_mesh(tmp_path, monkeypatch):
     ends += "            if 'end.stl' in file: os._exit(3)\n"
     triangle = "np.eye(3), np.arange(3).reshape(1, 3)"
     reads = f"            import numpy as np; arrays = [{triangle}]\n"
-    reads += "            parts = [{'vertices': 3, 'faces': 1, 'colour': None}]\n"
+    reads += "            head = {'parts': [{'vertices': 3, 'faces': 1, 'colour': None}]}\n"
     source = source.replace("SECONDS = 2 << 30, 20", "SECONDS = 2 << 30, 1")
     program = tmp_path / "reader.py"
     program.write_text(source.replace(opened, ends + reads).replace(imported, "pass  #"))
@@ -283,5 +330,6 @@ def test_meshes_are_read_without_what_takes_long_to_import(tmp_path):
         "heavy = [m for m in ('networkx', 'rtree', 'scipy', 'shapely') if sys.modules.get(m)]; "
         "open('told', 'w').write(f\"{heavy} {'trimesh' in sys.modules}\")"
     )
-    subprocess.run([sys.executable, "-P", "-c", code], input=b"[]", cwd=tmp_path, check=True)
+    nothing = b'{"files": [], "triangles": 0}'
+    subprocess.run([sys.executable, "-P", "-c", code], input=nothing, cwd=tmp_path, check=True)
     assert (tmp_path / "told").read_text() == "[] True"

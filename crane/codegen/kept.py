@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from crane.codegen.layout import Layout
-from crane.codegen.llvm import objects, settings
+from crane.codegen.llvm import settings
 from crane.codegen.package import changed, package_digest
 from crane.codegen.representation import ArgumentKind
+from crane.common import cache
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def place_of(depends: Any, kind: str = "note") -> str | None:
     if package is None:
         return None
     tracing = sys.version, np.__version__
-    return objects.named(repr((package, tracing, settings(), said)), kind)
+    return cache.named(repr((package, tracing, settings(), said)), kind)
 
 
 def _plain(value: Any) -> Any:
@@ -84,7 +85,7 @@ class Note:
     @classmethod
     def read(cls, place: str | None) -> "Note | None":
         """The note at a place, if there is one."""
-        text = None if place is None else objects.read(place)
+        text = None if place is None else cache.read(place)
         if text is None:
             return None
         said = json.loads(text)
@@ -103,4 +104,4 @@ class Note:
             for name, function in self.functions.items()
         }
         said = {"code": self.code, "longest": self.longest, "functions": functions}
-        objects.write(place, json.dumps(said).encode())
+        cache.write(place, json.dumps(said).encode())

@@ -14,7 +14,7 @@ _CLOCK = 2.0  # [s] by which the times of files may be coarse
 _ROOMS = ("codegen", "hydraulics", "closure", "dynamics", "motion", "control", "simulation")
 _CODE, _METHODS = (FunctionType, type), (staticmethod, classmethod)
 _KNOWN = sys.stdlib_module_names | {
-    "crane", "llvmlite", "numpy", "pinocchio", "platformdirs", "scipy",
+    "crane", "llvmlite", "numpy", "pinocchio", "scipy",
 }  # fmt: skip
 
 

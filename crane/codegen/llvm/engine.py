@@ -5,9 +5,9 @@ import functools
 from collections.abc import Iterable
 from typing import Any
 
-from crane.codegen.llvm.objects import named, object_code, read
 from crane.codegen.llvm.text import ENTRY, text_of
 from crane.codegen.representation import Formula, Routine
+from crane.common.cache import named, object_code, read
 
 _SPEED = 1  # of LLVM's levels of optimisation; higher ones take longer and gain nothing here
 _TUNING = {"slp_vectorization": False}  # takes long and gains nothing here

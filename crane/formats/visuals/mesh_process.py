@@ -1,9 +1,10 @@
 """A process that reads mesh files: whatever is in them can end this process, and nothing else.
 
-Run by crane.formats.visuals.meshes with the paths of files as JSON on its input. Per file it
-writes a line of JSON, {"parts": [{"vertices": V, "faces": F, "colour": [r, g, b, a] or null},
-...]} or {"wrong": "what"}, then the numbers of each part: V 3 float64, F 3 int64. Time and memory
-are limited, because readers of a dozen formats believe the sizes that a damaged file declares.
+Run by crane.formats.visuals.meshes, which sends it, as JSON, {"files": paths, "triangles": how
+many they may have together}. Per file it writes a line of JSON, {"parts": [{"vertices": V,
+"faces": F, "colour": [r, g, b, a] or null}, ...], "alone": whether nothing else was opened for it}
+or {"wrong": "what"}, then the numbers of each part: V 3 float64, F 3 int64. Time and memory are
+limited, because readers of a dozen formats believe the sizes that a damaged file declares.
 
 It imports nothing of the package, which takes longer than most meshes.
 """
@@ -30,7 +31,8 @@ def main() -> None:
     os.dup2(silence, 2)
     warnings.simplefilter("ignore")
     logging.disable()
-    files = json.load(sys.stdin)
+    asked = json.load(sys.stdin)
+    files, left = asked["files"], asked["triangles"]
     # what trimesh does without when it reads, and takes longer to import than most meshes to read
     for name in ("networkx", "rtree", "scipy", "shapely"):
         sys.modules[name] = None  # type: ignore[assignment]
@@ -40,13 +42,11 @@ def main() -> None:
         for _ in files:
             _send(out, {"wrong": str(error)}, [])
         return
-    left = TRIANGLES
     for file in files:
         _limit()
         try:
-            parts, arrays = _read(file, left)
-            left -= sum(part["faces"] for part in parts)
-            head: dict[str, Any] = {"parts": parts}
+            head, arrays = _read(file, left)
+            left -= sum(part["faces"] for part in head["parts"])
         except MemoryError:
             head, arrays = {"wrong": f"reading it takes more than {MEMORY >> 30} GB"}, []
         except Exception as error:  # whatever a reader raises for what is none of its format
@@ -76,16 +76,25 @@ def _send(out: BinaryIO, head: dict[str, Any], arrays: list[Any]) -> None:
     out.flush()
 
 
-def _read(file: str, most: int) -> tuple[list[dict[str, Any]], list[Any]]:
+def _read(file: str, most: int) -> tuple[dict[str, Any], list[Any]]:
     """Triangles of a file, in the frame of its scene, if there are not too many."""
     import numpy as np
     import trimesh
+
+    class Beside(trimesh.resolvers.FilePathResolver):
+        """Opens materials, pictures and buffers, and notes that it did."""
+
+        asked = False
+
+        def get(self, name: str) -> bytes:
+            Beside.asked = True
+            return super().get(name)
 
     kind = file.rpartition(".")[2].lower()
     if kind not in _FORMATS:
         raise ValueError(f"no mesh ends in .{kind}, known: {', '.join(_FORMATS)}")
     # unmerged vertices keep the edges of the drawing sharp
-    scene = trimesh.load_scene(file, process=False)
+    scene = trimesh.load_scene(file, resolver=Beside(file), process=False)
     own = sum(len(getattr(part, "faces", ())) for part in scene.geometry.values())
     repeated = max(_FEW, _TIMES * own)
     by_colour: dict[tuple[float, ...] | None, list[tuple[Any, Any]]] = {}
@@ -119,7 +128,7 @@ def _read(file: str, most: int) -> tuple[list[dict[str, Any]], list[Any]]:
         faces = np.concatenate([x + start for start, (_, x) in zip(first, pieces, strict=False)])
         parts.append({"vertices": len(vertices), "faces": len(faces), "colour": colour})
         arrays += [vertices, faces]
-    return parts, arrays
+    return {"parts": parts, "alone": not Beside.asked}, arrays
 
 
 def _colour(part: Any) -> tuple[float, ...] | None:

@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from crane.common import cache
 from crane.common.packages import find_file
 from crane.common.samples import Array
 from crane.formats.visuals import mesh_process
 
 _LARGEST = 200e6  # bytes of a file
+_SMALL = 4 << 20  # bytes of a file, and of what it holds, that is kept
 _ATTEMPTS = 3
 _PATIENCE = 10 * mesh_process.SECONDS  # [s] per file, for systems that do not limit computing
 
@@ -51,59 +53,94 @@ def read_meshes(files: Iterable[Path]) -> dict[Path, tuple[Part, ...] | str]:
     """Triangles of mesh files by their paths, or what is wrong with a file, in a few words.
 
     Files may be damaged, or declare sizes beyond all memory: another process reads them, with 20 s
-    of computing and 2 GB per file. Where it ends at a file, it begins anew after that, twice.
+    of computing and 2 GB per file. Where it ends at a file, it begins anew after that, twice. What
+    it says of small files is kept: it takes longer to start than to read a robot's meshes.
     """
     found: dict[Path, tuple[Part, ...] | str] = {}
-    waiting = []
+    waiting: dict[Path, str | None] = {}  # and under which name to keep what is said
     for file in dict.fromkeys(files):
         size = file.stat().st_size
         if size > _LARGEST:
             found[file] = f"{size / 1e6:.0f} MB, more than {_LARGEST / 1e6:.0f}"
+            continue
+        name = _name(file) if size <= _SMALL else None
+        kept = None if name is None else cache.read(name)
+        if kept is None:
+            waiting[file] = name
         else:
-            waiting.append(file)
+            found[file] = _told(kept)
     for _ in range(_ATTEMPTS):
-        told = _ask(waiting) if waiting else []
-        found |= dict(zip(waiting, told, strict=False))
-        waiting = waiting[len(told) :]
+        left = mesh_process.TRIANGLES - sum(map(_triangles, found.values()))
+        answers = _ask(list(waiting), left) if waiting else []
+        for (file, name), answer in zip(list(waiting.items()), answers, strict=False):
+            found[file] = _told(answer)
+            del waiting[file]
+            alone = len(answer) <= _SMALL and _head(answer).get("alone")
+            if name is not None and alone and name == _name(file):
+                cache.write(name, answer)
     return found | dict.fromkeys(waiting, f"not tried after {_ATTEMPTS} that ended the reader")
 
 
-def _ask(files: list[Path]) -> list[tuple[Part, ...] | str]:
+def _name(file: Path) -> str:
+    """Under which what is said of a file is kept: by the content, and by who reads it."""
+    builds = [cache.build_of(package) for package in ("trimesh", "collada")]
+    program = Path(mesh_process.__file__).read_bytes()
+    return cache.named(
+        repr((sys.version, builds, program, file.suffix, file.read_bytes())), "mesh"
+    )
+
+
+def _triangles(told: tuple[Part, ...] | str) -> int:
+    return 0 if isinstance(told, str) else sum(len(part.faces) for part in told)
+
+
+def _ask(files: list[Path], triangles: int) -> list[bytes]:
     """What the process says, of at least one file."""
     program = [sys.executable, "-P", mesh_process.__file__]  # its folder has an xml.py
-    wanted = json.dumps([str(file.resolve()) for file in files]).encode()
+    asked = {"files": [str(file.resolve()) for file in files], "triangles": triangles}
     alone = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # threads count as memory
     try:
         done = subprocess.run(
-            program, input=wanted, capture_output=True, env=alone, timeout=_PATIENCE * len(files)
+            program,
+            input=json.dumps(asked).encode(),
+            capture_output=True,
+            env=alone,
+            timeout=_PATIENCE * len(files),
         )
         said, status = done.stdout, done.returncode
     except subprocess.TimeoutExpired as late:
         said, status = late.stdout or b"", -signal.SIGTERM
-    told = _parsed(said)
-    if len(told) < len(files):
+    answers = list(_answers(said))
+    if len(answers) < len(files):
         slow = status in (-signal.SIGTERM, -getattr(signal, "SIGXCPU", 0))
         reason = f"reading it takes more than {mesh_process.SECONDS} s" if slow else "damaged"
-        told.append(reason)
-    return told
+        answers.append(json.dumps({"wrong": reason}).encode() + b"\n")
+    return answers
 
 
-def _parsed(said: bytes) -> list[tuple[Part, ...] | str]:
+def _answers(said: bytes) -> Iterator[bytes]:
     """Whole answers of the process."""
-    told: list[tuple[Part, ...] | str] = []
     at = 0
     while (end := said.find(b"\n", at)) >= 0:
-        head = json.loads(said[at:end])
-        at = end + 1
-        if "wrong" in head:
-            told.append(head["wrong"])
-            continue
-        size = sum(_bytes(part) for part in head["parts"])
-        if at + size > len(said):
+        parts = json.loads(said[at:end]).get("parts", ())
+        end += 1 + sum(map(_bytes, parts))
+        if end > len(said):
             break
-        told.append(tuple(_parts(head["parts"], said, at)))
-        at += size
-    return told
+        yield said[at:end]
+        at = end
+
+
+def _head(answer: bytes) -> dict[str, Any]:
+    head: dict[str, Any] = json.loads(answer[: answer.index(b"\n")])
+    return head
+
+
+def _told(answer: bytes) -> tuple[Part, ...] | str:
+    """The triangles of an answer, or what is wrong."""
+    head = _head(answer)
+    if "wrong" in head:
+        return str(head["wrong"])
+    return tuple(_parts(head["parts"], answer, answer.index(b"\n") + 1))
 
 
 def _bytes(part: dict[str, Any]) -> int:

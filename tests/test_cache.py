@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from crane.codegen import Program, Tape
-from crane.codegen.llvm import engine, objects
+from crane.codegen.llvm import engine
+from crane.common import cache
 
 
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     folder = tmp_path / "objects"
-    monkeypatch.setattr(objects, "folder", lambda: folder)
+    monkeypatch.setattr(cache, "folder", lambda: folder)
     return folder
 
 
@@ -55,8 +56,8 @@ def test_another_process_reads_it(place, translated):
     program = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
         "from pathlib import Path\n"
-        "import test_objects as t\n"
-        "t.objects.folder = lambda: Path(sys.argv[2])\n"
+        "import test_cache as t\n"
+        "t.cache.folder = lambda: Path(sys.argv[2])\n"
         "def never(*_): raise AssertionError('translated')\n"
         "t.engine._translated = never\n"
         "assert t.square_sum() == 16.0\n"
@@ -92,30 +93,30 @@ def test_without_a_folder_nothing_is_kept(place, translated):
 
 
 def test_what_was_used_least_lately_makes_room(place, monkeypatch):
-    monkeypatch.setattr(objects, "MOST", 400)  # three of them
+    monkeypatch.setattr(cache, "MOST", 400)  # three of them
     for number, name in enumerate("abc"):
-        objects.object_code(name, lambda: b"x" * 100)
+        cache.object_code(name, lambda: b"x" * 100)
         for file in place.iterdir():
             if file.stat().st_mtime > 1e9:
                 os.utime(file, (number, number))
-    first = objects.object_code("a", lambda: b"never")  # used now
-    objects.object_code("d", lambda: b"y" * 100)
+    first = cache.object_code("a", lambda: b"never")  # used now
+    cache.object_code("d", lambda: b"y" * 100)
     left = {file.read_bytes()[-1:] for file in place.iterdir()}
     assert first == b"x" * 100 and left == {b"x", b"y"}
-    assert objects.object_code("a", lambda: b"gone") == first
-    assert objects.object_code("b", lambda: b"gone") == b"gone"
+    assert cache.object_code("a", lambda: b"gone") == first
+    assert cache.object_code("b", lambda: b"gone") == b"gone"
 
 
 def test_the_folder_is_not_looked_through_each_time(place, monkeypatch):
-    looks, look = [], objects._files
+    looks, look = [], cache._files
 
     def counted(folder):
         looks.append(folder)
         return look(folder)
 
-    monkeypatch.setattr(objects, "_files", counted)
-    monkeypatch.setattr(objects, "MOST", 64 * 132)  # with their digests
+    monkeypatch.setattr(cache, "_files", counted)
+    monkeypatch.setattr(cache, "MOST", 64 * 132)  # with their digests
     for number in range(100):
-        objects.object_code(str(number), lambda: b"x" * 100)
+        cache.object_code(str(number), lambda: b"x" * 100)
         assert len(list(place.iterdir())) == min(number + 1, 64 - (63 - number) % 4)
     assert len(looks) == 25

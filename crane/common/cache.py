@@ -1,9 +1,8 @@
-"""Machine code kept between runs: what was compiled once is read from a folder of the user's.
+"""What is kept between runs, machine code above all: found once, it is read from a folder.
 
-A file per program, named by a digest of all that its code depends on, and small files that other
-modules keep beside. Each begins with a digest of its own name and the rest, so that one that is
-damaged or belongs elsewhere is made anew. Where the folder cannot be written or belongs to someone
-else, nothing is kept.
+A file each, in the user's cache, named by a digest of all that its content depends on. It begins
+with a digest of its own name and the rest, so that one that is damaged or belongs elsewhere is
+made anew. Where the folder cannot be written or belongs to someone else, nothing is kept.
 """
 
 import hashlib
@@ -11,6 +10,7 @@ import os
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 
 from platformdirs import user_cache_path
@@ -25,7 +25,7 @@ _left: dict[Path, int] = {}  # bytes that this process may write before it looks
 
 
 def folder() -> Path:
-    """Where machine code is kept."""
+    """Where things are kept."""
     return user_cache_path("crane", appauthor=False) / "objects"
 
 
@@ -47,6 +47,15 @@ def object_code(depends: str, make: Callable[[], bytes]) -> bytes:
         found = make()
         write(name, found)
     return found
+
+
+def build_of(package: str) -> tuple[int, int] | None:
+    """What differs between builds of a package, which need not be imported; None if not here."""
+    spec = find_spec(package)
+    if spec is None or spec.origin is None:
+        return None
+    about = os.stat(spec.origin)
+    return about.st_mtime_ns, about.st_size
 
 
 def read(name: str) -> bytes | None:
