@@ -12,6 +12,7 @@ from hypothesis import settings  # noqa: E402
 
 import crane  # noqa: E402
 from crane.codegen import package  # noqa: E402
+from crane.codegen.llvm import engine  # noqa: E402
 from crane.common import cache  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
@@ -19,6 +20,13 @@ DATA = Path(__file__).parent / "data"
 # postures take milliseconds, the first one of a machine more: time says nothing
 settings.register_profile("crane", deadline=None, max_examples=60, derandomize=True)
 settings.load_profile("crane")
+
+
+def pytest_configure(config):
+    """Fast tests translate without optimising, in a sixth of the time: they compile hundreds of
+    programs that run for milliseconds. Slow ones, and all other processes, do as users do."""
+    if config.option.markexpr == "not slow and not long":
+        engine._SPEED = 0
 
 
 @pytest.fixture(scope="session")
@@ -57,10 +65,13 @@ def place(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(crane, "LOADED", time.time() + 60.0)
     package._digest.cache_clear()
+    monkeypatch.setattr(engine, "_SPEED", 1)  # as another process has it
+    engine.settings.cache_clear()
     if tmp_path not in cache.folder().parents:
         pytest.skip("folders of the user are elsewhere here")
     yield cache.folder()
     package._digest.cache_clear()
+    engine.settings.cache_clear()
 
 
 @pytest.fixture

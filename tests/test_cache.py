@@ -60,6 +60,7 @@ def test_another_process_reads_it(place, translated):
         "t.cache.folder = lambda: Path(sys.argv[2])\n"
         "def never(*_): raise AssertionError('translated')\n"
         "t.engine._translated = never\n"
+        f"t.engine._SPEED = {engine._SPEED}\n"
         "assert t.square_sum() == 16.0\n"
     )
     here = os.path.dirname(__file__)

@@ -133,10 +133,10 @@ def test_python_follows_tyres_as_machine_code_does(block):
     tyre = {"lateral_stiffness": 2e5, "lateral_damping": 2e3, "friction": 0.4}
     loads = feet(0.3, stiffness=1e5, damping=2.0, **tyre)
     both = [
-        run(block, loads, start(block, 0.3), 0.1, method="rk4", backend=backend).q
-        for backend in ("compiled", "pinocchio")
+        run(block, loads, start(block, 0.3, above=1e-3), 0.1, method="rk4", backend=backend).q
+        for backend in ("compiled", "pinocchio")  # where it just touches, rounding decides
     ]
-    assert both[1] == pytest.approx(both[0], abs=1e-9)
+    assert both[1] == pytest.approx(both[0], abs=1e-13)
 
 
 def test_it_tips_where_its_weight_leaves_its_feet(block):

@@ -12,6 +12,7 @@ from broken import DATA
 import crane
 from crane.codegen import kept_result, results
 from crane.codegen.kept import place_of
+from crane.common import cache
 from crane.description import bundled
 
 MINI = {
@@ -75,8 +76,8 @@ def test_what_fails_is_not_kept(place):
 
 def test_another_build_of_what_finds_it_is_another_place(place, monkeypatch):
     kept_result("what", lambda: 1, "no.such.module")
-    build = results._build_of
-    monkeypatch.setattr(results, "_build_of", _Newer(build("scipy")))
+    build = cache.build_of
+    monkeypatch.setattr(cache, "build_of", _Newer(build("scipy")))
     assert kept_result("what", lambda: 2, "no.such.module") == 2
 
 

@@ -17,7 +17,7 @@ class Code:
     """Machine code of a program.
 
     Args:
-        name: Under which it is kept, see `crane.codegen.llvm.objects`.
+        name: Under which it is kept, see `crane.common.cache`.
         code: As LLVM put it out.
     """
 
