@@ -13,7 +13,8 @@ import crane
 import crane.cli
 from crane.common.errors import InputError
 from crane.description import bundled, changed, parameters
-from crane.formats import read
+from crane.formats import loading, read
+from crane.formats.loading import Variants
 from crane.hydraulics.components import Spool
 
 pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
@@ -134,6 +135,34 @@ def test_what_cannot_be_is_refused(changes, message):
     with pytest.raises(InputError) as caught:
         crane.load("mini_forwarder", changes)
     assert str(caught.value).startswith(message) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "alike", "other"),
+    [
+        ("mini_forwarder", {"link3.mass": 0.25, "friction.X1.coulomb": 20.0}, {"link3_G.x": 0.1}),
+        ("patu655", {"payload.mass": 300.0, "valve.X_lift.c1": 6e-7}, {"X_lift.upper": 0.4}),
+        ("excavator", {"oil.bulk_modulus": 1e9, "bucket.mass": 400.0}, {"slew.lower": -1.0}),
+    ],
+)
+def test_numbers_that_leave_the_loops_alone_do_not_close_them_again(
+    name, alike, other, monkeypatch
+):
+    """What comes of it is as if all had been loaded with these numbers, to the last bit."""
+    variants, closings = Variants(crane.load(name)), []
+    closed = loading.closed
+    monkeypatch.setattr(loading, "closed", lambda *x: closings.append(x) or closed(*x))
+    for changes, count in ((alike, 0), (other, 1), ({**alike, **other}, 0), ({}, 0)):
+        closings.clear()
+        found = variants.machine(changes)
+        assert len(closings) == count
+        anew = crane.load(name, changes)
+        for machine in (found, anew):
+            machine.closure.solve(machine.closure.home[machine.closure.active])
+        runs = [crane.simulate(x, duration=0.05) for x in (found, anew)]
+        assert np.array_equal(found.home, anew.home)
+        assert found.active == anew.active and found.friction == anew.friction
+        assert np.array_equal(runs[0].q, runs[1].q) and np.array_equal(runs[0].v, runs[1].v)
 
 
 def test_a_geometry_that_does_not_close_is_refused():

@@ -163,6 +163,7 @@ def test_what_knows_cylinders_alone_says_so(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_calibration_finds_numbers_of_pumps_and_elements(tmp_path):
     """From a recording of the truth, by a machine whose throttles are 7 and 15 % off."""
     machine = everything(tmp_path)

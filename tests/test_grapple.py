@@ -362,6 +362,7 @@ def test_a_command_tells_what_sway_is_left():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_all_payloads_leave_a_tenth_of_the_sway():
     found = crane.sway_study(NAME, "swing", (0.0, 125.0, 375.0, 500.0))
     assert len(found.rows) == 4 * 2 * len(METHODS)

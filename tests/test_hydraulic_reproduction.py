@@ -393,6 +393,7 @@ def test_the_published_page_is_complete():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_script_writes_the_page(tmp_path):
     page = tmp_path / "validation" / "page.md"
     script = ROOT / "scripts" / "reproduce_hydraulic_forwarder.py"

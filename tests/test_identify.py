@@ -85,6 +85,7 @@ def test_intervals_cover_the_truth(mini, method):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_intervals_cover_the_truth_of_rigs_as_users_identify_them():
     """12 rigs with settings of their own finding: bodies, friction with stiction, all sensors."""
     machine = crane.load("mini_forwarder")

@@ -88,7 +88,10 @@ def test_every_command_that_writes_is_here():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=pytest.mark.long) if x == "calibrate" else x for x in COMMANDS],
+)
 def test_old_or_new_wherever_it_is_killed(name, inputs, tmp_path):
     words, target = COMMANDS[name]
     place = tmp_path / "place"

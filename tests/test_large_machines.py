@@ -20,12 +20,13 @@ MACHINES = [
     ("chain", 4), ("chain", 13), ("tree", 16), ("ring", 4), ("ring", 12), ("spatial ring", 6),
     ("spatial ring", 10),
     *(
-        pytest.param(family, joints, marks=pytest.mark.slow)
-        for family, sizes in (
-            ("chain", (61, 100)), ("tree", (61, 100)), ("ring", (30, 60)),
-            ("spatial ring", (30, 60)),
+        pytest.param(family, joints, marks=(pytest.mark.slow, *marks))
+        for marks, sizes in (
+            ((), (("chain", 61), ("tree", 61), ("ring", 30), ("spatial ring", 30))),
+            ((pytest.mark.long,),
+             (("chain", 100), ("tree", 100), ("ring", 60), ("spatial ring", 60))),
         )
-        for joints in sizes
+        for family, joints in sizes
     ),
 ]  # fmt: skip
 EACH = pytest.mark.parametrize(("family", "joints"), MACHINES)

@@ -107,6 +107,7 @@ def peak(*arguments):
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is counted otherwise here")
+@pytest.mark.long
 def test_memory_grows_by_less_than_a_recording(tmp_path):
     """Three minutes later a recording of 40 columns has grown by 320 bytes a sample."""
     taken = {}

@@ -10,6 +10,7 @@ from judge import judge
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_some_options_at_the_edge():
     assert judge("fuzz_options.py", 0, 12) == 12
 

@@ -461,7 +461,11 @@ def test_a_second_recording_is_a_ghost_with_lines_of_its_own(machine, recording,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [(1280, 720), (390, 844), (844, 390), (768, 1024)])
+@pytest.mark.parametrize(
+    "size",
+    [(1280, 720), (390, 844), *(pytest.param(x, marks=pytest.mark.long)
+                                for x in ((844, 390), (768, 1024)))],
+)  # fmt: skip
 def test_one_sample_and_a_still_machine_fit_in_every_window(machine, recording, opened, size):
     for shown in (part(recording, np.array([70])), None, recording):
         page = opened(machine, shown, size=size, has_touch=size[0] < 1000)

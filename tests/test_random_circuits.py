@@ -11,7 +11,9 @@ from random_circuits import bounded
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(0, 40, 10))
+@pytest.mark.parametrize(
+    "first", [0, *(pytest.param(x, marks=pytest.mark.long) for x in (10, 20, 30))]
+)
 def test_random_circuits_balance(first):
     """Oil and energy to 1e-6 of what went through, within a minute each."""
     found = [bounded(seed) for seed in range(first, first + 10)]

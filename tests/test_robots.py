@@ -20,8 +20,10 @@ FREEDOMS = {
 FALLS = {
     "5bar_linkage_iso6d": 1.0, "robot_delta": 1.0, "digit_like_2legs": 0.3, "wl16_like": 1.0,
 }  # fmt: skip
-LARGE = ("digit_like_2legs", "wl16_like")
-EVERY = [pytest.param(x, marks=pytest.mark.slow) if x in LARGE else x for x in FREEDOMS]
+LARGE = {
+    "digit_like_2legs": pytest.mark.slow, "wl16_like": (pytest.mark.slow, pytest.mark.long),
+}  # fmt: skip
+EVERY = [pytest.param(x, marks=LARGE.get(x, ())) for x in FREEDOMS]
 
 pytestmark = pytest.mark.skipif(
     not ROBOTS.exists(), reason="the robots, ../shared/data, are not there"

@@ -158,10 +158,11 @@ HYDRAULIC = ("payload.mass", "oil.bulk_modulus", "valve.X_lift.c1", "cylinder.X_
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("sticks", "share"),
     [
-        pytest.param(True, 1e-4, marks=pytest.mark.long),
+        (True, 1e-4),
         (False, 3e-4),
     ],
 )

@@ -244,7 +244,7 @@ def workers(nanny):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("nanny", [True, False])
+@pytest.mark.parametrize("nanny", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_worker_that_dies_loses_nothing(nanny, tmp_path):
     """One of two workers is killed at a third of the way, and started again or not."""
     vary = {"link3_G.x": np.linspace(0.09, 0.1, 6), "payload.mass": np.linspace(0, 0.1, 3)}

@@ -151,6 +151,22 @@ class Closure(Brief):
             f"{', '.join(self.active_names)}"
         )
 
+    def of_alike(
+        self, model: pin.Model, loops: Sequence[LoopSpec], couplings: Sequence[Coupling]
+    ) -> "Closure | None":
+        """This closure, of a tree that differs in masses alone; None where more differs.
+
+        Args:
+            model: The tree, of the same structure.
+            loops: Its loops.
+            couplings: Its couplings.
+        """
+        if not _alike(LoopEquations(model, loops, couplings), self.equations):
+            return None
+        other = copy.copy(self)
+        other._local = threading.local()  # where a thread begins is no one else's
+        return other
+
     def near(
         self, model: pin.Model, loops: Sequence[LoopSpec], couplings: Sequence[Coupling]
     ) -> "Closure":

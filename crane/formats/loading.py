@@ -2,7 +2,7 @@
 
 import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from crane.closure import Closure
 from crane.common.counted import few_warnings
 from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.packages import giving, package_folders, values_by_name
-from crane.description import MachineSpec, changed, driven, locked, parameters
+from crane.description import Coupling, LoopSpec, MachineSpec, changed, driven, locked, parameters
 from crane.description.floating import floated, freedoms_of
 from crane.description.sources import WITH, find
 from crane.formats.ambiguity import warn_of_assemblies
@@ -75,6 +75,10 @@ def load(
         return replace(machine, packages=said.packages, arguments=MappingProxyType(said.arguments))
 
 
+Known = Callable[[pin.Model, Sequence[LoopSpec], Sequence[Coupling]], Closure | None]
+_REMEMBERED = (
+    3  # closures of variants: what is looked at beside one shares its loops or has its own
+)
 # What machines were made of before changes and locks, so that `Variants` need not read it again.
 _UNCHANGED: WeakKeyDictionary[Closure, MachineSpec] = WeakKeyDictionary()
 
@@ -105,10 +109,15 @@ class Variants:
         # of a payload the description does not say that it is one
         self.values = parameters(self.spec) | dict(machine.changes)
         self._unchanged = unchanged
+        self._known = [machine.closure] if machine.closure in _UNCHANGED else []
 
     def machine(self, changes: Mapping[str, float]) -> Machine:
         """The machine with some of its numbers changed, see `load`."""
-        return self._with(changes, None)
+        known = self._known
+        made = self._with(changes, lambda *tree: _of_alike(known, *tree))
+        if all(made.closure.structure is not closure.structure for closure in known):
+            self._known = [made.closure, *known][:_REMEMBERED]
+        return made
 
     def near(self, changes: Mapping[str, float]) -> Machine:
         """The machine with numbers changed so little that its loops are the same.
@@ -117,13 +126,13 @@ class Variants:
         """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CraneWarning)
-            return self._with(changes, self._machine.closure)
+            return self._with(changes, self._machine.closure.near)
 
-    def _with(self, changes: Mapping[str, float], near: Closure | None) -> Machine:
+    def _with(self, changes: Mapping[str, float], known: Known) -> Machine:
         was, every = self._machine, {**self._machine.changes, **changes}
         chosen = was.chosen.get("active"), was.chosen.get("free")
         with few_warnings(), self._giving():
-            made = _assembled(self._unchanged, every, was.locks, *chosen, was.floats, near)
+            made = _assembled(self._unchanged, every, was.locks, *chosen, was.floats, known)
         return replace(made, packages=was.packages, arguments=was.arguments)
 
     def _giving(self) -> AbstractContextManager[object]:
@@ -163,7 +172,7 @@ def _assembled(
     active: Sequence[str] | None,
     free: Sequence[str] | None,
     floating: bool | tuple[str, ...],
-    near: Closure | None = None,
+    known: Known = lambda *_: None,
 ) -> Machine:
     said, unchanged = {"active": active, "free": free}, spec
     if changes:
@@ -171,9 +180,7 @@ def _assembled(
     if lock:
         spec = locked(spec, lock)
     model = assemble(spec)
-    closure = (
-        _closed(spec, model) if near is None else near.near(model, spec.loops, spec.couplings)
-    )
+    closure = known(model, spec.loops, spec.couplings) or _closed(spec, model)
     _UNCHANGED[closure] = unchanged
     check_masses(spec, model, closure)
     check_elements(spec, closure)
@@ -216,6 +223,17 @@ def _assembled(
         locks=MappingProxyType({name: float(value) for name, value in (lock or {}).items()}),
     )
     return machine.under(*spec.external) if spec.external else machine
+
+
+def _of_alike(
+    closures: Sequence[Closure],
+    model: pin.Model,
+    loops: Sequence[LoopSpec],
+    couplings: Sequence[Coupling],
+) -> Closure | None:
+    """One of some closures if the tree is at the same places as its own."""
+    found = (closure.of_alike(model, loops, couplings) for closure in closures)
+    return next((closure for closure in found if closure is not None), None)
 
 
 def _closed(spec: MachineSpec, model: pin.Model) -> Closure:

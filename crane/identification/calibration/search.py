@@ -66,7 +66,7 @@ class Search:
         problem.rough = ROUGH
         # what smoothed friction leaves is no measure of what is left in the end: it is taken anew
         for problem.smooth, problem.slopes in _SMOOTHER if self._sticks else ():
-            z = self._minimum(z)
+            z = self._minimum(z, _BEGUN)
             self.sizes = self._fresh(z)
         return self.onward(z)
 
