@@ -23,5 +23,5 @@ np.savetxt("log.csv", table, delimiter=",", header=heads, comments="")
 found = crane.calibrate(described, "log.csv", list(truth), train=(0.0, 3.0))  # the rest judges
 print(found.to_text())
 for one in found.fitted:
-    print(f"{one.name} is {one.value:.2f} +- {one.interval:.2g} and not {one.before:g}")
+    print(f"{one.name} is {one.value:.1f} +- {one.interval:.1g} and not {one.before:g}")
     assert abs(one.value - truth[one.name]) < 2 * one.interval

@@ -154,6 +154,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_five_minutes_at_a_kilohertz_unthinned():
     """Their regressor alone takes 0.5 GB, and five copies were made of it."""
     command = [sys.executable, "-W", "ignore", "-c", LONG]

@@ -32,7 +32,7 @@ def test_oil_and_energy_balance(whole):
 @pytest.mark.parametrize(
     ("method", "backend"),
     [
-        pytest.param("Radau", "compiled", marks=pytest.mark.slow),
+        pytest.param("Radau", "compiled", marks=(pytest.mark.slow, pytest.mark.long)),
         ("DOP853", "compiled"),
         pytest.param("LSODA", "pinocchio", marks=pytest.mark.slow),
     ],

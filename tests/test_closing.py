@@ -23,6 +23,7 @@ def test_as_many_close_as_with_scipy():
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_two_hundred_close():
     assert_closed(200)
 
@@ -92,7 +93,11 @@ def test_the_nearest_assembly_is_taken_and_others_are_told(kind, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["four_bar", "bucket", "rssr", "crane", "six_bar", "platform"])
+@pytest.mark.parametrize(
+    "kind",
+    ["bucket", "crane", *(pytest.param(x, marks=pytest.mark.long)
+                          for x in ("four_bar", "rssr", "six_bar", "platform"))],
+)  # fmt: skip
 def test_no_silent_second_branch(kind, tmp_path):
     assert sum(assert_nearest_and_told(kind, seed, tmp_path) for seed in range(2, 14))
 

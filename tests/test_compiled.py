@@ -150,7 +150,7 @@ def test_every_quantity_agrees_with_pinocchio(machines, name, quantities):
 
 
 @pytest.mark.parametrize("kind", oracles.LOCKED)
-@pytest.mark.parametrize("count", [2, pytest.param(7, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [2, pytest.param(7, marks=(pytest.mark.slow, pytest.mark.long))])
 def test_random_mechanisms_agree_with_pinocchio(count, kind, tmp_path):
     """Six kinds of loops, seven mechanisms of each: 42."""
     tested, seed = 0, 1000 * list(oracles.LOCKED).index(kind)

@@ -110,16 +110,18 @@ def draw(kind, strength, rng, count, joints):
 @pytest.mark.parametrize(
     ("estimator", "kind", "strength", "gaps", "count"),
     [
-        (weighted, "ar", -0.5, False, 1000),
-        (weighted, "ar", 0.0, True, 1000),
-        (weighted, "ar", 0.9, False, 1000),
-        (weighted, "ar", 0.95, False, 1000),
         (weighted, "ar", 0.95, True, 1000),
         (huber, "ar", 0.9, False, 1000),
         (weighted, "low", 0.3, True, 1000),
-        (weighted, "low", 0.1, True, 2500),
+        *(pytest.param(*x, marks=pytest.mark.long) for x in (
+            (weighted, "ar", -0.5, False, 1000),
+            (weighted, "ar", 0.0, True, 1000),
+            (weighted, "ar", 0.9, False, 1000),
+            (weighted, "ar", 0.95, False, 1000),
+            (weighted, "low", 0.1, True, 2500),
+        )),
     ],
-)
+)  # fmt: skip
 def test_intervals_cover_the_truth(estimator, kind, strength, gaps, count):
     """200 runs of two joints with slow, sharp and constant columns: 95 % within 90 to 99 %."""
     rng, size, joints = np.random.default_rng(4), 6, 2

@@ -31,7 +31,7 @@ def test_some_odd_graphs(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [60, pytest.param(200, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [30, pytest.param(200, marks=pytest.mark.long)])
 @pytest.mark.parametrize("kind", GRAPHS)
 def test_more_odd_graphs(kind, count):
     run(kind, 0, count, "graphs.py")
@@ -39,7 +39,7 @@ def test_more_odd_graphs(kind, count):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("first", "count"), [
-    (0, 200), pytest.param(0, 700, marks=pytest.mark.long),
+    (30, 60), pytest.param(0, 700, marks=pytest.mark.long),
     pytest.param(2500, 700, marks=pytest.mark.long),
 ])  # fmt: skip
 @pytest.mark.parametrize("kind", FORMATS)

@@ -171,6 +171,7 @@ def test_halving_the_step_changes_less_than_a_start_beside(loaded, task):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_machine_code_agrees_with_scipy_on_pinocchio(patu):
     """Another method, another path of the dynamics, formulas in floats."""
     opening = Signals(patu, [0.0, 0.1, 0.2], {"X_lift": [5.8, 5.8, 4.6]})

@@ -90,7 +90,10 @@ def test_every_command_that_writes_is_here():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(x, marks=pytest.mark.long) if x == "calibrate" else x for x in COMMANDS],
+    [
+        pytest.param(x, marks=pytest.mark.long) if x in ("calibrate", "excite") else x
+        for x in COMMANDS
+    ],
 )
 def test_old_or_new_wherever_it_is_killed(name, inputs, tmp_path):
     words, target = COMMANDS[name]

@@ -120,7 +120,9 @@ def test_machines_of_any_size_are_the_same_machine(name, size, folder):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(
+    "size", [x if x in FEW[1:] else pytest.param(x, marks=pytest.mark.long) for x in SIZES]
+)
 @pytest.mark.parametrize("name", [*QUICK, *SLOW])
 def test_all_machines_at_all_sizes(name, size, folder):
     for backend in ("pinocchio", "compiled")[: 1 if name in LARGE else 2]:

@@ -108,7 +108,7 @@ def test_with_friction_that_sticks_or_is_smooth(name, quantity, smoothing):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ("delta", "stewart"))
+@pytest.mark.parametrize("name", ("delta", pytest.param("stewart", marks=pytest.mark.long)))
 @pytest.mark.parametrize("quantity", ("inverse", "forward"))
 def test_of_machines_with_one_large_cluster(name, quantity):
     dynamics, span, q_a, v_a, a_a = state(machine_of(name), 3)

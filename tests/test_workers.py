@@ -40,7 +40,9 @@ def until(holds, seconds):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are told by /proc")
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize("number", [
+    signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.long)
+])  # fmt: skip
 def test_workers_end_with_their_parent(number, tmp_path):
     script = tmp_path / "script.py"
     script.write_text(PROGRAM)
