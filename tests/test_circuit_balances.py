@@ -61,13 +61,10 @@ def test_methods_agree_on_two_pumps_and_an_accumulator(tmp_path, method, backend
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "backend", "tolerance"),
-    [
-        pytest.param("Radau", "compiled", 1e-10, marks=pytest.mark.long),
-        ("DOP853", "compiled", 1e-12),
-        pytest.param("LSODA", "pinocchio", 1e-10, marks=pytest.mark.long),
-    ],
+    [("Radau", "compiled", 1e-10), ("DOP853", "compiled", 1e-12), ("LSODA", "pinocchio", 1e-10)],
 )
 def test_other_methods_agree(whole, method, backend, tolerance):
     machine, signals, run = whole

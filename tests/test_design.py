@@ -112,6 +112,7 @@ def test_the_classical_transmission_angle_problem(four_bar):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_front_of_two_goals_is_that_of_a_grid():
     """Bucket linkage: the more swing of the bucket, the less its force; 7 by 7 variants beside.
 

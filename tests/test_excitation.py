@@ -131,6 +131,7 @@ def test_forces_can_be_what_limits(edited):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_edge_of_the_branch_is_kept(five_bar):
     """Cranks that turn one radian either way leave the reach; the reference does not."""
     result = excite(five_bar, **QUICK, period=4.0)

@@ -23,7 +23,7 @@ def test_some_damaged_inputs(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", [8, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.parametrize("part", [16, pytest.param(1, marks=pytest.mark.long)])
 @pytest.mark.parametrize("kind", MANY)
 def test_more_damaged_inputs(kind, part):
     run(kind, 0, MANY[kind] // part)

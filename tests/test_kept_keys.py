@@ -298,6 +298,7 @@ def counted(kept, built, depends, build):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_machines_that_differ_are_right_from_one_folder(place, tmp_path, monkeypatch):
     """Each finds only what is its own, whatever was kept before it, the second time all of it."""
     built, first = [], []

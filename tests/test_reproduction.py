@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_page_is_complete(tmp_path):
     page = tmp_path / "validation" / "page.md"
     script = ROOT / "scripts" / "reproduce_mini_forwarder.py"

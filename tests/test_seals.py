@@ -84,7 +84,7 @@ def slewing(folder, brake=BRAKE, friction=None, valve=None, inertia=15.0, **cyli
 @pytest.mark.parametrize(
     ("method", "coulomb"),
     [("rosenbrock", 500.0), ("rosenbrock", 0.0), ("rosenbrock", None), ("DOP853", 0.0),
-     pytest.param("Radau", 500.0, marks=pytest.mark.slow)],
+     pytest.param("Radau", 500.0, marks=(pytest.mark.slow, pytest.mark.long))],
 )  # fmt: skip
 def test_a_locked_cylinder_holds_up_to_what_its_seals_press(tmp_path, coulomb, method):
     """To the last bit until the force is F_C + mu (p_A + p_B), from weight's equilibrium on."""

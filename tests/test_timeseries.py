@@ -249,3 +249,16 @@ def test_a_pipe_is_no_file(tmp_path):
         os.mkfifo(tmp_path / name)
         with pytest.raises(RecordingError, match="is no plain file, copy it into one"):
             read(tmp_path / name)
+
+
+@pytest.mark.parametrize("count", [1, 3, 5000])
+def test_columns_that_stay_the_same_are_written_like_others(tmp_path, count):
+    """To the sign of a zero, and where they change between blocks of rows."""
+    same = [0.0, -0.0, 0.1, 1e-300, np.nan, np.pi, 0.0]
+    rows = np.tile(same, (count, 1))
+    rows[count // 2 :, -1] = -0.0
+    names = [f"c{i}" for i in range(len(same))]
+    write(tmp_path / "a.csv", Table(dict.fromkeys(names, ""), rows, {}))
+    lines = (tmp_path / "a.csv").read_text().splitlines()
+    body = lines[lines.index(",".join(names)) + 1 :]
+    assert body == [",".join("" if x != x else repr(x) for x in row) for row in rows.tolist()]
