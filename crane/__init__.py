@@ -95,21 +95,11 @@ if TYPE_CHECKING:
     )
     from crane.recordings import Recording
     from crane.recordings.measured import read_measured
-    from crane.simulation import (
-        Batch,
-        Comparison,
-        Gradient,
-        InterruptedRun,
-        LinearModel,
-        Sensitivities,
-        gradient,
-        linear_models,
-        linearize,
-        replay,
-        sensitivities,
-        simulate,
-        simulate_batch,
-    )
+    from crane.simulation import InterruptedRun, simulate
+    from crane.simulation.batch import Batch, simulate_batch
+    from crane.simulation.linear import LinearModel, linear_models, linearize
+    from crane.simulation.replays import Comparison, replay
+    from crane.simulation.sensitivity import Gradient, Sensitivities, gradient, sensitivities
     from crane.simulation.symbolic import casadi_function
     from crane.studies import (
         PowerAccount,
@@ -167,8 +157,11 @@ _HOMES = {
     "tool_force torques working_range",
     "crane.recordings": "Recording",
     "crane.recordings.measured": "read_measured",
-    "crane.simulation": "Batch Comparison Gradient InterruptedRun LinearModel Sensitivities "
-    "gradient linear_models linearize replay sensitivities simulate simulate_batch",
+    "crane.simulation": "InterruptedRun simulate",
+    "crane.simulation.batch": "Batch simulate_batch",
+    "crane.simulation.linear": "LinearModel linear_models linearize",
+    "crane.simulation.replays": "Comparison replay",
+    "crane.simulation.sensitivity": "Gradient Sensitivities gradient sensitivities",
     "crane.simulation.symbolic": "casadi_function",
     "crane.studies": "PowerAccount PowerComparison Study SwayStudy power_account study sway_study",
     "crane.studies.design": "Design design",

@@ -23,8 +23,10 @@ def wait(seconds: float, bar: bool = False, served: bool = False):
             time.sleep(seconds)
         return
     if bar:
-        with progress_bar("counting"):
-            time.sleep(seconds)
+        with progress_bar("counting") as tell:
+            for share in range(10):
+                time.sleep(seconds / 10)
+                tell(share / 10)
         return
     exec(compile("time.sleep(seconds)", "there", "exec"),
          {"__name__": "crane.closure.there", "time": time, "seconds": seconds})
@@ -82,8 +84,14 @@ def test_what_is_quick_says_nothing():
 
 
 def test_a_bar_stands_alone():
-    told = on_terminal("0.8", "--bar")
-    assert "crane wait:" not in told.split("compiling the machine", 1)[1]
+    told = on_terminal("0.9", "--bar", after="0.1")
+    before, after = told.split("counting", 1)
+    assert "crane wait:" in before and "crane wait:" not in after
+    assert left(told)[-1] == ""
+
+
+def test_a_bar_is_only_for_what_takes_a_while():
+    assert "counting" not in on_terminal("0.01", "--bar")
 
 
 def test_what_waits_for_the_user_says_nothing():

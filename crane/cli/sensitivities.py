@@ -55,7 +55,7 @@ def sensitivities(
 ) -> None:
     """Show which numbers of a machine a motion depends on, exactly."""
     from crane.cli.runs import check_folder, write_sensitivities
-    from crane.simulation import sensitivities as run
+    from crane.simulation.sensitivity import sensitivities as run
 
     if out is not None:
         check_folder(out, force)

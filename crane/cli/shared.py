@@ -1,15 +1,16 @@
 """What all commands share: the program, its arguments, loading and progress."""
 
 import sys
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from crane.cli.waiting import shown
+from crane.cli.waiting import on_terminal, shown
 from crane.common.errors import InputError, OutputError
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 # Commands import what they need when they run, so that `crane --help` answers at once.
 
 INTERRUPTED = 130  # exit status
+_AT_ONCE = 0.3  # [s] for which nobody needs a bar
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -233,35 +235,40 @@ def names(words: str | None) -> list[str] | None:
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[float], None]]:
-    """A bar on a terminal, and what takes the finished share, 0 to 1."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        with shown():
-            yield lambda share: None
-        return
-    from rich.progress import Progress
-
-    with shown(), Progress(console=console, transient=True) as bar:
-        job = bar.add_task("compiling the machine's formulas", total=1.0)
+    """What takes the finished share, 0 to 1; a bar on a terminal, where it takes a while."""
+    began = time.monotonic()
+    with ExitStack() as until_then:
+        draw: Callable[[float], None] | None = None
 
         def report(share: float) -> None:
-            bar.update(job, description=what, completed=share)
+            nonlocal draw
+            if draw is None and on_terminal() and time.monotonic() - began > _AT_ONCE:
+                draw = until_then.enter_context(_bar(what))
+            if draw is not None:
+                draw(share)
 
         yield report
 
 
 @contextmanager
+def _bar(what: str) -> Iterator[Callable[[float], None]]:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with shown(), Progress(console=Console(stderr=True), transient=True) as bar:
+        job = bar.add_task(what, total=1.0)
+        yield lambda share: bar.update(job, completed=share)
+
+
+@contextmanager
 def status(what: str) -> Iterator[None]:
     """Say what takes a while, where somebody watches."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
+    if not on_terminal():
         yield
         return
-    with shown(), console.status(what):
+    from rich.console import Console
+
+    with shown(), Console(stderr=True).status(what):
         yield
 
 

@@ -58,6 +58,11 @@ class _Stream:
         return getattr(self._stream, name)
 
 
+def on_terminal() -> bool:
+    """Whether somebody may watch."""
+    return sys.stderr is not None and sys.stderr.isatty()
+
+
 @contextmanager
 def watched(what: str) -> Iterator[None]:
     """Tell on a terminal what goes on, once it has taken two seconds.
@@ -65,10 +70,10 @@ def watched(what: str) -> Iterator[None]:
     Args:
         what: Who says so, as "crane check".
     """
-    out, errors = sys.stdout, sys.stderr
-    if errors is None or not errors.isatty():
+    if not on_terminal():
         yield
         return
+    out, errors = sys.stdout, sys.stderr
     line = _Line(errors)
 
     def tell(frame: FrameType | None, seconds: float) -> None:

@@ -5,7 +5,6 @@ from typing import Protocol
 
 import numpy as np
 import pinocchio as pin
-from numpy.polynomial.polynomial import polyder, polyval
 from numpy.typing import ArrayLike
 
 from crane.common.errors import InputError
@@ -20,11 +19,12 @@ _ALONG = 1e-6  # by which a joint's axis may miss an axis of the frame [rad]
 _LEVEL = 0.5  # sine of the angle that the axis may be off the level at home
 _TERMS = 40  # of the series below, enough for turns up to `_FARTHEST`
 _FARTHEST = 6.0  # [rad] of an attitude from the first; at a whole turn directions are lost
-# sin(w)/w, (1 - cos w)/w^2, (w - sin w)/w^3 as series in w^2, and how they change with it
+# sin(w)/w, (1 - cos w)/w^2, (w - sin w)/w^3 as series in w^2, highest power first, and slopes
 _SERIES = [
-    np.array([(-1.0) ** k / factorial(2 * k + i) for k in range(_TERMS)]) for i in (1, 2, 3)
+    np.array([(-1.0) ** k / factorial(2 * k + i) for k in reversed(range(_TERMS))])
+    for i in (1, 2, 3)
 ]
-_SLOPES = [polyder(series) for series in _SERIES]
+_SLOPES = [np.polyder(series) for series in _SERIES]
 
 
 class Attitude(Protocol):
@@ -220,9 +220,9 @@ class Turning(Brief):
         """
         r, rate, second = self._vector(np.atleast_1d(time))
         square, grows = np.einsum("ij,ij->i", r, r), 2.0 * np.einsum("ij,ij->i", r, rate)
-        one, two, three = (polyval(square, series)[:, None, None] for series in _SERIES)
+        one, two, three = (np.polyval(series, square)[:, None, None] for series in _SERIES)
         slope_two, slope_three = (
-            (polyval(square, slope) * grows)[:, None, None] for slope in _SLOPES[1:]
+            (np.polyval(slope, square) * grows)[:, None, None] for slope in _SLOPES[1:]
         )
         x, y = _crossing(r), _crossing(rate)
         jacobian = np.eye(3) - two * x + three * x @ x

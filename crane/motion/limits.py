@@ -61,7 +61,7 @@ def carried_beyond(machine: Machine, reference: Trajectory, until: float = np.in
     closure, times = machine.closure, _times(reference, until)
     if reference.position(times).shape[1] != len(machine.active):
         return ""
-    passive = np.setdiff1d(np.arange(len(machine.joints)), closure.active)
+    passive = np.delete(np.arange(len(machine.joints)), closure.active)
     lower, upper = machine.coordinates.lower, machine.coordinates.upper
 
     def carried(times: Array) -> Array:

@@ -491,4 +491,4 @@ def breaks_of(machine: Machine, control: TracedController) -> Array:
         if hasattr(one, "breaks"):
             outside.append(np.asarray(one.breaks(), dtype=np.float64))
             break
-    return np.unique(np.concatenate([np.zeros(0), *outside]))
+    return np.array(sorted({time for times in outside for time in times.tolist()}), dtype=float)
