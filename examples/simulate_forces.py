@@ -11,16 +11,15 @@ recording = crane.simulate(machine, crane.PI(machine, trajectory), label="lift")
 recording.to_csv("lift.csv")
 crane.report(machine, recording, "lift.html")  # a page that plays the motion, for any browser
 
-for i, joint in enumerate(machine.active):
-    error = recording.channels[f"reference_{joint}"] - recording.q[:, i]
-    unit = machine.unit(joint)
-    print(f"{joint}: off by {np.abs(error).max():.1e} {unit} at most")
-lifted = np.ptp(recording.channels["tip_z"])
+for joint in machine.active:
+    off = np.abs(recording.error(joint)).max()  # from its reference
+    print(f"{joint}: off by {off:.1e} {machine.unit(joint)} at most")
+lifted = np.ptp(recording["tip_z"])
 print(f"the tip rises by {lifted:.3f} m in {recording.time[-1]:g} s")
 
 # the balance of energy: what the drives do is lifted, is in motion, or is lost to friction
-energy = {name: recording.channels[name] for name in ("kinetic", "potential", "dissipated")}
-work = recording.channels["work"]
+energy = {name: recording[name] for name in ("kinetic", "potential", "dissipated")}
+work = recording["work"]
 left = work - sum(x - x[0] for x in energy.values())
 print(f"work {work[-1]:.3f} J, of which friction takes {energy['dissipated'][-1]:.3f} J")
 assert np.abs(left).max() < 1e-6 * np.abs(work).max()

@@ -15,17 +15,17 @@ recording = crane.simulate(
 )
 print(recording)
 
-at = recording.channels
-piston, rod_side = at["pressure_X_lift_a"], at["pressure_X_lift_b"]  # [Pa], from a vacuum
-way = recording.q[-1, 0] - recording.q[0, 0]
+piston, rod_side = (recording[f"pressure_X_lift_{x}"] for x in "ab")  # [Pa], from a vacuum
+way = np.ptp(recording["X_lift"])
 print(f"the cylinder extends by {1e3 * way:.0f} mm")
 print(f"its piston side has {piston[0] / 1e5:.0f} bar at rest, {piston.max() / 1e5:.0f} at most")
-print(f"the pump delivers {1e3 * at['oil_pumped'][-1]:.2f} l")
+print(f"the pump delivers {1e3 * recording['oil_pumped'][-1]:.2f} l")
 
 # at rest: A p_A - B p_B carries the weight
 cylinder = machine.hydraulics.cylinders["X_lift"]
 force = cylinder.area_a * piston[0] - cylinder.area_b * rod_side[0]
 assert np.isclose(force, crane.Dynamics(machine).gravity(recording.q[0, :1])[0], rtol=1e-9)
 # the pump's work is what was lifted, lost to throttles and friction, or is pressed into the oil
-left = at["pump_work"] - at["work"] - at["hydraulic_loss"] - at["oil_energy"]
-assert np.abs(left).max() < 1e-4 * at["pump_work"][-1]
+given = recording["pump_work"]
+left = given - recording["work"] - recording["hydraulic_loss"] - recording["oil_energy"]
+assert np.abs(left).max() < 1e-4 * given[-1]

@@ -50,6 +50,20 @@ def test_arrays_are_own_contiguous_copies():
     assert recording.channel_units == {"tip_x": "m", "valve": ""}
 
 
+def test_columns_go_by_their_names():
+    recording = make(free=("q1",), tau=[[0, -16.0], [0, -17.0], [0, -18.0]])
+    names = ["time", "q1", "X1", "q1_velocity", "X1_velocity", "X1_force", "tip_x", "valve"]
+    assert list(recording) == names and "X1" in recording and "q1_force" not in recording
+    np.testing.assert_array_equal(recording["X1_velocity"], [0.1, 0.1, 0.05])
+    np.testing.assert_array_equal(recording["X1_force"], recording.tau[:, 1])
+    np.testing.assert_array_equal(recording["tip_x"], [0.4, 0.5, 0.6])
+    with pytest.raises(InputError, match="'X1_velocty' is not .*, did you mean 'X1_velocity'?"):
+        recording["X1_velocty"]
+    for wrong in (0, slice(2), recording.time < 0.2):
+        with pytest.raises(InputError, match="go by names .*'between' and 'at'"):
+            recording[wrong]
+
+
 def test_written_file(tmp_path):
     make().to_csv(tmp_path / "run.csv")
     assert (tmp_path / "run.csv").read_text().splitlines() == [

@@ -21,7 +21,7 @@ instead of displacements and forces, crane.recordings.measured turns into them.
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import InitVar, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -193,6 +193,26 @@ class Recording(Brief):
             | {x + FORCE: FORCE_UNITS[self.units[x]] for x in self._driven}
             | self.channel_units
         )
+
+    def __getitem__(self, name: str) -> Array:
+        """A column (N,) by its name, as it is written: "X1", "X1_velocity", "tip_z".
+
+        Raises:
+            InputError: There is none of this name.
+        """
+        columns = self.columns()
+        if not isinstance(name, str):
+            raise InputError(
+                f"a recording's columns go by names such as '{TIME}', give one; samples are "
+                "chosen by 'between' and 'at'"
+            )
+        if name not in columns:
+            raise InputError(f"column '{name}' is not in the recording, {known(columns, name)}")
+        return columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Names of all columns, in the order in which they are written."""
+        return iter(self._names())
 
     def columns(self) -> dict[str, Array]:
         """All columns (N,) by name, as they are written; views, not copies."""
