@@ -209,7 +209,7 @@ def test_cones_end_where_they_say():
         ({"slews": [9.0]}, "'slew' turns from"),
         ({"radii": [3.0, 2.0]}, "radii must be numbers that rise"),
         ({"radii": [30.0]}, "reaches none of these places"),
-        ({"frame": "upper"}, "0 strokes move"),
+        ({"frame": "upper"}, "what moves .upper. in its section is nothing"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(excavator, given, said):

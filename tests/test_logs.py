@@ -70,6 +70,25 @@ def test_csv_of_other_programs(tmp_path, between):
     np.testing.assert_allclose(table.values, [[0, 0.5e-3], [0.01, 1e-3]], rtol=1e-12)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
+@pytest.mark.parametrize("between", [";", "\t"])
+def test_csv_of_european_programs(tmp_path, between, encoding):
+    rows = [["Zeit", "Neigung [°]"], ["0", "-1,5"], ["0,01", "2,5E+1"]]
+    text = "\n".join(between.join(row) for row in rows) + "\n"
+    (tmp_path / "log.csv").write_text(text, encoding)
+    described = columns(tmp_path, "time [s] = Zeit\nX [deg] = 'Neigung [°]'\n")
+    table = read_log(tmp_path / "log.csv", described)
+    np.testing.assert_allclose(table.values, [[0, np.deg2rad(-1.5)], [0.01, np.deg2rad(25)]])
+
+
+@pytest.mark.parametrize("cell", ["1.234,5", "1,234.5"])
+def test_thousands_are_not_taken_for_decimals(tmp_path, cell):
+    (tmp_path / "log.csv").write_text(f"t;x\n0;1\n1;{cell}\n")
+    described = columns(tmp_path, "time [s] = t\nX [m] = x\n")
+    with pytest.raises(RecordingError, match=f"line 3, column 'x': '{cell}' is not a number"):
+        read_log(tmp_path / "log.csv", described)
+
+
 def change(old, new):
     return GOOD.replace(old, new)
 

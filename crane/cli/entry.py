@@ -92,7 +92,10 @@ def main() -> None:
         if debug or message is None:
             raise
         if text := message():
-            say(f"error: {one_line(' '.join(text.split()))} (crane --help shows the commands)")
+            context = getattr(error, "ctx", None)
+            command = getattr(context, "command_path", "crane")
+            shows = "the commands" if command == "crane" else "what it takes"
+            say(f"error: {one_line(' '.join(text.split()))} ({command} --help shows {shows})")
         sys.exit(2)
     sys.exit(status if isinstance(status, int) else 0)
 

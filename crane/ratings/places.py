@@ -104,9 +104,10 @@ class Places:
         strokes = [i for i in strokes if far[i] > _SAME * far[strokes].max()]
         if not 2 <= len(strokes) <= len(_LEVELS) + 1:
             names = ", ".join(machine.active[i] for i in strokes)
+            less = "fewer" if len(strokes) < 2 else "some: --lock"
             raise InputError(
-                f"{len(strokes)} strokes move '{frame}' in its section ({names}), a chart takes 2 "
-                f"to {len(_LEVELS) + 1}: name another frame, or hold some: --lock"
+                f"what moves '{frame}' in its section is {names or 'nothing'}, a chart takes 2 to "
+                f"{len(_LEVELS) + 1} strokes: name another frame, or lock {less}"
             )
         order = sorted(strokes, key=lambda i: -far[i])
         self.pair = (min(order[:2]), max(order[:2]))

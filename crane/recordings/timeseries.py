@@ -8,6 +8,7 @@ bar, deg, mm and others of `crane.common.units.TO_SI` are converted, those in ot
 they are. Numbers are written with the fewest digits that give the same float64 again.
 """
 
+import codecs
 import csv
 import io
 import itertools
@@ -15,7 +16,7 @@ import os
 import re
 import stat
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -38,6 +39,7 @@ T = TypeVar("T")
 _WORD = re.compile(r'[^\s,\[\]"#](?:[^,\[\]"]*[^\s,\[\]"])?')
 SAMPLES = "crane samples"  # the comment that says how many there are
 _ROWS_AT_ONCE = 4096
+_UTF8 = "utf-8-sig"  # with a mark or without
 _BLOCK = 1 << 20  # bytes, and so many at most in a line
 _LONG_HEADING, _LONG_NAME = 1 << 16, 200  # characters
 _AGAIN = f"copy it again, or remove '# {SAMPLES}' if that is meant"
@@ -198,7 +200,9 @@ def read_npz(path: Path) -> Table:
 def arrays(path: Path) -> dict[str, np.ndarray]:
     """What an npz file or a CSV of another program holds, by name: nothing is converted.
 
-    A CSV has one header row; it separates columns by commas, semicolons or tabs.
+    A CSV has one header row; it separates columns by commas, semicolons or tabs. Where it is not
+    by commas, and no number has a point, decimals are behind commas. It is in UTF-8, in UTF-16
+    with its mark, or else in Windows-1252.
 
     Raises:
         RecordingError: The file does not exist or is none of these.
@@ -208,11 +212,12 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         check_plain(path)
         _count_lines(path)
-        notes, heading, line = _head(path)
+        encoding = _encoding(path)
+        notes, heading, line = _head(path, encoding)
         _check_end(path, notes)
         between = max(",;\t", key=heading.count)
         names = [cell.strip() for cell in next(csv.reader([heading], delimiter=between))]
-        values = _numbers(path, line, between, names)
+        values = _numbers(lambda: _rows(path, encoding, line, between), line, between, names)
         _check_count(values, notes)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
@@ -336,11 +341,37 @@ def _in_si(table: Table) -> Table:
     return Table(units, values, table.notes)
 
 
-def _head(path: Path) -> tuple[dict[str, str], str, int]:
+def _encoding(path: Path) -> str:
+    """How the text of a log is encoded."""
+    with path.open("rb") as file:
+        if file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+            return "utf-16"
+    try:
+        with path.open(encoding=_UTF8) as text:
+            for _ in text:
+                pass
+    except UnicodeDecodeError:
+        return "cp1252"
+    return _UTF8
+
+
+def _rows(path: Path, encoding: str, header: int, between: str) -> Iterator[str]:
+    """Lines of a log below its header row, with decimals behind points."""
+
+    def lines() -> Iterator[str]:
+        with path.open(encoding=encoding) as file:
+            yield from itertools.islice(file, header, None)
+
+    if between == "," or any("." in line for line in lines()):
+        return lines()
+    return (line.replace(",", ".") for line in lines())
+
+
+def _head(path: Path, encoding: str = _UTF8) -> tuple[dict[str, str], str, int]:
     """Notes, the header row, and its line number."""
     notes: dict[str, str] = {}
     passed = 0  # characters
-    with path.open(encoding="utf-8-sig") as file:
+    with path.open(encoding=encoding) as file:
         for line, text in enumerate(file, start=1):
             passed += len(text)
             text = text.strip()
@@ -465,8 +496,10 @@ def _values(path: Path, header: int, lines: int, units: Mapping[str, str]) -> Ar
     return values
 
 
-def _numbers(path: Path, header: int, between: str, names: Sequence[str]) -> Array:
-    """Numbers (N, columns) of a log, below its header row.
+def _numbers(
+    rows: Callable[[], Iterator[str]], header: int, between: str, names: Sequence[str]
+) -> Array:
+    """Numbers (N, columns) of a log, whose rows are below its header row, line `header`.
 
     Raises:
         RecordingError: There are none, or a cell holds something else.
@@ -475,28 +508,25 @@ def _numbers(path: Path, header: int, between: str, names: Sequence[str]) -> Arr
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about a file without samples
-            values = np.loadtxt(
-                path, delimiter=between, comments=None, skiprows=header, ndmin=2, encoding="utf-8"
-            )
+            values = np.loadtxt(rows(), delimiter=between, comments=None, ndmin=2)
     except ValueError:
-        _find_word(path, header, between, names)
+        _find_word(rows(), header, between, names)
         raise
     if not values.size:
         raise RecordingError("has a header and no samples, write one row per sample")
     return values
 
 
-def _find_word(path: Path, header: int, between: str, names: Sequence[str]) -> None:
+def _find_word(rows: Iterator[str], header: int, between: str, names: Sequence[str]) -> None:
     """Raise an error about the first cell of a log that is no number."""
-    with path.open(encoding="utf-8-sig") as file:
-        for line, text in enumerate(file, start=1):
-            cells = text.rstrip("\n").split(between) if line > header and text.strip() else []
-            for name, cell in zip(names, cells, strict=False):
-                if _number(cell) is None:
-                    raise RecordingError(
-                        f"line {line}, column '{name}': '{_shown(cell)}' is not a number, correct "
-                        f"or remove the line"
-                    )
+    for line, text in enumerate(rows, start=header + 1):
+        cells = text.rstrip("\n").split(between) if text.strip() else []
+        for name, cell in zip(names, cells, strict=False):
+            if _number(cell) is None:
+                raise RecordingError(
+                    f"line {line}, column '{name}': '{_shown(cell)}' is not a number, correct "
+                    f"or remove the line"
+                )
 
 
 def _number(cell: str) -> float | None:
@@ -509,7 +539,7 @@ def _number(cell: str) -> float | None:
 def _find_fault(path: Path, header: int, units: Mapping[str, str]) -> None:
     """Raise an error about the first line that is wrong."""
     names, last = list(units), -np.inf
-    with path.open(encoding="utf-8-sig") as file:
+    with path.open(encoding=_UTF8) as file:
         for line, text in enumerate(file, start=1):
             if line <= header or not text.strip():
                 continue
