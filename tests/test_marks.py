@@ -9,10 +9,10 @@ import pytest
 
 import crane
 from crane.common.errors import CraneWarning
-from crane.formats.visuals.visuals import Box
+from crane.formats.visuals.visuals import Box, Cylinder
 from crane.view.page.marks import full_arrows, springs
 from crane.view.page.scene import build_scene, link_poses
-from crane.view.page.visuals import blocks, read_visuals
+from crane.view.page.visuals import read_visuals, sliding
 
 DATA = Path(__file__).parent / "data"
 SPRINGS = """forces:
@@ -74,18 +74,36 @@ def test_ends_of_springs_are_in_the_picture(sprung, tmp_path):
 
 
 def test_a_body_that_slides_and_is_not_drawn_is_a_block_along_its_axis(sprung):
-    assert [visual.link for visual in blocks(sprung, ())] == ["slider"]
+    assert [visual.link for visual in sliding(sprung, ())] == ["slider"]
     (block,) = (visual for visual in read_visuals(sprung) if isinstance(visual.shape, Box))
     np.testing.assert_allclose(block.placement[:3, 3], 0)
     assert block.shape.size[0] > block.shape.size[1] == block.shape.size[2]  # along x, as s
-    assert blocks(sprung, [sprung.model.getJointId("s")]) == []
+    assert sliding(sprung, [sprung.model.getJointId("s")]) == []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
         for name in ("mini_forwarder", "patu655", "excavator"):  # all have shapes of their own
             machine = crane.load(name)
             links = {visual.link for visual in read_visuals(machine)}
             drawn = {machine.model.frames[machine.frame(link)].parentJoint for link in links}
-            assert blocks(machine, drawn) == []
+            assert sliding(machine, drawn) == []
+
+
+def test_a_cylinder_that_is_not_drawn_has_a_rod_that_stays_in_its_barrel(tmp_path):
+    body = '<inertial><mass value="3"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
+    links = "".join(f'<link name="{x}">{body}</inertial></link>' for x in ("barrel", "rod"))
+    (tmp_path / "cylinder.urdf").write_text(
+        f"""<robot name="cylinder"><link name="base"/>{links}
+        <joint name="pin" type="continuous"><parent link="base"/><child link="barrel"/>
+        <axis xyz="0 1 0"/></joint>
+        <joint name="stroke" type="prismatic"><parent link="barrel"/><child link="rod"/>
+        <origin xyz="0.8 0 0.1"/><axis xyz="-1 0 0"/>
+        <limit lower="0.1" upper="0.7" effort="1" velocity="1"/></joint></robot>"""
+    )
+    machine = crane.load(tmp_path / "cylinder.urdf")
+    (rod,) = sliding(machine, ())
+    assert rod.link == "rod" and isinstance(rod.shape, Cylinder)
+    ends = [(rod.placement @ [0, 0, z * rod.shape.length, 1])[:3] for z in (0.5, -0.5)]
+    np.testing.assert_allclose(ends, [[0, 0, 0], [0.6, 0, 0]], atol=1e-15)  # against the axis
 
 
 def test_arrows_are_in_proportion_to_what_joints_can():

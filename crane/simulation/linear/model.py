@@ -86,7 +86,8 @@ class LinearModel(Brief):
     def _line(self) -> str:
         """Its sizes, and where it rings."""
         rings = [mode.frequency for mode in self.modes if mode.rings]
-        words = f", rings at {rings[0]:.3g} to {rings[-1]:.3g} Hz" if rings else ""
+        ends = dict.fromkeys(f"{frequency:.3g}" for frequency in rings[:1] + rings[-1:])
+        words = f", rings at {' to '.join(ends)} Hz" if rings else ""
         return (
             f"LinearModel of '{self.machine.name}': {counted(len(self.x), 'state')}, "
             f"{counted(len(self.u), 'input')}, {counted(len(self.y), 'output')}{words}"

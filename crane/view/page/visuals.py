@@ -18,7 +18,7 @@ def read_visuals(machine: Machine) -> list[Visual]:
 
     A mesh whose file is missing or damaged is a box, and what cannot be drawn is left out, with a
     warning; where nothing but boxes would be left, the skeleton is there, too. Bodies that slide
-    and have no visuals are blocks.
+    and have no visuals are rods or blocks.
     """
     visuals: list[Visual] = []
     missing: list[str] = []
@@ -42,7 +42,7 @@ def read_visuals(machine: Machine) -> list[Visual]:
     shown = {frames[machine.frame(visual.link)].parentJoint for visual in visuals}
     if all(visual.shape is box for visual in visuals):
         visuals += skeleton(machine)
-    return visuals + blocks(machine, shown)
+    return visuals + sliding(machine, shown)
 
 
 def _warn(text: str) -> None:
@@ -80,20 +80,28 @@ def _links(machine: Machine) -> dict[int, str]:
     return links
 
 
-def blocks(machine: Machine, drawn: Collection[int]) -> list[Visual]:
-    """A block for each body with mass that slides, but for those that are drawn, by joints."""
+def sliding(machine: Machine, drawn: Collection[int]) -> list[Visual]:
+    """What shows bodies with mass that slide, but for those that are drawn, by joints.
+
+    On what moves, a rod as long as the stroke, whose end is in the mouth of the barrel when it is
+    out; on what stands still, or without limits, a block.
+    """
     model, links, width = machine.model, _links(machine), 0.11 * longest(machine)
+    limits = machine.coordinates
     found = []
     for joint in range(1, model.njoints):
         column = model.joints[joint].idx_v
-        slides = column not in machine.coordinates.floating and machine.coordinates.slides[column]
+        slides = column not in limits.floating and limits.slides[column]
         if not slides or joint in drawn or not model.inertias[joint].mass:
             continue
         axis = np.ravel(model.joints[joint].createData().S)[:3]
-        along = pin.SE3(pin.Quaternion.FromTwoVectors(pin.XAxis, axis), np.zeros(3))
+        stroke = float(limits.upper[column] - limits.lower[column])
+        rod = bool(model.parents[joint]) and np.isfinite(stroke)
+        shape = Cylinder(0.2 * width, stroke) if rod else Box((1.5 * width, width, width))
+        turned = pin.Quaternion.FromTwoVectors(pin.ZAxis if rod else pin.XAxis, axis)
+        along = pin.SE3(turned, -0.5 * stroke * axis if rod else np.zeros(3))
         in_link = model.frames[machine.frame(links[joint])].placement.inverse() * along
-        size = (1.5 * width, width, width)
-        found.append(Visual(links[joint], Box(size), in_link.homogeneous, PLAIN))
+        found.append(Visual(links[joint], shape, in_link.homogeneous, PLAIN))
     return found
 
 
