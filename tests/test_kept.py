@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import ModuleType
 
 import kept
 import llvmlite.binding as llvm
@@ -333,3 +334,17 @@ def test_a_patched_package_finds_nothing(place, owner, name, value):
         patch.setattr(owner, name, value)
         assert package.package_digest() is None
     assert not ask()
+
+
+def test_nor_does_one_with_another_entry_or_module(place, monkeypatch):
+    assert ask() and not ask()
+    table = crane.dynamics.compiled.QUANTITIES
+    with monkeypatch.context() as patch:
+        patch.setitem(table, next(iter(table)), another)
+        assert package.package_digest() is None
+    other = ModuleType("crane.dynamics.compiled")
+    other.effects = another
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, other.__name__, other)
+        assert package.package_digest() is None
+    assert package.package_digest()

@@ -2,9 +2,11 @@
 
 import functools
 import hashlib
+import operator
 import os
 import sys
-from types import FunctionType
+from collections.abc import Mapping
+from types import FunctionType, ModuleType
 from typing import Any
 
 import crane
@@ -40,21 +42,39 @@ def changed() -> bool:
 def patched() -> bool:
     """Whether functions or classes of the modules that make formulas are not theirs."""
     for name, module in list(sys.modules.items()):
-        if name.startswith("crane.") and name.split(".")[1] in _ROOMS:
-            there = [x for word, x in list(vars(module).items()) if word != "__builtins__"]
-            if any(map(_foreign, _standing(name, there))):
+        if name.startswith("crane.") and name.split(".")[1] in _ROOMS and not _same(name, module):
+            tables = _tables(name, module)
+            if any(_foreign(_function(x)) for table in tables for x in list(table.values())):
                 return True
+            _sound[name] = [(table, list(table.values())) for table in tables]
     return False
 
 
-def _standing(name: str, values: list[Any]) -> list[Any]:
-    """What stands in a module, in its tables, and in the classes that it defines."""
-    found = values.copy()
-    for value in values:
-        if isinstance(value, dict):
-            found += list(value.values())
+# of modules in which all was theirs, what stood in their tables
+_sound: dict[str, list[tuple[Mapping[str, Any], list[Any]]]] = {}
+
+
+def _same(name: str, module: ModuleType) -> bool:
+    """Whether in a module that was sound stands what stood there."""
+    before = _sound.get(name)
+    return (
+        before is not None
+        and before[0][0] is vars(module)
+        and all(
+            len(table) == len(values) and all(map(operator.is_, list(table.values()), values))
+            for table, values in before
+        )
+    )
+
+
+def _tables(name: str, module: ModuleType) -> list[Mapping[str, Any]]:
+    """The names of a module, its tables, and what is in the classes that it defines."""
+    found: list[Mapping[str, Any]] = [vars(module)]
+    for word, value in list(vars(module).items()):
+        if isinstance(value, dict) and word != "__builtins__":
+            found.append(value)
         elif isinstance(value, type) and value.__module__ == name:
-            found += map(_function, list(vars(value).values()))
+            found.append(vars(value))
     return found
 
 
