@@ -16,7 +16,7 @@ recording = crane.simulate(
 print(recording)
 
 piston, rod_side = (recording[f"pressure_X_lift_{x}"] for x in "ab")  # [Pa], from a vacuum
-way = np.ptp(recording["X_lift"])
+way = recording["X_lift"][-1] - recording["X_lift"][0]
 print(f"the cylinder extends by {1e3 * way:.0f} mm")
 print(f"its piston side has {piston[0] / 1e5:.0f} bar at rest, {piston.max() / 1e5:.0f} at most")
 print(f"the pump delivers {1e3 * recording['oil_pumped'][-1]:.2f} l")
