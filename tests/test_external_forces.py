@@ -112,6 +112,32 @@ def test_all_methods_agree_and_work_is_in_the_balance(method):
     assert np.abs(impulse) == pytest.approx(30.0 * way, rel=1e-3)
 
 
+def test_what_carries_a_load_hangs_as_still_as_with_a_payload():
+    """Drives begin with what they have to bear at time 0; the oil is not pressed by it first."""
+    machine = crane.load("patu655", lock={"X_ext": 0.1, "slew": 0.0})
+    pull = crane.Wrench(machine.tip, (0.0, 0.0, -1500.0))
+    run = crane.simulate(machine, None, None, 1.0, loads=(pull,))
+    assert np.abs(run.q - run.q[0]).max() < 1e-9
+    dynamics, q_a = crane.Dynamics(machine), run.q[0]
+    wrench = {machine.tip: [0, 0, -1500.0, 0, 0, 0]}
+    borne = dynamics.gravity(q_a) - dynamics.applied(q_a, wrench)
+    np.testing.assert_allclose(run.tau[0], borne, rtol=1e-12)
+    later = crane.Wrench(machine.tip, [(0, 0, 0), (0, 0, -1500.0)], times=[0.0, 0.5])
+    unloaded = crane.simulate(machine, None, None, 1e-3, loads=(later,))
+    np.testing.assert_allclose(unloaded.tau[0], dynamics.gravity(q_a), rtol=1e-12)
+    mini = crane.load("mini_forwarder")
+    law = crane.PI(
+        mini.under(crane.Wrench(mini.tip, (0, 0, -5.0))), crane.task_trajectory(mini, "lift")
+    )
+    more = law.start(law.reference.position(0.0)) - crane.PI(mini, law.reference).start(
+        law.reference.position(0.0)
+    )
+    lifted = crane.Dynamics(mini).applied(
+        law.reference.position(0.0), {mini.tip: [0, 0, -5.0, 0, 0, 0]}
+    )
+    np.testing.assert_allclose(more * law.settings[3:], -lifted, rtol=1e-9, atol=1e-12)
+
+
 def test_with_hydraulics_a_pull_is_in_the_chambers():
     """A cylinder that holds still carries the load's generalised force more."""
     machine = crane.load("patu655", lock={"X_ext": 0.1, "slew": 0.0})

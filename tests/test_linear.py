@@ -45,6 +45,63 @@ def test_a_load_on_its_oil(tmp_path):
     np.testing.assert_allclose(model.rate, 0.0, atol=1e-6)
 
 
+def pulled(machine):
+    """With a constant force, and one that grows with the way and the speed."""
+
+    class Held(crane.ExternalForce):
+        def wrench(self, here):
+            return [-2e3 * here.place[0] - 50 * here.velocity[0], 0.0, -300.0], [0.0, 40.0, 0.0]
+
+    return machine.under(crane.Wrench(machine.tip, (800.0, 0.0, -1500.0)), Held(machine.tip, "b"))
+
+
+def test_forces_from_outside_are_part_of_it():
+    """Beside differences of the accelerations, by all that goes with place and speed."""
+    machine = crane.load("patu655", lock={"X_ext": 0.1, "slew": 0.0})
+    loaded = pulled(machine)
+    model = crane.linearize(loaded, drive="forces", outputs=["X_lift"])
+    np.testing.assert_allclose(model.rate, 0.0, atol=1e-9)
+    dynamics, n = crane.Dynamics(machine), len(machine.active)
+    kinematics = crane.Kinematics(machine)
+    first = model.x[:n]
+
+    def acceleration(q_a, v_a):
+        place, speed = kinematics.position(q_a), kinematics.jacobian(q_a) @ v_a
+        push = [800.0 - 2e3 * place[0] - 50 * speed[0], 0.0, -1800.0, 0.0, 40.0, 0.0]
+        return dynamics.forward(q_a, v_a, model.u + dynamics.applied(q_a, {machine.tip: push}))
+
+    for i in range(n):
+        way = 1e-4 * np.eye(n)[i]
+        by_place, by_speed = (
+            (acceleration(first + q, v) - acceleration(first - q, -v)) / 2e-4
+            for q, v in ((way, 0 * way), (0 * way, way))
+        )
+        np.testing.assert_allclose(model.A[n:, i], by_place, rtol=1e-6, atol=1e-5)
+        # joints' own friction is that of a motion that has begun
+        own = crane.linearize(machine, drive="forces", outputs=["X_lift"]).A[n:, n + i]
+        np.testing.assert_allclose(model.A[n:, n + i] - own, by_speed, rtol=1e-6, atol=1e-6)
+
+
+def test_on_valves_chambers_bear_forces_from_outside():
+    machine = crane.load("patu655", lock={"X_ext": 0.1, "slew": 0.0})
+    model, n = crane.linearize(pulled(machine)), len(machine.active)
+    np.testing.assert_allclose(model.rate[: 2 * n], 0.0, atol=1e-9)  # what leaks goes on leaking
+    run = crane.simulate(pulled(machine), None, None, 0.5)
+    assert np.abs(run.q - run.q[0]).max() < 1e-9
+    a, b = (run[f"pressure_X_lift_{x}"][0] for x in "ab")
+    at = {name: model.y[i] for i, name in enumerate(model.outputs)}
+    np.testing.assert_allclose(
+        [at["pressure_X_lift_a"], at["pressure_X_lift_b"]], [a, b], rtol=1e-9
+    )
+
+
+def test_what_remembers_its_way_is_left_out_and_told():
+    machine = crane.load("excavator")
+    foot = crane.Contact(machine.tip, lateral_stiffness=1e6)
+    with pytest.warns(CraneWarning, match=f"remember their way .*left out: {machine.tip}"):
+        crane.linearize(machine.under(foot), drive="forces")
+
+
 def test_a_mass_on_a_spring_under_a_force(tmp_path):
     machine = rig(tmp_path, friction={"viscous": 300.0})
     machine = machine.replace(forces=(crane.ForceElement("x", stiffness=5e4, rest=0.1),))

@@ -10,6 +10,7 @@ from crane.codegen import Number
 from crane.common.samples import Array, as_sample
 from crane.common.shown import Brief
 from crane.dynamics import Dynamics
+from crane.dynamics.external import at_rest
 from crane.machine import Machine
 from crane.motion.curves import Trajectory
 from crane.motion.trajectories import with_free
@@ -123,7 +124,11 @@ class Law(Brief):
         return [next(given) if moved else 0.0 for moved in self.machine.driven]
 
     def begin(self, at: At) -> Sequence[Number]:
-        """The law's own states (k,) at the start, seen in numbers and at rest; none yet."""
+        """The law's own states (k,) at the start, seen in numbers and at rest; none yet.
+
+        What the drives have to give then, `at.inverse`, is less by what forces from outside do at
+        time 0: a machine that carries a load hangs as still as one with a payload.
+        """
         return ()
 
     def references(self, times: Array) -> Array:
@@ -138,12 +143,15 @@ class Law(Brief):
 
     def start_at(self, dynamics: Dynamics, q: Array) -> Array:
         """`start` at a posture (nq,) that is closed already, of an exact `Dynamics`."""
-        q_a = q[self.machine.closure.active]
+        machine = self.machine
+        q_a = q[machine.closure.active]
         rest = np.zeros_like(q_a)
+        outside = at_rest(machine, q)
 
         def inverse(a_a: Sequence[Number], friction: bool) -> list[Number]:
             quantity = "inverse with friction" if friction else "inverse"
-            found: list[Number] = dynamics.tree.at(quantity, q, rest, np.array(a_a)).tolist()
+            needed = dynamics.tree.at(quantity, q, rest, np.array(a_a)) - outside
+            found: list[Number] = needed.tolist()
             return found
 
         def gravity() -> list[Number]:

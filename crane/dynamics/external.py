@@ -191,11 +191,12 @@ class ExternalForces:
     """What acts on a machine from outside, in numbers.
 
     Args:
-        machine: The machine, whose `external` act.
+        machine: The machine.
+        forces: Those of its `external` that act.
     """
 
-    def __init__(self, machine: Machine):
-        self._forces, self._jacobians = machine.external, FrameJacobians(machine)
+    def __init__(self, machine: Machine, forces: Sequence[ExternalForce]):
+        self._forces, self._jacobians = forces, FrameJacobians(machine)
 
     def along(self, time: float, q: Array, v: Array, states: Array) -> AppliedAt:
         """J^T w along the joints.
@@ -228,6 +229,15 @@ class ExternalForces:
         return AppliedAt(
             total, powers, np.array(seen, dtype=np.float64), np.array(rates, dtype=np.float64)
         )
+
+
+def at_rest(machine: Machine, q: Array) -> Array:
+    """gamma^T J^T w (n,) of a machine's external forces at time 0, at rest in a posture (nq,)."""
+    if not machine.external:
+        return np.zeros(len(machine.active))
+    none = np.zeros(states_of(machine.external))
+    forces = ExternalForces(machine, machine.external).along(0.0, q, np.zeros(machine.model.nv), none).forces
+    return np.asarray(machine.closure.gamma(q).T @ forces)
 
 
 def _placed(machine: Machine, force: ExternalForce) -> tuple[int, pin.SE3]:

@@ -116,7 +116,7 @@ class Chart:
 
     @cached_property
     def _external(self) -> ExternalForces:
-        return ExternalForces(self.machine)
+        return ExternalForces(self.machine, self.machine.external)
 
     def traced_forces(self, gamma: dict[int, list[Number]], tau: Sequence[Number]) -> list[Number]:
         """`forces` as formulas, with rows of gamma by body."""

@@ -19,6 +19,7 @@ from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
 from crane.simulation.linear.drive import Drive
 from crane.simulation.linear.model import LinearModel
+from crane.simulation.linear.outside import Outside
 from crane.simulation.linear.trim import trimmed
 
 
@@ -35,7 +36,8 @@ def linearize(
 
     The operating point is trimmed: forces, or pressures and valve signals, are those at which the
     velocities stay what they are. Matrices are exact derivatives through the closed loops
-    (`Dynamics.derivatives`), the circuit's by its formulas. Friction that sticks is that of small
+    (`Dynamics.derivatives`), the circuit's by its formulas; those of forces from outside, which
+    act as at time 0, by differences. Friction that sticks is that of small
     motions which have begun: at rest its viscous part alone, in motion the side that it is on.
     What the circuit only counts, such as the oil drawn, is no state.
 
@@ -72,16 +74,19 @@ def linearize(
     dynamics = Dynamics(machine)
     q = machine.closure.solve(q_a)
     made = Drive(machine, dynamics, q, valves, pressures)
-    own, u = trimmed(dynamics, made, q_a, v_a)
+    outside = Outside(machine)
+    pushed = outside.at(q_a, v_a)
+    own, u = trimmed(dynamics, made, q_a, v_a, pushed)
     n, k, m = len(q_a), len(own), len(u)
     values, slopes = made.at(q_a, v_a, own, u)
-    tau = values[:n]
+    tau = values[:n] + pushed
     found = dynamics.derivatives("forward", q_a, v_a, tau, friction=True)
     by_tau = found["tau_a"]
     size = 2 * n + k
     a, b = np.zeros((size, size)), np.zeros((size, m))
     a[:n, n : 2 * n] = np.eye(n)
     a[n : 2 * n] = by_tau @ slopes[:n, :size]
+    a[n : 2 * n, : 2 * n] += by_tau @ outside.slopes(q_a, v_a)
     a[n : 2 * n, :n] += found["q_a"]
     a[n : 2 * n, n : 2 * n] += found["v_a"]
     a[2 * n :] = slopes[n : n + k, :size]

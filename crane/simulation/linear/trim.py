@@ -18,19 +18,28 @@ _SHORT = 1e-3  # share of its step below which it is taken all the same
 _BAR, _MILLIMETRE, _THIMBLE, _SOON = 1e5, 1e-3, 1e-6, 0.1  # [Pa], [m], [m3], [s]
 
 
-def trimmed(dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array) -> tuple[Array, Array]:
+def trimmed(
+    dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array, outside: Array
+) -> tuple[Array, Array]:
     """The drive's states and inputs at which velocities and states stay.
+
+    Args:
+        dynamics: Of the machine.
+        drive: What acts on it.
+        q_a: (n,).
+        v_a: (n,).
+        outside: (n,) what forces from outside do along the active joints.
 
     Raises:
         SimulationError: There are none.
     """
     machine = dynamics.machine
-    forces = dynamics.inverse(q_a, v_a, np.zeros(len(q_a))) + dynamics.friction(q_a, v_a)
+    forces = dynamics.inverse(q_a, v_a, np.zeros(len(q_a))) + dynamics.friction(q_a, v_a) - outside
     if machine.free:
-        _check_hanging(dynamics, q_a, v_a, forces)
+        _check_hanging(dynamics, q_a, v_a, forces, outside)
     if drive.states:
         for shared in (True, False) if not v_a.any() else (True,):
-            found = _on_valves(_Trim(dynamics, drive, q_a, v_a, shared))
+            found = _on_valves(_Trim(dynamics, drive, q_a, v_a, outside, shared))
             if found is not None:
                 return found
         raise SimulationError(
@@ -39,7 +48,9 @@ def trimmed(dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array) -> tuple[A
     return drive.own, forces[machine.driven]
 
 
-def _check_hanging(dynamics: Dynamics, q_a: Array, v_a: Array, forces: Array) -> None:
+def _check_hanging(
+    dynamics: Dynamics, q_a: Array, v_a: Array, forces: Array, outside: Array
+) -> None:
     """See that free joints keep their velocities while drives bear their share of forces (n,).
 
     Raises:
@@ -48,7 +59,7 @@ def _check_hanging(dynamics: Dynamics, q_a: Array, v_a: Array, forces: Array) ->
     machine = dynamics.machine
     held = np.where(machine.driven, forces, 0.0)
     units = machine.closure.units[machine.closure.active] / machine.closure.pace**2
-    moved = np.abs(dynamics.forward(q_a, v_a, held, friction=True)) / units
+    moved = np.abs(dynamics.forward(q_a, v_a, held + outside, friction=True)) / units
     if moved.max() > _HANGS:
         worst = int(np.argmax(np.abs(forces - held)))
         joint = machine.active[worst]
@@ -71,6 +82,7 @@ class _Trim:
         drive: The circuit.
         q_a: (n,).
         v_a: (n,).
+        outside: See `trimmed`.
         shared: Whether states of no joint, of pumps and lines, have to stay what they are, too.
 
     Attributes:
@@ -78,9 +90,16 @@ class _Trim:
     """
 
     def __init__(
-        self, dynamics: Dynamics, drive: Drive, q_a: Array, v_a: Array, shared: bool = True
+        self,
+        dynamics: Dynamics,
+        drive: Drive,
+        q_a: Array,
+        v_a: Array,
+        outside: Array,
+        shared: bool = True,
     ):
         self._dynamics, self.drive, self._q_a, self.v_a = dynamics, drive, q_a, v_a
+        self._outside = outside
         closure = dynamics.machine.closure
         n, k = len(q_a), len(drive.states)
         pressure = np.array([unit == "Pa" for unit in drive.states.values()])
@@ -88,7 +107,7 @@ class _Trim:
         volume = np.array([unit == "m3" for unit in drive.states.values()])
         scales = np.select([pressure, spring, volume], [_BAR, _MILLIMETRE, _THIMBLE], 1.0)
         moving = drive.moving(v_a, shared)
-        loaded = drive.loaded(dynamics.inverse(q_a, v_a, np.zeros(n)))
+        loaded = drive.loaded(dynamics.inverse(q_a, v_a, np.zeros(n)) - outside)
         self._free = np.flatnonzero(np.concatenate([loaded | spring | moving[:k], moving[k:]]))
         self._rows = np.concatenate([np.arange(n), n + np.flatnonzero(spring | moving[:k])])
         self._scales = np.concatenate([scales, np.ones(len(drive.u))])
@@ -106,7 +125,7 @@ class _Trim:
         """Accelerations and rates in their units, and their derivatives by z."""
         drive, n, k = self.drive, len(self._q_a), len(self.drive.states)
         values, slopes = drive.at(self._q_a, self.v_a, z[:k], z[k:])
-        state = self._q_a, self.v_a, values[:n]
+        state = self._q_a, self.v_a, values[:n] + self._outside
         a_a = self._dynamics.forward(*state, friction=True)
         found = self._dynamics.derivatives("forward", *state, friction=True, by=["tau_a"])
         by = slopes[:, 2 * n :]
