@@ -236,7 +236,11 @@ def at_rest(machine: Machine, q: Array) -> Array:
     if not machine.external:
         return np.zeros(len(machine.active))
     none = np.zeros(states_of(machine.external))
-    forces = ExternalForces(machine, machine.external).along(0.0, q, np.zeros(machine.model.nv), none).forces
+    forces = (
+        ExternalForces(machine, machine.external)
+        .along(0.0, q, np.zeros(machine.model.nv), none)
+        .forces
+    )
     return np.asarray(machine.closure.gamma(q).T @ forces)
 
 

@@ -39,8 +39,11 @@ def said(
         exact: Whether the formulation keeps its energy.
 
     Raises:
-        SimulationError: An end stop gave back more energy than it took.
+        SimulationError: An end stop gave back more energy than it took, or a piston left its
+            cylinder.
     """
+    if text := cylinders_left(machine, time, rows.q):
+        raise SimulationError(text)
     gap = _gap(rows)
     if exact and (text := stop_gains(machine, time, rows, step, gap)):
         raise SimulationError(text)
@@ -114,6 +117,32 @@ def strokes_passed(machine: Machine, time: Array, q: Array) -> str:
     if not words:
         return ""
     return f"{', '.join(words)}: make end stops as stiff as steel is, or move slower"
+
+
+def cylinders_left(machine: Machine, time: Array, q: Array) -> str:
+    """What to say of a piston beyond all room of its chambers, hoses among it, else nothing.
+
+    Arguments as those of `limits_passed`.
+    """
+    cylinders = machine.hydraulics.cylinders if machine.hydraulics is not None else {}
+    for joint, cylinder in cylinders.items():
+        if cylinder.motor:
+            continue
+        release()
+        i = machine.column(joint)
+        lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
+        least, most = (
+            lower - cylinder.hose_a / cylinder.area_a,
+            upper + cylinder.hose_b / cylinder.area_b,
+        )
+        if (out := (q[:, i] <= least) | (q[:, i] >= most)).any():
+            first = int(np.argmax(out))
+            chamber = "A" if q[first, i] <= least else "B"
+            return (
+                f"at t = {time[first]:.4g} s the piston of '{joint}' has left its cylinder, whose "
+                f"chamber {chamber} has no room: give '{joint}' an end stop (end_stops)"
+            )
+    return ""
 
 
 def buried(machine: Machine, q: Array) -> str:
