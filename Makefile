@@ -54,8 +54,9 @@ demo: $(READY)
 test: $(READY_DEV)
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
+# a third process works where browsers and programs are waited for
 slow: $(READY_DEV)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "slow and not long"
+	$(BIN)/python -m pytest -n 3 --dist worksteal -m "slow and not long"
 
 long: $(READY_DEV)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m long
