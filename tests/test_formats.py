@@ -323,6 +323,7 @@ def test_convert(tmp_path):
         ("b.xml", (), "b.xml"),
         ("c", (), "c/five_bar.yaml"),
         ("d.txt", ("--to", "mjcf"), "d.txt"),
+        ("e.v2", ("--to", "machine"), "e.v2/five_bar.yaml"),
     ):
         result = convert(DATA / "five_bar.urdf", tmp_path / out, *options)
         assert (result.returncode, result.stderr) == (0, "")
@@ -337,6 +338,7 @@ def test_convert(tmp_path):
     [
         ("there.urdf", (), "there.urdf: exists already, choose another name or add --force"),
         ("x.yaml", (), "x.yaml: a machine file comes with its URDFs, give the name of a folder"),
+        ("x.fmu", (), "x.fmu: .fmu is not written, give a .urdf or .xml file, or a folder; "),
         ("x", ("--to", "sdf"), "error: --to is 'sdf', known: machine, mjcf, urdf, urdf+"),
     ],
 )

@@ -142,6 +142,8 @@ def test_parts_and_signals_by_hand():
     machine = crane.load("patu655")
     with pytest.raises(InputError, match="at most, far below the tank's: looks like bar"):
         Signals(machine, [0.0, 1.0], {}, supply=[92, 95])
+    with pytest.raises(InputError, match=r"signals are a list, give those of each valve by its j"):
+        Signals(machine, [0.0, 1.0], [0.0, 1.0])
     Signals(machine, [0.0, 1.0], {}, supply=[0.5e5, 9e6])  # the pump is switched on
 
 

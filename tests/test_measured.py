@@ -1,7 +1,10 @@
 """Recordings of a real crane: strokes from angles, forces from pressures."""
 
+import csv
 import re
 import warnings
+from contextlib import nullcontext
+from pathlib import Path
 
 import numpy as np
 import oracles
@@ -13,8 +16,9 @@ import crane
 from crane.cli.runs import read_run
 from crane.common.errors import CraneError, CraneWarning, RecordingError
 from crane.recordings import postures
-from crane.recordings.measured import read_measured
+from crane.recordings.measured import check_pressures, read_measured
 from crane.recordings.recording import Recording
+from crane.recordings.timeseries import Table
 
 AREA_A, AREA_B = 3.14e-4, 2.01e-4  # [m2] of both cylinders
 
@@ -104,6 +108,34 @@ def test_strokes_and_forces_come_back(machine, columns, truth, tmp_path):
         assert close(recording.tau[:, i], truth["tau"][:, i])
     # rates by differences of the angles: of second order in the step of 10 ms
     assert close(recording.v[1:-1], truth["v"][1:-1], 1e-3)
+
+
+LIFTING = Path(__file__).parents[2] / "shared" / "data" / "patu655" / "lifting_first_half.csv"
+
+
+def test_a_chamber_that_is_sucked_empty_may_read_less_by_noise(machine, columns, truth, tmp_path):
+    noise = np.random.default_rng(0).normal(size=len(truth["t"]))
+    columns["pressure_X1_b [bar]"] = 0.05 + 0.1 * noise
+    below = f"{(columns['pressure_X1_b [bar]'] < 0).sum()} of 401 samples"
+    with pytest.warns(CraneWarning, match=f"'pressure_X1_b' is below a vacuum in {below}, by up "):
+        recording = read_measured(machine, write(tmp_path, columns))
+    assert recording["pressure_X1_b"].min() < 0  # as read
+    columns["pressure_X1_b [bar]"] = -0.9 + 0.1 * noise
+    with pytest.raises(RecordingError, match="count from a vacuum: to gauge pressures add 1e5"):
+        read_measured(machine, write(tmp_path, columns))
+
+
+@pytest.mark.skipif(not LIFTING.is_file(), reason="the recordings, ../shared/data, are not there")
+def test_real_gauge_pressures_are_not_taken_for_noise():
+    with LIFTING.open() as file:
+        names, *rows = csv.reader(file)
+    measured = np.array(rows, dtype=float)
+    machine = crane.load("patu655")
+    for less, refused in ((0.0, False), (1e5, True)):
+        empty = measured[:, names.index("p2_Pa")] - less
+        table = Table({"pressure_X_lift_b": "Pa"}, empty[:, None], {})
+        with pytest.raises(RecordingError) if refused else nullcontext():
+            check_pressures(machine, table)
 
 
 def test_channels_are_kept_in_si(machine, columns, truth, tmp_path):

@@ -57,11 +57,17 @@ def convert(
     from crane.common.output import replacing
     from crane.formats import robot_description, write_machine, write_mjcf, write_urdf_plus
 
-    kind = to or _SUFFIXES.get(out.suffix.lower(), "machine")
+    suffix = out.suffix.lower()
+    kind = to or _SUFFIXES.get(suffix, "machine")
     if kind not in _FORMATS:
         raise InputError(f"--to is '{kind}', {known(_FORMATS, kind)}")
-    if kind == "machine" and out.suffix.lower() in {*_SUFFIXES, ".yaml", ".yml"}:
+    if kind == "machine" and suffix in {*_SUFFIXES, ".yaml", ".yml"}:
         raise InputError(f"{out}: a machine file comes with its URDFs, give the name of a folder")
+    if to is None and suffix and suffix not in _SUFFIXES:
+        raise InputError(
+            f"{out}: {suffix} is not written, give a .urdf or .xml file, or a folder; where the "
+            "folder shall have this name, --to machine"
+        )
     if kind == "machine":
         check_folder(out, force)
     else:

@@ -132,6 +132,12 @@ class Signals(Command, Brief):
         self._time = as_sample(time, shape[0], "time of the signals").copy()
         if not (np.diff(self._time) > 0).all():
             raise InputError("time of the signals does not increase, sort it")
+        if not isinstance(signals, Mapping):
+            example = next(iter(circuit.spools))
+            raise InputError(
+                f"signals are a {type(signals).__name__}, give those of each valve by its joint, "
+                f"as {{'{example}': [...]}}"
+            )
         for name in signals:
             if name not in circuit.spools:
                 raise InputError(f"no valve for '{name}', {known(circuit.spools, name)}")

@@ -110,7 +110,7 @@ class _Pair:
         reading, walk = column(postures.table, name), 0.0
         if self.rate:
             time = column(postures.table, TIME)
-            walk = _noise(reading) * float(time[-1] - time[0]) / float(np.sqrt(len(time)))
+            walk = noise_of(reading) * float(time[-1] - time[0]) / float(np.sqrt(len(time)))
             reading = _added_up(time, reading)
         self.measured = reading[postures.chosen]
         self.said = postures.said(self.base)
@@ -119,7 +119,7 @@ class _Pair:
             self.off = self.off - self.off.mean()
         elif self.unit == "rad":
             self.off = self.off - 2 * np.pi * np.round(np.median(self.off) / (2 * np.pi))
-        noise = _noise(self.off)
+        noise = noise_of(self.off)
         self.allowed = allowed(AGREE, postures.machine, self.unit)
         # of what differs, and of what a cause may leave; noise that is added up walks at random
         self.most = max(self.allowed, _NOISE[0] * noise, _WALKS * walk)
@@ -308,7 +308,7 @@ def _least(causes: list[tuple[float, _Cause]], limit: float) -> _Cause:
     return min(near, key=lambda pair: (len(pair[1].sensors), pair[0]))[1]
 
 
-def _noise(x: Array) -> float:
+def noise_of(x: Array) -> float:
     """Standard deviation of white noise on a smooth signal (N,), by its second differences."""
     return float(np.median(np.abs(np.diff(x, 2)))) / 1.65 if len(x) > 2 else 0.0
 

@@ -75,9 +75,10 @@ class Identification(Brief):
             for name, fit in fits.items()
             if fit is not None and not math.isnan(fit.stacked)
         )
+        vague = self.marks.count("not determined")
         return (
-            f"Identification of '{self.described.name}': {len(self.values)} base parameters, "
-            f"{kind}{self.method}{''.join(told)}"
+            f"Identification of '{self.described.name}': {len(self.values)} base parameters"
+            f"{f', {vague} not determined' if vague else ''}, {kind}{self.method}{''.join(told)}"
         )
 
     @property
