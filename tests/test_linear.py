@@ -34,6 +34,11 @@ def test_a_load_on_its_oil(tmp_path):
     )
     rings = [mode for mode in model.modes if mode.pole.imag > 0]
     assert len(rings) == 1
+    undamped = crane.linearize(machine.replace(friction={}))
+    (ring,) = (mode for mode in undamped.modes if mode.rings)
+    assert ring.damping == 0 and str(ring.damping) == "0.0"  # not what rounding leaves
+    assert f"| {ring.frequency:.4g} | 0 |  | x |" in undamped.to_text()
+    assert "nothing answers voltage_x there; a velocity opens valves" in undamped.to_text()
     # p^2 + c/m p + k/m = 0
     poles = np.roots([1.0, 300.0 / 2000.0, stiffness / 2000.0])
     np.testing.assert_allclose(rings[0].pole, poles[poles.imag > 0][0], rtol=1e-11)

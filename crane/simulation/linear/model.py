@@ -19,6 +19,7 @@ from crane.recordings.recording import Recording
 
 _FRAMES, _SWING = 50, 0.05  # per second; of a stroke, rad and machine's size, as modes are shown
 _PAIRED = 1e-3  # share of a pole that is no imaginary part: the root of rounding, and more
+_UNDAMPED = 1e-13  # share of the fastest pole that is no damping: rounding
 _INTEGRATOR = 1e-7  # share of the fastest pole that is none: rounding of a pole at zero
 
 
@@ -108,12 +109,14 @@ class LinearModel(Brief):
             size = abs(pole)
             if size < _INTEGRATOR * fastest:
                 pole, size = 0j, 0.0
+            elif abs(pole.real) < _UNDAMPED * fastest:
+                pole = complex(0.0, pole.imag)
             moved = self.ways @ vector[: self.ways.shape[1]]
             at = np.argmax(np.abs(moved / units))
             largest = moved[at] / units[at]
             if abs(largest) > 1e-12 * np.abs(vector).max():
                 moved = moved / largest
-            damping = -pole.real / size if size else 0.0
+            damping = (0.0 - pole.real) / size if size else 0.0
             mode = Mode(complex(pole), size / (2 * np.pi), float(damping), moved, vector)
             found.append(mode)
         return tuple(sorted(found, key=lambda mode: (mode.frequency, mode.pole.imag)))
@@ -170,15 +173,16 @@ class LinearModel(Brief):
         for mode in self.modes:
             if not mode.frequency:
                 continue
-            lasting = -1.0 / mode.pole.real if mode.pole.real else np.inf
+            lasting = f"{1.0 / abs(mode.pole.real):.3g}" if mode.pole.real else ""
             frequency = f"{mode.frequency:.4g}" if mode.rings else ""
             damping = f"{100 * mode.damping:.3g}" if mode.rings else ""
             grows = " (grows)" if mode.pole.real > 0 else ""
-            lines.append(
-                f"| {frequency} | {damping} | {abs(lasting):.3g}{grows} | {self.most(mode)} |"
-            )
+            lines.append(f"| {frequency} | {damping} | {lasting}{grows} | {self.most(mode)} |")
         if zeros := sum(mode.frequency == 0 for mode in self.modes):
             lines += ["", f"{zeros} poles at zero: what stays where it is put"]
+        still = [name for name, way in zip(self.inputs, self.B.T, strict=True) if not way.any()]
+        if still:
+            lines += ["", f"nothing answers {', '.join(still)} there; a velocity opens valves"]
         return "\n".join(lines)
 
     def motion(self, seconds: float = 3.0, most: int = 8) -> Recording | None:

@@ -153,7 +153,7 @@ def _draw_poles(axes: Axes, model: LinearModel) -> None:
         rings = mode.rings
         axes.plot(
             [mode.frequency], [100 * mode.damping], "o" if rings else "x", ms=4.5,
-            color=RECORDED if rings else "#909090",
+            color=RECORDED if rings else "#909090", clip_on=False, zorder=3,
         )  # fmt: skip
         if rings:
             axes.annotate(
@@ -161,6 +161,8 @@ def _draw_poles(axes: Axes, model: LinearModel) -> None:
                 xytext=(3, 4), textcoords="offset points",
             )  # fmt: skip
     axes.set_xscale("log")
+    powers = np.log10([mode.frequency for mode in shown] or [1.0])
+    axes.set_xlim(10 ** np.floor(powers.min()), 10 ** (np.floor(powers.max()) + 1))
     axes.set_yscale("symlog", linthresh=1.0)
     axes.set_xlabel("frequency [Hz]")
     axes.set_ylabel("damping [%]")
