@@ -332,3 +332,19 @@ def test_a_small_force_beside_a_large_one_is_in_the_same_unit():
     grid = panels(recording_figure(run))
     assert [grid[2, i].get_ylabel() for i in (0, 1)] == ["force [kN]"] * 2
     np.testing.assert_allclose(curve(grid[2, 1], "recording")[1], [0.3, -0.5])
+
+
+@pytest.mark.parametrize("name", ["loader", "loader with a long boom and two chambers"])
+def test_title_and_legend_stand_apart_where_there_is_one_joint(name):
+    time = np.linspace(0, 2, 201)
+    pressures = {f"pressure_lift_{side}": 1e6 + 1e5 * np.sin(time) for side in "ab"}
+    column = np.sin(time)[:, None]
+    one = Recording(
+        time, ("lift",), column, column, column, {"lift": "m"}, pressures,
+        dict.fromkeys(pressures, "Pa"), machine_name=name,
+    )  # fmt: skip
+    figure = recording_figure(one)
+    FigureCanvasAgg(figure).draw()
+    (legend,) = figure.legends
+    above, beside = (part.get_window_extent() for part in (figure._suptitle, legend))
+    assert not above.overlaps(beside)

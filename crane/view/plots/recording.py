@@ -64,6 +64,7 @@ STYLE: Any = {
 TICK_OFFSET, LABEL_OFFSET, PAD_OFFSET = 8.0, 14.0, 8.0
 _FLAT = 0.01  # of a path's size, what it may leave a plane by
 MOST_COLUMNS = 5  # joints beside each other
+_LETTER, _ENTRY = 0.11, 1.0  # [in] of a title, and of an entry of a legend
 # Least height of an axis [SI], so that rounding noise of a joint at rest looks like rest.
 LEAST_SPAN = {
     "rad": 3e-3, "m": 2e-4, "rad/s": 3e-3, "m/s": 2e-4, "N m": 0.02, "N": 0.2, "Pa": 1e4,
@@ -365,13 +366,14 @@ def _letter(axes: Axes, letters: Iterator[str]) -> None:
 
 def _caption(figure: Figure, recording: Recording) -> None:
     """What is shown, and which line is what."""
-    if words := title(subject(recording), recording.task):
+    words = title(subject(recording), recording.task)
+    if words:
         figure.suptitle(plain(words), x=0.01, ha="left", fontsize=11, fontweight="bold")
     lines = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
     if shown := [lines[label] for label in LINES if label in lines and label != "recording"]:
-        figure.legend(
-            handles=[lines["recording"], *shown], loc="outside upper right", ncols=1 + len(shown)
-        )
+        beside = _LETTER * len(words) + _ENTRY * (1 + len(shown)) < figure.get_figwidth()
+        place = "outside upper right" if beside else "outside lower center"
+        figure.legend(handles=[lines["recording"], *shown], loc=place, ncols=1 + len(shown))
 
 
 def joint_symbol(name: str) -> str:
