@@ -372,8 +372,11 @@ def _caption(figure: Figure, recording: Recording) -> None:
     lines = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
     if shown := [lines[label] for label in LINES if label in lines and label != "recording"]:
         beside = _LETTER * len(words) + _ENTRY * (1 + len(shown)) < figure.get_figwidth()
-        place = "outside upper right" if beside else "outside lower center"
-        figure.legend(handles=[lines["recording"], *shown], loc=place, ncols=1 + len(shown))
+        figure.legend(
+            handles=[lines["recording"], *shown],
+            loc="outside upper right" if beside else "outside lower center",
+            ncols=1 + len(shown),
+        )
 
 
 def joint_symbol(name: str) -> str:
