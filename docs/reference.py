@@ -3,9 +3,10 @@
 import inspect
 import re
 import shutil
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 from docutils import nodes
 from sphinx.addnodes import pending_xref
@@ -18,6 +19,7 @@ from crane.cli import program
 HERE = Path(__file__).parent
 GENERATED = HERE / "generated"
 EXAMPLES = HERE.parent / "examples"
+_MEMBERS = "   :members:\n   :inherited-members: Exception, BaseException, object, tuple\n"
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
@@ -25,6 +27,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.add_role("public", Public())
     app.connect("config-inited", lambda *_: write())
     app.connect("autodoc-process-docstring", _restructured, priority=400)  # before napoleon
+    app.connect("autodoc-skip-member", _of_a_tuple)
     return {"parallel_read_safe": True}
 
 
@@ -44,6 +47,13 @@ class Public(SphinxRole):
         )
         link["refdoc"] = self.env.docname
         return [link], []
+
+
+def _of_a_tuple(
+    _app: Sphinx, _what: str, _name: str, of: Any, _skip: bool, _options: Any
+) -> bool | None:
+    """Leave out what Python says of the fields of named tuples; their class says what they are."""
+    return True if str(of.__doc__).startswith("Alias for field") else None
 
 
 def _restructured(
@@ -85,8 +95,9 @@ def write() -> None:
     for module, names in crane._HOMES.items():
         rooms.setdefault(module.split(".")[1], []).extend(names.split())
     del rooms["common"]
+    parts = _parts()
     for room, names in rooms.items():
-        _write(f"api/{room}.rst", _room(room, sorted(names)))
+        _write(f"api/{room}.rst", _room(room, sorted(names), parts.get(room, [])))
     _write("api/errors.rst", _errors())
     _write("api/index.rst", _index(list(rooms)))
     _write("commands.md", _commands())
@@ -97,18 +108,65 @@ def _write(name: str, text: str) -> None:
     (GENERATED / name).write_text(text)
 
 
-def _room(room: str, names: list[str]) -> str:
+def _parts() -> dict[str, list[type]]:
+    """By room, classes without a public name that attributes and results of public ones are."""
+    every = [getattr(crane, name) for name in crane.__all__]
+    to_follow = [value for value in every if callable(value)]
+    seen, found = set(to_follow), {}
+    while to_follow:
+        for part in _leads_to(to_follow.pop()):
+            root, _, rest = part.__module__.partition(".")
+            room = rest.partition(".")[0]
+            inner = part.__name__.startswith("_") or room in ("closure", "codegen", "common")
+            if part not in seen and root == "crane" and not inner:
+                seen.add(part)
+                to_follow.append(part)
+                found.setdefault(room, []).append(part)
+    return {room: sorted(parts, key=lambda x: x.__name__) for room, parts in found.items()}
+
+
+def _leads_to(value: Any) -> Iterator[type]:
+    """Classes of the attributes of a class, or of what a function returns."""
+    if not inspect.isclass(value):
+        yield from _classes(_hints(value).get("return"))
+        return
+    for name, hint in _hints(value).items():
+        yield from () if name.startswith("_") else _classes(hint)
+    for name, member in inspect.getmembers(value):
+        of = getattr(member, "fget", None) or getattr(member, "func", None) or member
+        if inspect.isfunction(of) and not name.startswith("_"):
+            yield from _classes(_hints(of).get("return"))
+
+
+def _hints(of: Any) -> dict[str, Any]:
+    try:
+        return get_type_hints(of)
+    except NameError:  # of types that are imported where they are checked alone
+        return {}
+
+
+def _classes(hint: Any) -> Iterator[type]:
+    if inspect.isclass(hint) and not get_args(hint):
+        yield hint
+    for part in get_args(hint):
+        yield from _classes(part)
+
+
+def _room(room: str, names: list[str], inner: list[type]) -> str:
     module = import_module(f"crane.{room}")
     parts = [_title(room.capitalize()), str(module.__doc__)]
     for name in names:
         value = getattr(crane, name)
         if inspect.isclass(value):
-            members = "   :members:\n   :inherited-members: Exception, BaseException, object\n"
-            parts.append(f".. autoclass:: crane.{name}\n{members}")
+            parts.append(f".. autoclass:: crane.{name}\n{_MEMBERS}")
         elif callable(value):
             parts.append(f".. autofunction:: crane.{name}\n")
         else:
             parts.append(f".. py:data:: crane.{name}\n\n   By name: {', '.join(value)}.\n")
+    if inner:
+        heading = "What these lead to"
+        parts += [f"{heading}\n{'-' * len(heading)}", "Classes of their attributes and results."]
+        parts += [f".. autoclass:: {x.__module__}.{x.__name__}\n{_MEMBERS}" for x in inner]
     return "\n\n".join(parts)
 
 

@@ -107,8 +107,9 @@ def simulate(
         controller: A controller, a function (t, q_a, v_a) -> tau_a, or what commands the valves
             of a hydraulic machine (`ValvePD`, `joystick`, `Signals`, `Sampled`). None is no
             force, and valves at their neutral signal where the machine has any.
-        initial: Active coordinates (n,) to start at rest from, or a pair (q_a, v_a); the start of
-            the controller's reference, or of its levers, at rest, or else the home posture.
+        initial: Active coordinates (n,) [m], [rad] to start at rest from, or a pair (q_a, v_a)
+            with velocities [m/s], [rad/s]; the start of the controller's reference, or of its
+            levers, at rest, or else the home posture.
         duration: [s]; that of the controller's reference or levers if not given, which ends where
             the last of their phases does.
         step: [s].

@@ -54,6 +54,9 @@ def add_loops(
             suffix; NAME_closed.yaml in this folder if not given.
         force: Whether files that are there are replaced.
 
+    Returns:
+        The loops, the active joints, and the file that was written.
+
     Raises:
         InputError: Nothing is left open.
         MechanismError: The machine does not close with them.

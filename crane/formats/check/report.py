@@ -150,6 +150,9 @@ def check(
         packages: As for `load`.
         arguments: As for `load`.
 
+    Returns:
+        Findings with file and line, a summary, and what to do next; printed as `crane check` does.
+
     Raises:
         DescriptionError: There is no such file.
         InputError: A joint is unknown.

@@ -86,6 +86,10 @@ def calibrate(
         sensors: Columns to compare; all that can be if not given.
         progress: Called with the finished share, 0 to 1.
 
+    Returns:
+        The numbers with their intervals, channels before and after, the fitted machine, and what
+        else it lacks.
+
     Raises:
         InputError: Names, bounds or windows that cannot be.
         RecordingError: A recording is malformed, or has no signals.

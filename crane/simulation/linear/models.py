@@ -54,6 +54,9 @@ def linearize(
             pressure, where its valve would begin to let oil in: the model is that of the valve
             closed.
 
+    Returns:
+        Matrices with the names of states, inputs and outputs, the operating point, and the modes.
+
     Raises:
         InputError: Unknown names, a posture beyond the limits, or a drive that is not there.
         ClosureError: The loops do not close there.
