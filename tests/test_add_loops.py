@@ -176,8 +176,8 @@ def test_what_cannot_be_is_refused_in_one_line(tmp_path, monkeypatch):
     planar(tmp_path)
     done = typed("add", "loops", "digger.urdf", cwd=tmp_path)
     assert done.returncode == 2 and done.stderr.splitlines()[-1] == (
-        "error: 'digger' has no frames that look like ends of a loop, write loops in a machine "
-        "file"
+        "error: 'digger' has no frames that look like ends of a loop and meet at home: give a "
+        'home where they do (<group_state name="home">), or write loops in a machine file'
     )
     (tmp_path / "far.urdf").write_text(
         five_bar("closing_foot_1", "closing_foot_2").replace("0.3 0 0", "5 0 0", 1)

@@ -57,7 +57,10 @@ class Kinematics(Brief):
     def __init__(self, machine: Machine, frame: str | None = None):
         if frame is None:
             if machine.tip is None:
-                raise InputError(f"machine '{machine.name}' has no tip, name a frame")
+                raise InputError(
+                    f"machine '{machine.name}' has no tip, name a frame: a link here, or as 'tip' "
+                    "in the machine file"
+                )
             frame = machine.tip
         self.machine, self.frame = machine, frame
         self._model = machine.model

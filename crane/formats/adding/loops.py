@@ -66,8 +66,8 @@ def add_loops(
     found = proposals(spec, loaded.model, loaded.home)
     if not found:
         raise InputError(
-            f"'{loaded.name}' has no frames that look like ends of a loop, write loops in a "
-            "machine file"
+            f"'{loaded.name}' has no frames that look like ends of a loop and meet at home: give "
+            'a home where they do (<group_state name="home">), or write loops in a machine file'
         )
     file = machine_file(out, f"{file_name(loaded.name)}_closed.yaml")
     draft = Draft(loaded, file.stem)
