@@ -128,7 +128,7 @@ def _as_float(value: Any) -> float:
 
 def _composed(text: str) -> tuple[Any, yaml.Node | None]:
     """What is in a text, and the loader that constructs it."""
-    if yaml.__with_libyaml__:
+    if yaml.__with_libyaml__ and "\t" not in text:  # which PyYAML refuses in more places
         with suppress(yaml.YAMLError):
             fast = _Fast(text)
             return fast, fast.get_single_node()
