@@ -9,6 +9,7 @@ from typed import typed
 
 import crane
 from crane.common.errors import CraneError, CraneWarning
+from crane.simulation.linear.outside import Outside
 
 
 def quiet(call, *args, **options):
@@ -85,6 +86,17 @@ def test_forces_from_outside_are_part_of_it():
         # joints' own friction is that of a motion that has begun
         own = crane.linearize(machine, drive="forces", outputs=["X_lift"]).A[n:, n + i]
         np.testing.assert_allclose(model.A[n:, n + i] - own, by_speed, rtol=1e-6, atol=1e-6)
+
+
+def test_stiffness_under_a_constant_force_is_symmetric():
+    """As of all that has a potential, -F p: to the digits that its differences leave."""
+    for name, force in (("mini_forwarder", (2, 1, -5)), ("excavator", (1e4, 0, -2e4))):
+        machine = quiet(crane.load, name)
+        q_a = machine.home[machine.closure.active]
+        loaded = machine.under(crane.Wrench(machine.tip, force))
+        stiffness = Outside(loaded).slopes(q_a, 0 * q_a)[:, : len(q_a)]
+        off = np.abs(stiffness - stiffness.T).max()
+        assert off < 1e-10 * np.abs(stiffness).max() and np.abs(stiffness).max() > 0
 
 
 def test_on_valves_chambers_bear_forces_from_outside():
