@@ -138,6 +138,21 @@ def test_what_carries_a_load_hangs_as_still_as_with_a_payload():
     np.testing.assert_allclose(more * law.settings[3:], -lifted, rtol=1e-9, atol=1e-12)
 
 
+def test_a_controller_of_the_bare_machine_begins_with_what_the_run_carries():
+    mini = crane.load("mini_forwarder")
+    stand = crane.point_to_point(*2 * [mini.home[mini.closure.active]], 1.0)
+    law, pull = crane.PI(mini, stand), crane.Wrench(mini.tip, (0.0, 0.0, -5.0))
+    run = crane.simulate(mini, law, loads=(pull,))
+    assert np.abs(run.q - run.q[0]).max() < 1e-9
+    crane_ = crane.load("patu655", lock={"X_ext": 0.1, "slew": 0.0})
+    pull = crane.Wrench(crane_.tip, (0.0, 0.0, -1500.0))
+    drive = crane.ValveDrive(crane_, crane.Signals(crane_, [0.0], {}))
+    given, own = (
+        crane.simulate(crane_, control, duration=0.1, loads=(pull,)) for control in (drive, None)
+    )
+    np.testing.assert_array_equal(given["pressure_X_lift_a"], own["pressure_X_lift_a"])
+
+
 def test_with_hydraulics_a_pull_is_in_the_chambers():
     """A cylinder that holds still carries the load's generalised force more."""
     machine = crane.load("patu655", lock={"X_ext": 0.1, "slew": 0.0})

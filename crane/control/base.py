@@ -143,10 +143,9 @@ class Law(Brief):
 
     def start_at(self, dynamics: Dynamics, q: Array) -> Array:
         """`start` at a posture (nq,) that is closed already, of an exact `Dynamics`."""
-        machine = self.machine
-        q_a = q[machine.closure.active]
+        q_a = q[self.machine.closure.active]
         rest = np.zeros_like(q_a)
-        outside = at_rest(machine, q)
+        outside = at_rest(dynamics.machine, q)  # a run's may carry more than the law's
 
         def inverse(a_a: Sequence[Number], friction: bool) -> list[Number]:
             quantity = "inverse with friction" if friction else "inverse"

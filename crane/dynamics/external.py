@@ -235,13 +235,9 @@ def at_rest(machine: Machine, q: Array) -> Array:
     """gamma^T J^T w (n,) of a machine's external forces at time 0, at rest in a posture (nq,)."""
     if not machine.external:
         return np.zeros(len(machine.active))
-    none = np.zeros(states_of(machine.external))
-    forces = (
-        ExternalForces(machine, machine.external)
-        .along(0.0, q, np.zeros(machine.model.nv), none)
-        .forces
-    )
-    return np.asarray(machine.closure.gamma(q).T @ forces)
+    still, none = np.zeros(machine.model.nv), np.zeros(states_of(machine.external))
+    applied = ExternalForces(machine, machine.external).along(0.0, q, still, none)
+    return np.asarray(machine.closure.gamma(q).T @ applied.forces)
 
 
 def _placed(machine: Machine, force: ExternalForce) -> tuple[int, pin.SE3]:
