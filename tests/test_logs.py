@@ -74,11 +74,14 @@ def test_csv_of_other_programs(tmp_path, between):
 @pytest.mark.parametrize("between", [";", "\t"])
 def test_csv_of_european_programs(tmp_path, between, encoding):
     rows = [["Zeit", "Neigung [°]"], ["0", "-1,5"], ["0,01", "2,5E+1"]]
-    text = "\n".join(between.join(row) for row in rows) + "\n"
+    text = "# crane samples: 2\n" + "\n".join(between.join(row) for row in rows) + "\n"
     (tmp_path / "log.csv").write_text(text, encoding)
     described = columns(tmp_path, "time [s] = Zeit\nX [deg] = 'Neigung [°]'\n")
     table = read_log(tmp_path / "log.csv", described)
     np.testing.assert_allclose(table.values, [[0, np.deg2rad(-1.5)], [0.01, np.deg2rad(25)]])
+    (tmp_path / "log.csv").write_text(text[:-1], encoding)
+    with pytest.raises(RecordingError, match="cut short in its last line"):
+        read_log(tmp_path / "log.csv", described)
 
 
 @pytest.mark.parametrize("cell", ["1.234,5", "1,234.5"])

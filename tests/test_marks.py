@@ -104,6 +104,10 @@ def test_a_cylinder_that_is_not_drawn_has_a_rod_that_stays_in_its_barrel(tmp_pat
     assert rod.link == "rod" and isinstance(rod.shape, Cylinder)
     ends = [(rod.placement @ [0, 0, z * rod.shape.length, 1])[:3] for z in (0.5, -0.5)]
     np.testing.assert_allclose(ends, [[0, 0, 0], [0.6, 0, 0]], atol=1e-15)  # against the axis
+    text = (tmp_path / "cylinder.urdf").read_text().replace('lower="0.1" upper="0.7"', "{}")
+    (tmp_path / "endless.urdf").write_text(text.format('lower="-1000" upper="1000"'))
+    (block,) = sliding(crane.load(tmp_path / "endless.urdf"), ())
+    assert isinstance(block.shape, Box)  # such limits are placeholders
 
 
 def test_arrows_are_in_proportion_to_what_joints_can():

@@ -214,7 +214,7 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
         _count_lines(path)
         encoding = _encoding(path)
         notes, heading, line = _head(path, encoding)
-        _check_end(path, notes)
+        _check_end(path, notes, encoding)
         between = max(",;\t", key=heading.count)
         names = [cell.strip() for cell in next(csv.reader([heading], delimiter=between))]
         values = _numbers(lambda: _rows(path, encoding, line, between), line, between, names)
@@ -295,7 +295,7 @@ def _count_lines(path: Path) -> int:
     return ended + (since > 0)
 
 
-def _check_end(path: Path, notes: Mapping[str, str]) -> None:
+def _check_end(path: Path, notes: Mapping[str, str], encoding: str = _UTF8) -> None:
     """See that the last line of a file that says how many samples it has ends.
 
     Raises:
@@ -304,8 +304,8 @@ def _check_end(path: Path, notes: Mapping[str, str]) -> None:
     if SAMPLES not in notes:
         return
     with path.open("rb") as file:
-        file.seek(-1, os.SEEK_END)
-        if file.read(1) not in b"\r\n":
+        file.seek(-2 if encoding == "utf-16" else -1, os.SEEK_END)
+        if file.read().strip(b"\0") not in (b"\r", b"\n"):
             raise RecordingError(f"is cut short in its last line, {_AGAIN}")
 
 

@@ -12,6 +12,8 @@ from crane.formats.opening import robots
 from crane.formats.visuals.visuals import PLAIN, Box, Cylinder, Sphere, Visual, read_drawn
 from crane.machine import Machine
 
+_BARRELS = 3.0  # largest distances on one body, the longest stroke that is drawn as a rod
+
 
 def read_visuals(machine: Machine) -> list[Visual]:
     """The visuals of every link, or a skeleton where no URDF has any.
@@ -84,10 +86,10 @@ def sliding(machine: Machine, drawn: Collection[int]) -> list[Visual]:
     """What shows bodies with mass that slide, but for those that are drawn, by joints.
 
     On what moves, a rod as long as the stroke, whose end is in the mouth of the barrel when it is
-    out; on what stands still, or without limits, a block.
+    out; on what stands still, or without limits that any barrel has, a block.
     """
-    model, links, width = machine.model, _links(machine), 0.11 * longest(machine)
-    limits = machine.coordinates
+    model, links, size = machine.model, _links(machine), longest(machine)
+    width, limits = 0.11 * size, machine.coordinates
     found = []
     for joint in range(1, model.njoints):
         column = model.joints[joint].idx_v
@@ -96,7 +98,7 @@ def sliding(machine: Machine, drawn: Collection[int]) -> list[Visual]:
             continue
         axis = np.ravel(model.joints[joint].createData().S)[:3]
         stroke = float(limits.upper[column] - limits.lower[column])
-        rod = bool(model.parents[joint]) and np.isfinite(stroke)
+        rod = bool(model.parents[joint]) and stroke < _BARRELS * size
         shape = Cylinder(0.2 * width, stroke) if rod else Box((1.5 * width, width, width))
         turned = pin.Quaternion.FromTwoVectors(pin.ZAxis if rod else pin.XAxis, axis)
         along = pin.SE3(turned, -0.5 * stroke * axis if rod else np.zeros(3))
