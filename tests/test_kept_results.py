@@ -1,6 +1,7 @@
 """What is found once and kept between runs: home and structure of machines, motions of tasks."""
 
 import dataclasses
+import pickle
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,11 +9,14 @@ import pytest
 import scipy.interpolate  # noqa: F401  what is spared
 import scipy.linalg  # noqa: F401
 from broken import DATA
+from work import at_most
 
 import crane
+from crane.closure.exactness import Surplus
 from crane.codegen import kept_result, results
 from crane.codegen.kept import place_of
 from crane.common import cache
+from crane.common.serialization import serialize
 from crane.description import bundled
 
 MINI = {
@@ -43,24 +47,24 @@ def test_it_is_found_once(place):
 
     def find():
         found.append(1)
-        return {"x": np.array([0.1, np.nan, -0.0])}
+        return ("x", np.array([0.1, np.nan, -0.0]))
 
-    first = kept_result(("what", 1.0), find, "no.such.module")
-    again = kept_result(("what", 1.0), find, "no.such.module")
+    first = kept_result(("what", 1.0), find, "no.such.module", ())
+    again = kept_result(("what", 1.0), find, "no.such.module", ())
     assert len(found) == len(kept(place)) == 1
-    assert first["x"].tobytes() == again["x"].tobytes()
-    kept_result(("what", 2.0), find, "no.such.module")
+    assert first[0] == again[0] and first[1].tobytes() == again[1].tobytes()
+    kept_result(("what", 2.0), find, "no.such.module", ())
     assert len(found) == len(kept(place)) == 2
     kept(place)[0].write_bytes(b"damaged")
     for number in (1.0, 2.0):
-        assert np.isnan(kept_result(("what", number), find, "no.such.module")["x"][1])
+        assert np.isnan(kept_result(("what", number), find, "no.such.module", ())[1][1])
     assert len(found) == 3
 
 
 def test_it_is_not_kept_where_its_module_is_there_already(place):
     found = []
     for _ in range(2):
-        kept_result("what", lambda: found.append(1), "numpy")
+        kept_result("what", lambda: found.append(1), "numpy", ())
     assert len(found) == 2 and not kept(place)
 
 
@@ -70,15 +74,15 @@ def test_what_fails_is_not_kept(place):
 
     for _ in range(2):
         with pytest.raises(crane.CraneError, match="no"):
-            kept_result("what", fail, "no.such.module")
+            kept_result("what", fail, "no.such.module", ())
     assert not kept(place)
 
 
 def test_another_build_of_what_finds_it_is_another_place(place, monkeypatch):
-    kept_result("what", lambda: 1, "no.such.module")
+    kept_result("what", lambda: 1, "no.such.module", ())
     build = cache.build_of
     monkeypatch.setattr(cache, "build_of", _Newer(build("scipy")))
-    assert kept_result("what", lambda: 2, "no.such.module") == 2
+    assert kept_result("what", lambda: 2, "no.such.module", ()) == 2
 
 
 class _Newer:
@@ -90,6 +94,39 @@ class _Newer:
     def __call__(self, package):
         time, size = self._build
         return time + (package == "scipy"), size
+
+
+@pytest.mark.parametrize("content", [b"", b"12345678{", serialize(Surplus())])
+def test_an_entry_that_cannot_be_read_is_made_anew(place, content):
+    kept_result("what", lambda: (1.0, None), "no.such.module", ())
+    name = kept(place)[0].name
+    cache.write(name, content)
+    assert kept_result("what", lambda: (2.0, None), "no.such.module", ()) == (2.0, None)
+    assert kept_result("what", lambda: (3.0, None), "no.such.module", ()) == (2.0, None)
+
+
+@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+def test_a_single_call_takes_the_short_way_in_a_later_process(place, fresh):
+    """Arrays that come from a file have numpy's own type, which a pickle's have not."""
+    fresh()
+    for name in ("mini_forwarder", "patu655", "excavator", "kr300"):
+        lines = []
+        for _ in range(3):
+            machine = crane.load(name)
+            dynamics = crane.Dynamics(machine)
+            q = machine.home[machine.closure.active]
+            v, tau = np.zeros_like(q), dynamics.gravity(q)
+            dynamics.forward(q, v, tau)
+            with at_most(1000) as work:
+                found = dynamics.forward(q, v, tau)
+            lines.append(work.lines)
+            assert machine.home.dtype is np.dtype(np.float64)
+        assert lines[0] == lines[1] == lines[2], (name, lines)
+        unpickled = [pickle.loads(pickle.dumps(x)) for x in (q, v, tau)]
+        assert unpickled[0].dtype is not np.dtype(np.float64)  # as of a worker, or a copy of one
+        with at_most(1000) as work:
+            assert (dynamics.forward(*unpickled) == found).all()
+        assert work.lines == lines[0], name
 
 
 def variants():

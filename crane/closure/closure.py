@@ -15,7 +15,7 @@ from crane.closure.branch import Branch
 from crane.closure.choice import Choice, condition, proposals, scales
 from crane.closure.compiled import Cursor, FastClosure
 from crane.closure.equations import LoopEquations
-from crane.closure.exactness import CLOSED, Exact, Rounded
+from crane.closure.exactness import CLOSED, Exact, Rounded, Surplus
 from crane.closure.following import followed
 from crane.closure.home import Sought, settle
 from crane.closure.structure import Structure
@@ -129,7 +129,7 @@ class Closure(Brief):
             return find()
         told = None if said is None else tuple(said)
         depends = (self.parts, self.active, self.guess, told, tuple(loose))
-        return kept_result(("home", depends), find, "scipy.linalg")
+        return kept_result(("home", depends), find, "scipy.linalg", (Structure, Surplus, Sought))
 
     @property
     def parts(self) -> tuple[Any, ...]:

@@ -6,7 +6,7 @@ It is found by what the program's formulas depend on, so that a later process ne
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from crane.codegen.llvm import settings
 from crane.codegen.package import changed, package_digest
 from crane.codegen.representation import ArgumentKind
 from crane.common import cache
+from crane.common.serialization import serialize
 
 
 @dataclass(frozen=True)
@@ -46,26 +47,12 @@ def place_of(depends: Any, kind: str = "note") -> str | None:
     """
     if depends is None:
         return None
-    said = _plain(depends)
+    content = serialize(depends)
     package = package_digest()
     if package is None:
         return None
     tracing = sys.version, np.__version__
-    return cache.named(repr((package, tracing, settings(), said)), kind)
-
-
-def _plain(value: Any) -> Any:
-    """The same in types whose text says all of it and nothing else."""
-    if value is None or type(value) in (bool, int, float, str, bytes):
-        return value
-    if isinstance(value, tuple):
-        return tuple(map(_plain, value))
-    if isinstance(value, np.ndarray | np.generic) and not value.dtype.hasobject:
-        return value.dtype.str, value.shape, value.tobytes()
-    if is_dataclass(value) and not isinstance(value, type):
-        parts = [_plain(getattr(value, field.name)) for field in fields(value)]
-        return type(value).__qualname__, tuple(parts)
-    raise TypeError(f"what a program depends on is not told by a {type(value).__name__}")
+    return cache.named(repr((package, tracing, settings(), content)), kind)
 
 
 @dataclass(frozen=True)

@@ -141,7 +141,7 @@ class QuantityCode:
                 if (
                     array.__class__ is not np.ndarray
                     or array.shape != shape
-                    or array.dtype is not _FLOAT
+                    or array.dtype != _FLOAT
                 ):
                     return None
                 buffer[:] = array

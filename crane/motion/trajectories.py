@@ -14,6 +14,7 @@ from crane.motion.attitude import INCLINATION, Turning, via_attitudes
 from crane.motion.curves import Trajectory, polynomial, via_points
 from crane.motion.kinematics import Kinematics
 from crane.motion.limits import beyond_limits
+from crane.motion.piecewise import Piecewise
 from crane.motion.splines import quintics
 
 _KNOTS_PER_SECOND = 100
@@ -152,7 +153,10 @@ def task_trajectory(machine: Machine, task: str) -> Trajectory:
         tuple((name, tuple(row)) for name, row in chosen.coefficients.items()),
         tuple((x.time, tuple(x.point.items()), tuple(x.rates.items())) for x in chosen.via),
     )  # fmt: skip
-    return kept_result(("task", depends), lambda: _followed(machine, chosen), "scipy.interpolate")
+    classes = Trajectory, _WithFree, Turning, Piecewise
+    return kept_result(
+        ("task", depends), lambda: _followed(machine, chosen), "scipy.interpolate", classes
+    )
 
 
 def _followed(machine: Machine, chosen: Task) -> Trajectory:

@@ -1,0 +1,90 @@
+"""Values as bytes and back: numbers, texts, arrays, and objects of classes that the reader names.
+
+The bytes hold data alone: unlike a pickle they cannot name code to run, and arrays that are read
+have numpy's own types, of which there is one each. They are
+
+    8 bytes: length of the head | head: JSON | elements of all arrays, one after the other
+
+In the head an array stands as its type, shape and place, a tuple and an object as what they hold.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+_LENGTH = 8  # bytes
+_KINDS = "biufSU"  # of arrays; no objects
+
+
+def serialize(value: Any, classes: Sequence[type] = ()) -> bytes:
+    """The bytes of a value: equal for equal values, to the last bit of every number.
+
+    Args:
+        value: None, a bool, int, float, str, bytes, array, dataclass, or a tuple of these.
+        classes: Others whose objects may occur; their attributes are what they hold.
+
+    Raises:
+        TypeError: Something else, which may mean another thing to another process.
+    """
+    blob = bytearray()
+
+    def plain(value: Any) -> Any:
+        if value is None or type(value) in (bool, int, float, str):
+            return value
+        if isinstance(value, bytes):
+            blob.extend(value)
+            return {"bytes": [len(blob) - len(value), len(value)]}
+        if isinstance(value, tuple):
+            return [plain(item) for item in value]
+        if isinstance(value, np.ndarray | np.generic) and value.dtype.kind in _KINDS:
+            start = len(blob)
+            blob.extend(value.tobytes())
+            return {"array": [value.dtype.str, list(value.shape), start]}
+        if isinstance(value, tuple(classes)):
+            state = vars(value)
+        elif is_dataclass(value) and not isinstance(value, type):
+            state = {field.name: getattr(value, field.name) for field in fields(value)}
+        else:
+            raise TypeError(f"a {type(value).__name__} cannot be written as data")
+        return {"of": type(value).__qualname__, "state": {k: plain(v) for k, v in state.items()}}
+
+    head = json.dumps(plain(value)).encode()
+    return len(head).to_bytes(_LENGTH, "little") + head + bytes(blob)
+
+
+def deserialize(data: bytes, classes: Sequence[type]) -> Any:
+    """The value whose bytes these are.
+
+    Args:
+        data: From `serialize`.
+        classes: Those whose objects may occur, dataclasses included.
+
+    Raises:
+        ValueError: Not such bytes.
+        KeyError: An object of another class.
+    """
+    start = _LENGTH + int.from_bytes(data[:_LENGTH], "little")
+    named = {item.__qualname__: item for item in classes}
+
+    def value_of(plain: Any) -> Any:
+        if isinstance(plain, list):
+            return tuple(map(value_of, plain))
+        if not isinstance(plain, dict):
+            return plain
+        if "bytes" in plain:
+            offset, count = plain["bytes"]
+            return data[start + offset : start + offset + count]
+        if "array" in plain:
+            kind, shape, offset = plain["array"]
+            count = int(np.prod(shape, dtype=np.intp))
+            found = np.frombuffer(data, np.dtype(kind), count, start + offset).copy()
+            return found.reshape(shape)[()]
+        item = named[plain["of"]]
+        out: Any = object.__new__(item)
+        vars(out).update({key: value_of(x) for key, x in plain["state"].items()})
+        return out
+
+    return value_of(json.loads(data[_LENGTH:start]))
