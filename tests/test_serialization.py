@@ -27,7 +27,7 @@ VALUES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("value", VALUES, ids=repr)
+@pytest.mark.parametrize("value", VALUES)
 def test_a_value_comes_back(value):
     data = serialize(value, (Plain,))
     back = deserialize(data, (Plain, Frozen))
