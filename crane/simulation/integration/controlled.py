@@ -1,73 +1,28 @@
 """Steps in machine code of a length that their error chooses: what such methods have in common."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from collections.abc import Hashable
 from typing import Any
 
 import numpy as np
 
-from crane.codegen import Number, Program, Tape, Value, select
-from crane.codegen.representation import Array as Place
-from crane.codegen.representation import Routine
+from crane.codegen import Number, Program, Tape
 from crane.codegen.scalar import add, apply, dot, maximum, minimum, scale, with_sign_of
 from crane.common.samples import Array
 from crane.control import TracedController, ValveDrive
 from crane.dynamics.external import states_of
 from crane.machine import Machine
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.sticking import NEAR
-from crane.simulation.integration.traced import (
-    HELD,
-    Stepper,
-    beyond,
-    columns_of,
-    references_of,
-    wrapped,
-)
+from crane.simulation.integration.step_loop import Attempt, StepLoop, Way
+from crane.simulation.integration.traced import Stepper, references_of, wrapped
 
 SPACING = 5e-4  # [s] between the instants that references are known at, at most
 LEAST = 0.1  # what is taken for no smaller: rad, machine's size, per `Closure.pace`
 ENERGY = 10.0  # times the tolerance, of energies
-SLOWER = 0.2  # change of the step's length from one to the next, at least
 _ROUND = 2.5  # [rad] of a step, of bodies that float
 _ROWS = 1000  # pairs of references of a call
-_FOLLOWED = 0.02  # way of a step beyond whose end the loops may not close: rad, machine's size
 _AFTER = 0.2  # of a step's length, the first behind an event
-_SHORTEST = 1e-9  # part of a recorded step that is given up on
-_LEAST, _BISECTED = 0.02, 8  # share of a step that is tried to find an event; trials until halving
-_NEARLY = 1.0 - 2.0**-41  # of what is left: all of it
 _SAME = 1e-9  # of a recorded step, between instants that are one
-
-Rate = Callable[..., None]
-"""Calls a formula by its name, at a time relative to that of `run`, with a state and arrays."""
-
-
-Way = Callable[[Value, Value], None]
-"""Adds what happens from a time on, over a length."""
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """What a step is made of, in machine code.
-
-    Attributes:
-        r: What it is added to.
-        call: See `Rate`.
-        first: Rate at its beginning.
-        ending: Rate at its end.
-        length: (1,) its length.
-        following: Outputs of the formula `finish`.
-        inside: Outputs of the formula `dense`.
-    """
-
-    r: Routine
-    call: Rate
-    first: Place
-    ending: Place
-    length: Place
-    following: Place
-    inside: Place
 
 
 def energy_of(chart: Chart) -> float:
@@ -158,7 +113,7 @@ class ControlledStepper(Stepper):
         lengths[5] = 0.0
         if lengths[0] != step:
             lengths[:2] = step, 0.01 * min(step, SPACING)
-        functions = [self._fast.close_address]
+        functions = [self.closure_code.close_address]
         if self.asks is not None:
             functions.append(self.asks.address)
         most, done = max(1, int(_ROWS * pair / step)), 0
@@ -227,13 +182,13 @@ class ControlledStepper(Stepper):
         self._add_edges(program, len(edges))
         # the parabola through rows at 0, 1/2, 1
         tape = Tape()
-        s, columns = tape.load(1, 0), self._columns
+        s, columns = tape.load(1, 0), self.reference_columns
         rows = [tape.loads(0, columns * row, columns) for row in range(3)]
         shares = ((2.0 * s - 1.0) * (s - 1.0), 4.0 * s * (1.0 - s), s * (2.0 * s - 1.0))
         program.add("reference", 2, [dot(shares, values) for values in zip(*rows, strict=True)])
         self._add_method(program)
         # s + x (c0 + (1 - x) (c1 + x (c2 + ...)))
-        tape, size = Tape(), self._state.size
+        tape, size = Tape(), self.state_layout.size
         state, x = tape.loads(0, 0, size), tape.load(2, 0)
         out: list[Number] = [0.0] * size
         for i in reversed(range(program.outputs("dense").size // size)):
@@ -251,7 +206,7 @@ class ControlledStepper(Stepper):
         out: list[Number] = []
         for i, (x, y) in enumerate(zip(one, other, strict=True)):
             size = maximum(apply("abs", x), apply("abs", y))
-            size = size if i < self._state.start("work") else ENERGY * size
+            size = size if i < self.state_layout.start("work") else ENERGY * size
             out.append(1.0 / maximum(tape.load(array, i), tape.load(array, len(one)) * size))
         return out
 
@@ -287,197 +242,11 @@ class ControlledStepper(Stepper):
         """What makes a step up to `finish`, and what calls `dense` behind one."""
 
     def _add_run(self, program: Program) -> None:
-        """run: steps and recorded instants until an end, or one needs a closer look.
-
-        h: recorded step; length to try; when the state is, after the first instant, and behind,
-        after the next one; length of three references; when to end; whether a joint starts or
-        stops there.
-
-        A step behind which one has is not made. How long it takes to where the margin is just
-        beyond is found by the secant method; steps that fall short are made.
-        """
-        size, seen, columns = self._state.size, self._seen.size, self._columns
-        floating = self._chart.machine.coordinates.floating
-        names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds", "tol")
         functions = ("close",) if self.asks is None else ("close", "answer")
+        names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds", "tol")
         with program.routine("run", counts=("steps",), functions=functions, arrays=names) as r:
-            following = r.array("following", program.outputs("finish"))
-            first, ending = (r.array(x, program.outputs("rate")) for x in ("first", "ending"))
-            looked = r.array("looked", program.outputs("observe"))
-            inside = r.array("inside", program.outputs("dense"))
-            between = r.array("between", size)
-            result = r.array("result", self._fast.outputs("newton"))
-            found = r.array("found", self._fast.outputs("newton"))
-            theta, part = r.array("theta", 1), r.array("part", 1)
-            reference = r.array("reference", max(1, columns))
-            machine = r.geometry, r.numbers, r.control, reference
-            if self.asks is not None:
-                asked = r.array("asked", program.outputs("asked"))
-                outside = reference.at(columns_of(self._control))
-            whole, pair, end = r.let(r.h[0]), r.let(r.h[3]), r.let(r.h[4])
-            t = r.let(r.h[2])
-            recorded, due = r.let(0), r.let(0.0)
-            base, before = r.let(0), r.let(t)  # the references a step begins among
-
-            def refer(time: Value) -> None:
-                """Put the references at a time behind the step's beginning into `reference`."""
-                here, begins = r.let(base), r.let(before)
-                with r.forever():
-                    with r.when(~((time >= begins + pair) & (begins + pair * 1.5 < end))):
-                        r.leave()
-                    r.set(here, here + 1)
-                    r.set(begins, begins + pair)
-                r.store(theta, 0, (time - begins) / pair)
-                r.call("reference", r.refs.row(here, 2 * columns), theta, reference)
-
-            def call(formula: str, time: Value, *arrays: Place) -> None:
-                if columns:
-                    refer(time)
-                if self.asks is not None:
-                    r.call("asked", *machine, arrays[0], asked)
-                    r.call("answer", asked, outside)
-                self._call(r, formula, *machine, *arrays)
-
-            def stop() -> None:
-                r.store(r.h, 2, t - due)
-                r.give(recorded)
-
-            step = Attempt(r, call, first, ending, part, following, inside)
-            attempt, interpolate = self._made(program, step)
-            call("rate", t, r.state, first)
-            # where a joint starts or stops, or a stop begins or ends: how far ahead, and margins
-            # here and there
-            ahead, low, high, tries = r.let(0.0), r.let(1.0), r.let(0.0), r.let(0)
-            edges = program.outputs("rate").parts["edges"]
-            sides, crossed = r.array("sides", max(1, edges)), r.array("crossed", 1)
-            if edges:
-                r.call("sides", first, sides)
-            if self._sticks:
-                r.set(low, first["margin"])
-                with r.when(low < -NEAR):
-                    r.store(r.h, 5, 1.0)
-                    stop()
-            with r.forever():
-                left, proposed = r.let(end - t), r.let(r.h[1])
-                with r.when(~(left > whole * _SHORTEST)):
-                    r.leave()
-                sure, goal = r.let(0), r.let(end)
-                if self._short:
-                    r.set(goal, select(due > t + whole * _SHORTEST, due, due + whole))
-                    with r.when(goal > end):
-                        r.set(goal, end)
-                    r.set(left, goal - t)
-                if self._sticks:
-                    with r.when((r.bounds[HELD] > 0.5) & (proposed > whole)):
-                        r.set(proposed, whole)  # what is at rest does not tell how soon it starts
-                if self._sticks or edges:
-                    with r.when(ahead > 0.0):
-                        share = r.let((low + 1.5 * NEAR) / (low - high))
-                        with r.when(tries > _BISECTED):
-                            r.set(share, 0.5)
-                        with r.when(~(share > _LEAST)):
-                            r.set(share, _LEAST)
-                        with r.when(share > 1.0 - _LEAST):
-                            r.set(share, 1.0 - _LEAST)
-                        with r.when(ahead < whole * _SHORTEST):  # a margin that jumps
-                            r.set(share, 1.0)
-                            r.set(sure, 1)
-                        r.set(left, ahead * share)
-                        r.set(tries, tries + 1)
-                last = r.let(proposed >= left * _NEARLY)
-                length = r.let(select(last, left, proposed))
-                with r.when(~(length >= whole * _SHORTEST) & (ahead <= 0.0)):
-                    stop()
-                if columns:
-                    with r.forever():
-                        with r.when(~((t >= before + pair) & (before + pair * 1.5 < end))):
-                            r.leave()
-                        r.set(base, base + 1)
-                        r.set(before, before + pair)
-                r.store(part, 0, length)
-                attempt(t, length)
-                change = following["change"]
-                wanted = r.let(length * select(change > 0.0, change, SLOWER))  # NaN: slower
-                with r.when(following["error"] <= 1.0):
-                    closed = r.call("close", r.geometry, following, result, r.bounds)
-                    with r.when(closed < 1):
-                        # nearer to where the branch ends, if it does
-                        r.store(r.h, 1, length * SLOWER)
-                        with r.when(following["move"] < _FOLLOWED):
-                            stop()
-                    with r.otherwise():
-                        call("rate", t + length, following, ending)
-                        beyond_it, event = r.let(0), r.let(0)
-                        worst = r.let(1.0)
-                        if self._sticks:
-                            r.set(worst, ending["margin"])
-                            with r.when(worst < -NEAR):
-                                r.set(event, 1)
-                        if edges:
-                            r.call("crossed", ending, sides, crossed)
-                            with r.when(crossed[0] < worst):
-                                r.set(worst, crossed[0])
-                        if self._sticks or edges:
-                            with r.when((worst < -2.0 * NEAR) & (sure < 1)):
-                                r.set(beyond_it, 1)
-                                r.set(event, 0)
-                                r.set(ahead, length)
-                                r.set(high, worst)
-                        count, since = r.let(recorded), r.let(due)
-                        with r.when((beyond_it < 1) & (due < (t + length) * _NEARLY)):
-                            interpolate(t, length)
-                        with r.forever():
-                            with r.when((beyond_it > 0) | ~(due < (t + length) * _NEARLY)):
-                                r.leave()
-                            row = r.out.row(recorded, size + seen)
-                            r.store(theta, 0, (due - t) / length)
-                            r.call("interpolate", r.state, inside, theta, between)
-                            closed = r.call("close", r.geometry, between, found, r.bounds)
-                            with r.when(closed < 1):
-                                stop()
-                            call("observe", due, between, looked)
-                            if self._sticks:
-                                with r.when(
-                                    (looked["margin"] < -2.0 * NEAR) & (due > t) & (event < 1)
-                                ):
-                                    r.set(beyond_it, 1)
-                                    r.set(ahead, due - t)
-                                    r.set(high, looked["margin"])
-                                    r.set(recorded, count)
-                                    r.set(due, since)
-                                    r.leave()
-                            r.copy(row.at(size), looked, seen)
-                            r.copy(row, between, size)
-                            r.set(recorded, recorded + 1)
-                            r.set(due, due + whole)
-                        with r.when(beyond_it < 1):
-                            # a part that was cut short says nothing against the length it was
-                            # cut from
-                            r.store(r.h, 1, select(last & (proposed > wanted), proposed, wanted))
-                            r.set(t, select(last & (ahead <= 0.0), goal, t + length))
-                            if floating:  # other coordinates have other slopes
-                                r.call("wrap", following, r.state)
-                                call("rate", t, r.state, first)
-                            else:
-                                r.copy(r.state, following, size)
-                                r.copy(first, ending, size)
-                            with r.when(event > 0):
-                                r.store(r.h, 5, 1.0)
-                                stop()
-                            with r.when(ahead > 0.0):
-                                r.set(ahead, ahead - length)
-                                r.set(low, worst)
-                            if edges:
-                                r.call("sides", ending, sides)
-                                with r.when(worst < -NEAR):  # an edge, behind which it goes on
-                                    r.set(ahead, 0.0)
-                                    r.set(tries, 0)
-                                    r.set(low, 1.0)
-                            with r.when(beyond(r, result)):
-                                stop()
-                with r.otherwise():
-                    r.store(r.h, 1, wanted)
-            stop()
+            loop = StepLoop(self, program, r, self._short)
+            loop.write(self._made)
 
 
 def breaks_of(machine: Machine, control: TracedController) -> Array:

@@ -12,14 +12,8 @@ from crane.codegen import Number, Program, Tape, Value
 from crane.codegen.scalar import add, apply, maximum, minimum, scale, subtract
 from crane.control import TracedController
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.controlled import (
-    SLOWER,
-    Attempt,
-    ControlledStepper,
-    Way,
-    errors_of,
-    mixed,
-)
+from crane.simulation.integration.controlled import ControlledStepper, errors_of, mixed
+from crane.simulation.integration.step_loop import SLOWER, Attempt, Way
 
 STAGES, MORE = 12, 3  # of a step, and for what is between its ends
 TOLERANCE = 1e-12  # error of a step, per size of the state
@@ -54,7 +48,7 @@ class ExplicitStepper(ControlledStepper):
 
     def _add_method(self, program: Program) -> None:
         """stage1(s, k, h) to stage11, more0 to more2; finish(numbers, s, k, h, tol); dense."""
-        size, method = self._state.size, _method()
+        size, method = self.state_layout.size, _method()
         stages = {f"stage{i}": method.A[i] for i in range(1, STAGES)}
         stages |= {f"more{i}": row for i, row in enumerate(method.A_EXTRA)}
         for name, weights in stages.items():
@@ -72,9 +66,9 @@ class ExplicitStepper(ControlledStepper):
             third = third + other * share * (other * share)
         below = maximum(fifth + 0.01 * third, 1e-300)
         error = apply("abs", h) * fifth / apply("sqrt", below * float(size))
-        long = [not turns for turns in self._fast.geometry.revolute[1:]]
-        rates = tape.loads(2, 0, self._state.parts["q"])
-        move = h * largest_share(rates, long, self._fast.per_size(tape))
+        long = [not turns for turns in self.closure_code.geometry.revolute[1:]]
+        rates = tape.loads(2, 0, self.state_layout.parts["q"])
+        move = h * largest_share(rates, long, self.closure_code.per_size(tape))
         error = self._followed(error, move)
         usable = minimum(maximum(error, 1e-9), 1e9)
         change = _SAFETY * apply("exp", (-1.0 / 8.0) * apply("log", usable))
@@ -97,7 +91,7 @@ class ExplicitStepper(ControlledStepper):
 
     def _made(self, program: Program, step: Attempt) -> tuple[Way, Way]:
         """See `ControlledStepper`."""
-        r, size, method = step.r, self._state.size, _method()
+        r, size, method = step.r, self.state_layout.size, _method()
         # a rate has more behind it, which the next one replaces
         more = program.outputs("rate").size - size
         k, stage = r.array("k", (STAGES + 1 + MORE) * size + more), r.array("stage", size)

@@ -14,13 +14,8 @@ from crane.codegen.scalar import add, apply, dot, maximum, minimum, scale, subtr
 from crane.common.samples import Array
 from crane.control import TracedController
 from crane.simulation.integration.charts import Chart
-from crane.simulation.integration.controlled import (
-    SLOWER,
-    Attempt,
-    ControlledStepper,
-    Way,
-    errors_of,
-)
+from crane.simulation.integration.controlled import ControlledStepper, errors_of
+from crane.simulation.integration.step_loop import SLOWER, Attempt, Way
 
 TOLERANCE = 1e-9  # error of a step, per size of the state
 _ROOT = np.sqrt(6.0)
@@ -117,14 +112,14 @@ class RadauStepper(ControlledStepper):
     @property
     def _blocks(self) -> Layout:
         """What the derivatives are, as formulas pass them on."""
-        n, k, nq = self._n, self._own, self._state.parts["q"]
+        n, k, nq = self._n, self._own, self.state_layout.parts["q"]
         return Layout(
             ways=nq * n, bends=nq * n, oo=k * k, ov=k * n, oq=k * n, vo=n * k, vv=n * n,
             vq=n * n, mass=n * n, free=n,
         )  # fmt: skip
 
     def _add_method(self, program: Program) -> None:
-        size, n = self._state.size, self._n
+        size, n = self.state_layout.size, self._n
         for added, rest in self._rests:
             sweep = self._driven(Tape())[0].sweep
             mass = [x for row in sweep.mass for x in row]
@@ -138,19 +133,19 @@ class RadauStepper(ControlledStepper):
         along: list[Number] = []
         for j in range(n):
             row: list[Number] = [0.0] * size
-            row[self._state.start("v_a") + j] = tape.load(0, start + j)
+            row[self.state_layout.start("v_a") + j] = tape.load(0, start + j)
             along += row
         for j in range(self._own):
             row = [0.0] * size
-            row[self._state.start("own") + j] = tape.load(0, start + 2 * n + j)
+            row[self.state_layout.start("own") + j] = tape.load(0, start + 2 * n + j)
             along += row
         program.add("directions", 1, along)
         tape = Tape()
         along = []
         for j in range(n):
             reach = tape.load(2, start + n + j) / tape.load(2, start + j)
-            now = tape.loads(0, 0, self._state.parts["q"])
-            there = tape.loads(1, j * size, self._state.parts["q"])
+            now = tape.loads(0, 0, self.state_layout.parts["q"])
+            there = tape.loads(1, j * size, self.state_layout.parts["q"])
             row = [0.0] * size
             row[: len(now)] = scale(reach, subtract(there, now))
             along += row
@@ -167,16 +162,16 @@ class RadauStepper(ControlledStepper):
     @property
     def _start(self) -> int:
         """Where the nudges are in `tolerance`."""
-        return self._state.size + 1
+        return self.state_layout.size + 1
 
     def _add_jacobian(self, program: Program) -> None:
         """jacobian(first, by v and own, by q, mass, tol)."""
-        size, n, k, start = self._state.size, self._n, self._own, self._start
+        size, n, k, start = self.state_layout.size, self._n, self._own, self._start
         tape = Tape()
-        first = self._state.view(tape.loads(0, 0, size))
+        first = self.state_layout.view(tape.loads(0, 0, size))
 
         def slopes(array: int, column: int, nudge: int) -> list[list[Number]]:
-            there = self._state.view(tape.loads(array, column * size, size))
+            there = self.state_layout.view(tape.loads(array, column * size, size))
             by = 1.0 / tape.load(4, start + nudge)
             return [
                 scale(by, subtract(getattr(there, part), getattr(first, part)))
@@ -254,7 +249,7 @@ class RadauStepper(ControlledStepper):
     ) -> list[list[Number]]:
         """The x of (mu - J) x = r; real and imaginary parts of both where mu is complex."""
         n, k, active = self._n, self._own, self._chart.machine.closure.active.tolist()
-        views = [self._state.view(one) for one in right]
+        views = [self.state_layout.view(one) for one in right]
 
         def turned(values: list[list[Number]]) -> list[list[Number]]:
             """Over mu."""
@@ -296,7 +291,7 @@ class RadauStepper(ControlledStepper):
 
     def _add_newton(self, program: Program) -> None:
         """start(state, Z before, ratio); newton(state, J, real, complex, F, W, h, tol)."""
-        size = self._state.size
+        size = self.state_layout.size
         tape = Tape()
         state, ratio = tape.loads(0, 0, size), tape.load(2, 0)
         before = [tape.loads(1, i * size, size) for i in range(STAGES)]
@@ -344,7 +339,7 @@ class RadauStepper(ControlledStepper):
 
     def _add_ends(self, program: Program) -> None:
         """estimate(J, real, rate, Z, h); finish(numbers, state, Z, e, first, h, tol); dense(Z)."""
-        size, nq = self._state.size, self._state.parts["q"]
+        size, nq = self.state_layout.size, self.state_layout.parts["q"]
         tape = Tape()
         h = tape.load(4, 0)
         Z = [tape.loads(3, i * size, size) for i in range(STAGES)]
@@ -372,8 +367,8 @@ class RadauStepper(ControlledStepper):
             gap = c[0] - h * first[i]
             middle = middle + (gap * shares[i] * _BETWEEN) * (gap * shares[i] * _BETWEEN)
         norm = maximum(norm, apply("sqrt", middle * (1.0 / nq)))
-        long = [not turns for turns in self._fast.geometry.revolute[1:]]
-        move = largest_share(Z[2][:nq], long, self._fast.per_size(tape))
+        long = [not turns for turns in self.closure_code.geometry.revolute[1:]]
+        move = largest_share(Z[2][:nq], long, self.closure_code.per_size(tape))
         norm = self._followed(norm, move)
         usable = minimum(maximum(norm, 1e-9), 1e9)
         change = _SAFETY * apply("exp", (-1.0 / 4.0) * apply("log", usable))
@@ -389,7 +384,7 @@ class RadauStepper(ControlledStepper):
 
     def _made(self, program: Program, step: Attempt) -> tuple[Way, Way]:
         """See `ControlledStepper`."""
-        r, size, n, k = step.r, self._state.size, self._n, self._own
+        r, size, n, k = step.r, self.state_layout.size, self._n, self._own
         columns, m = n + k, n + k
         directions = r.array("directions", columns * size)
         bent = r.array("bent", max(1, n * size))

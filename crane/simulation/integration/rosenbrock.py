@@ -13,13 +13,11 @@ from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.controlled import (
     ENERGY,
     LEAST,
-    SLOWER,
-    Attempt,
     ControlledStepper,
-    Way,
     energy_of,
     mixed,
 )
+from crane.simulation.integration.step_loop import SLOWER, Attempt, Way
 
 # ROS34PW2 of Rang and Angermann (2005): order 3 with any Jacobian, L-stable, stiffly accurate,
 # with an embedded method of order 2.
@@ -103,7 +101,7 @@ class StiffStepper(ControlledStepper):
         """combine(s, u), prepare(..., h), solve(rate, u, factors, h) of stages; finish; dense."""
         for added, rest in self._rests:
             self._add_solves(program, added, rest)
-        size, q = self._state.size, self._state.parts["q"]
+        size, q = self.state_layout.size, self.state_layout.parts["q"]
         for i in range(1, STAGES):
             tape = Tape()
             state = tape.loads(0, 0, size)
@@ -112,7 +110,10 @@ class StiffStepper(ControlledStepper):
         state = tape.loads(1, 0, size)
         after = add(state, mixed(tape, 2, size, _FINAL))
         gap = mixed(tape, 2, size, _FINAL - _SECOND)
-        used, energies = self._state.start("own") + self._stiff, self._state.start("work")
+        used, energies = (
+            self.state_layout.start("own") + self._stiff,
+            self.state_layout.start("work"),
+        )
         relative = tape.load(3, energies)
         shares = [
             gap[i] / (1.0 / tape.load(3, i) + relative * apply("abs", after[i]))
@@ -126,9 +127,9 @@ class StiffStepper(ControlledStepper):
             ]
         # the other integrals count only so far as that NaN and infinity anywhere show
         error = maximum(largest(shares), largest(scale(1e-30, gap[used:])))
-        long = [not turns for turns in self._fast.geometry.revolute[1:]]
+        long = [not turns for turns in self.closure_code.geometry.revolute[1:]]
         way = subtract(after[:q], state[:q])
-        move = largest_share(way, long, self._fast.per_size(tape))
+        move = largest_share(way, long, self.closure_code.per_size(tape))
         error = self._followed(error, move)
         usable = minimum(maximum(error, 1e-9), 1e9)
         change = _SAFETY * apply("exp", (-1.0 / 3.0) * apply("log", usable))
@@ -188,7 +189,7 @@ class StiffStepper(ControlledStepper):
         outputs = {name: stored(table) for name, table in tables.items()}
         program.add(f"prepare{added}", 6, outputs)
         starts = program.outputs(f"prepare{added}")
-        size, active = self._state.size, self._chart.machine.closure.active
+        size, active = self.state_layout.size, self._chart.machine.closure.active
         for i in range(STAGES):
             tape = Tape()
             right = scale(GAMMA * tape.load(3, 0), tape.loads(0, 0, size))
@@ -196,7 +197,7 @@ class StiffStepper(ControlledStepper):
             there = {
                 name: loaded(table, tape, 2, starts.start(name)) for name, table in tables.items()
             }
-            part = self._state.view(right)
+            part = self.state_layout.view(right)
             pulls = times(there["by_q"], [part.q[column] for column in active])
             wanted = add([*part.own[:stiff], *times(there["mass"], part.v_a)], pulls)
             x = substituted(there["factors"], [*wanted, *times(there["rows"], part.v_a)])
@@ -209,7 +210,7 @@ class StiffStepper(ControlledStepper):
 
     def _made(self, program: Program, step: Attempt) -> tuple[Way, Way]:
         """See `ControlledStepper`."""
-        r, size = step.r, self._state.size
+        r, size = step.r, self.state_layout.size
         u, stage = r.array("u", STAGES * size), r.array("stage", size)
         slope = r.array("slope", program.outputs("rate"))
         # the last has the most
@@ -223,7 +224,7 @@ class StiffStepper(ControlledStepper):
                     now = slope
                     r.call(f"combine{k}", r.state, u, stage)
                     step.call("rate", t + length * float(ALPHA[k].sum()), stage, slope)
-                self._call(r, f"solve{k}", now, u, factors, step.length, u.at(k * size))
+                self.call_formula(r, f"solve{k}", now, u, factors, step.length, u.at(k * size))
             r.call("finish", r.geometry, r.state, u, r.tol, step.following)
 
         def interpolate(t: Value, length: Value) -> None:

@@ -59,19 +59,23 @@ class CompiledStepper(Stepper):
         h: length of a step, half of it; then how far behind the last recorded instant a joint has
         started or stopped, if one has.
         """
-        size, seen, columns = self._state.size, self._seen.size, self._columns
+        size, seen, columns = (
+            self.state_layout.size,
+            self.output_layout.size,
+            self.reference_columns,
+        )
         names = ("geometry", "numbers", "control", "refs", "state", "out", "h", "bounds")
         with program.routine("run", counts=("steps",), functions=("close",), arrays=names) as r:
             following = r.array("following", program.outputs("finish"))
             k1 = r.array("k1", program.outputs("observe"))
             k2, k3, k4 = (r.array(f"k{i}", size) for i in (2, 3, 4))
-            result = r.array("result", self._fast.outputs("newton"))
+            result = r.array("result", self.closure_code.outputs("newton"))
             machine, half = (r.geometry, r.numbers, r.control), r.h.at(1)
             with r.loop(r.steps) as i:
                 first = r.refs.row(i, 2 * columns)
                 middle, last = first.at(columns), first.at(2 * columns)
-                self._call(r, "observe", *machine, first, r.state, k1)
-                if self._sticks:
+                self.call_formula(r, "observe", *machine, first, r.state, k1)
+                if self.sticks:
                     with r.when(k1["margin"] < -NEAR):
                         r.store(r.h, 2, r.h[0])
                         r.give(i)
@@ -79,11 +83,11 @@ class CompiledStepper(Stepper):
                 r.copy(row, r.state, size)
                 r.copy(row.at(size), k1.at("seen"), seen)
                 r.call("blend", r.state, k1, half, following)
-                self._call(r, "rate", *machine, middle, following, k2)
+                self.call_formula(r, "rate", *machine, middle, following, k2)
                 r.call("blend", r.state, k2, half, following)
-                self._call(r, "rate", *machine, middle, following, k3)
+                self.call_formula(r, "rate", *machine, middle, following, k3)
                 r.call("blend", r.state, k3, r.h, following)
-                self._call(r, "rate", *machine, last, following, k4)
+                self.call_formula(r, "rate", *machine, last, following, k4)
                 r.call("finish", r.geometry, r.state, k1, k2, k3, k4, r.h, following)
                 with r.when(~(following["move"] < 1.0)):
                     r.give(i)
@@ -113,7 +117,7 @@ class CompiledStepper(Stepper):
 
         def call(count: int, references: Array, out: Array) -> int:
             return self._program.call(
-                "run", count, self._fast.close_address, *arguments, references, state,
+                "run", count, self.closure_code.close_address, *arguments, references, state,
                 out, self._lengths, self.bounds,
             )  # fmt: skip
 
@@ -124,7 +128,7 @@ class CompiledStepper(Stepper):
 
         With the largest move [rad], [machine's size].
         """
-        size, coordinates = self._state.size, self._state["q"]
+        size, coordinates = self.state_layout.size, self.state_layout["q"]
         tape = Tape()
         state, rate = tape.loads(0, 0, size), tape.loads(1, 0, size)
         program.add("blend", 3, add(state, scale(tape.load(2, 0), rate)))
@@ -135,8 +139,8 @@ class CompiledStepper(Stepper):
         mean = add(k1, scale(2.0, add(k2, k3)), k4)
         after = wrapped(self._chart, add(state, scale(h * (1.0 / 6.0), mean)))
         rates = [*k1[coordinates], *k2[coordinates], *k3[coordinates]]
-        long = 3 * [not turns for turns in self._fast.geometry.revolute[1:]]
-        share = largest_share(rates, long, self._fast.per_size(tape))
+        long = 3 * [not turns for turns in self.closure_code.geometry.revolute[1:]]
+        share = largest_share(rates, long, self.closure_code.per_size(tape))
         # the others count only so far as that NaN and infinity anywhere show
         move = h * maximum(share, largest(scale(1e-30, mean)))
         program.add("finish", 7, {"state": after, "move": [move]})

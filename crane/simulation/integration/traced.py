@@ -168,6 +168,12 @@ class Stepper:
         bounds: See `FastClosure`; where other coordinates are better, see `Chart.limits`; whether
             joints are at rest.
         asks: What calls those external forces that are functions in Python, if there are some.
+        state_layout: Parts of the state.
+        output_layout: Parts of what a row has besides.
+        reference_columns: Length of a row of references.
+        controller_columns: Of these, the first ones that are the controller's.
+        sticks: Whether joints have friction that sticks.
+        closure_code: The loops in machine code.
 
     Raises:
         TooLongError: It would take too long to compile.
@@ -177,19 +183,24 @@ class Stepper:
         self, chart: Chart, control: TracedController, states: int, method: tuple, fold: bool
     ):
         machine = chart.machine
-        self._fast, self._numbers = machine.closure.fast, chart.dynamics.numbers
+        self.closure_code, self._numbers = machine.closure.fast, chart.dynamics.numbers
         self._chart, self._control = chart, control
-        self.bounds = np.concatenate([self._fast.bounds, chart.limits, [0.0]])
-        own = columns_of(control)
-        self._columns, self._fold = own + sum(external.columns_of(machine.external)), fold
+        self.bounds = np.concatenate([self.closure_code.bounds, chart.limits, [0.0]])
+        own = self.controller_columns = columns_of(control)
+        self.reference_columns, self._fold = own + sum(external.columns_of(machine.external)), fold
         self.asks = None if machine.traced else external.Asked(machine.external)
-        self._sticks = bool(chart.sticking.columns)
-        self._state, self._seen = state_layout(machine, states), seen_layout(machine, control)
+        self.sticks = bool(chart.sticking.columns)
+        self.state_layout, self.output_layout = (
+            state_layout(machine, states),
+            seen_layout(machine, control),
+        )
         form = form_of(control, own, chart, states, fold)
         key = (*method, form, states, bool(machine.supports), *chart.formulas)
-        if key not in self._fast.programs:
-            self._fast.programs[key] = program_of(machine, control, self._fast, key, self._build)
-        self._program = self._fast.programs[key]
+        if key not in self.closure_code.programs:
+            self.closure_code.programs[key] = program_of(
+                machine, control, self.closure_code, key, self._build
+            )
+        self._program = self.closure_code.programs[key]
 
     def _build(self, program: Program) -> None:
         """Add formulas and routines."""
@@ -200,32 +211,37 @@ class Stepper:
 
         References and state are the arguments 3 and 4.
         """
-        references, own = tape.loads(3, 0, self._columns), columns_of(self._control)
-        machine = machine_at(self._chart, tape, self._state, 4, references[own:])
+        references, own = tape.loads(3, 0, self.reference_columns), columns_of(self._control)
+        machine = machine_at(self._chart, tape, self.state_layout, 4, references[own:])
         settings = settings_of(self._control, tape, 2, self._fold)
         at = machine.seen(settings, references[:own])
         tau, rates = self._control.trace(at)
         return machine.gripped(self._control, at), at, tau, rates
 
     @property
+    def floats(self) -> bool:
+        """Whether a body floats."""
+        return bool(self._chart.machine.coordinates.floating)
+
+    @property
     def width(self) -> int:
         """Length of a row."""
-        return self._state.size + self._seen.size
+        return self.state_layout.size + self.output_layout.size
 
     def adopt(self) -> None:
         """Take over what the joints do whose friction sticks."""
-        if self._sticks:
+        if self.sticks:
             self._chart.sticking.tell(self._chart.dynamics)
             self.bounds[HELD] = self._chart.sticking.held.any()
 
     @property
     def _rests(self) -> tuple[tuple[str, bool], ...]:
         """What to add to a formula's name without joints at rest, and with some."""
-        return (("", False), (_REST, True)) if self._sticks else (("", False),)
+        return (("", False), (_REST, True)) if self.sticks else (("", False),)
 
-    def _call(self, r: Routine, formula: str, *arguments: Place) -> None:
+    def call_formula(self, r: Routine, formula: str, *arguments: Place) -> None:
         """Call a formula for what the joints do that stick."""
-        if not self._sticks:
+        if not self.sticks:
             r.call(formula, *arguments)
             return
         with r.when(r.bounds[HELD] > 0.5):
@@ -237,7 +253,7 @@ class Stepper:
     def _arguments(self) -> tuple[Array, Array, Array]:
         """What all formulas begin with: geometry, numbers of the machine, settings."""
         settings = np.ascontiguousarray(self._control.settings)
-        return self._fast.geometry.numbers, self._numbers, settings
+        return self.closure_code.geometry.numbers, self._numbers, settings
 
     def observe(self, time: float, state: Array) -> tuple[Array, float]:
         """What is seen (.,) at a time [s] and a state, and its margin (`Moved.margin`)."""
