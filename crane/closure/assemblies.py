@@ -8,6 +8,7 @@ home; what comes after it follows, from where the guess has it.
 
 import itertools
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,10 +16,12 @@ import pinocchio as pin
 
 from crane.closure.anywhere import Search
 from crane.closure.closure import Closure
+from crane.closure.equations import LoopEquations
 from crane.closure.exactness import DIGITS
 from crane.closure.home import within
 from crane.closure.structure import Indices
 from crane.common.samples import Array, solve
+from crane.common.threads import one_thread
 
 _CLOSED = 1e-9  # residual, in shares of the machine's size
 _SAME = 1e-3  # [rad], or share of the machine's size: postures that are not different
@@ -27,6 +30,7 @@ _ITERATIONS = 15
 _CERTAIN = 0.05  # the same, off the guess: other assemblies are farther
 _FAR = 0.5  # the same: a guess that is farther says little
 _RATIO, _LOOSE = 2.0, 5.0  # of distances from the guess, up to which it does not decide
+_MANY = 32  # joints, of fewer of which matrices are too small for more threads
 _STARTS = 8  # for each unknown of a block
 
 
@@ -66,7 +70,12 @@ def ambiguities(closure: Closure, guess: Array, named: Indices, most: int) -> li
         most: Starts in one block, which bounds the work; an assembly that is not found from there
             is not told.
     """
-    search = _Search(closure, guess, named)
+    with one_thread() if closure.model.nv > _MANY else nullcontext():
+        return _ambiguities(_Search(closure, guess, named), most)
+
+
+def _ambiguities(search: "_Search", most: int) -> list[Assembly]:
+    closure = search.closure
     found: list[Assembly] = []
     for index, (_, columns) in enumerate(closure.structure.blocks):
         block = closure.passive[columns]
@@ -96,6 +105,8 @@ class _Search:
         self.home, self.blocks = closure.home, closure.structure.blocks
         self._unit = self.equations.units
         self._turns = ~self.equations.coordinates.slides
+        self._parts: dict[tuple[int, ...], LoopEquations] = {}
+        self._places: dict[bytes, Array] = {}
         self._massless = not any(inertia.mass > 0 for inertia in list(self.model.inertias)[1:])
 
     def difference(self, one: Array, two: Array) -> Array:
@@ -135,14 +146,9 @@ class _Search:
 
     def groups(self) -> list[Indices]:
         """Columns of passive joints that loops tie together, directly or through others."""
-        from scipy.sparse import csr_array
-        from scipy.sparse.csgraph import connected_components
-
         passive = self.closure.passive
-        tied = np.vstack([self.equations.sign, self.equations.factors])[:, passive] != 0
-        count, label = connected_components(csr_array(tied.T.astype(float) @ tied))
-        groups = [passive[label == group] for group in range(count)]
-        return [columns for columns in groups if len(self.rows_of(columns))]
+        group, group_of_row = self.equations.groups(passive)
+        return [passive[group == i] for i in np.unique(group_of_row[group_of_row >= 0])]
 
     def rows_of(self, columns: Indices) -> Indices:
         """Independent rows of the loops that some joints are in."""
@@ -154,10 +160,21 @@ class _Search:
         """Closed postures with all joints but some as at home, the nearest to the guess first."""
         guess = self.home.copy()
         guess[columns] = self.guess[columns]
-        search = Search(self.equations, guess, self.named, most)
+        rows = self.rows_of(columns)
+        search = Search(self._part(rows)[0], guess, self.named, most)
         ways = search.postures(columns, np.zeros(0, dtype=np.intp), DIGITS)
-        closed = (self._solved(q, self.rows_of(columns), columns) for q in ways)
+        closed = (self._solved(q, rows, columns) for q in ways)
         return [q for q in closed if q is not None]
+
+    def _part(self, rows: Indices) -> tuple[LoopEquations, Indices]:
+        """The equations of the loops that some rows belong to alone, and these rows in them."""
+        of_row = self.equations.loop_of_row
+        chosen = tuple(np.unique(of_row[rows]).tolist())
+        if chosen not in self._parts:
+            names = self.equations.names
+            self._parts[chosen] = self.equations.part([names[i] for i in chosen])
+        every = np.flatnonzero(np.isin(of_row, chosen))
+        return self._parts[chosen], np.searchsorted(every, rows)
 
     def _block(self, index: int) -> tuple[Indices, Indices]:
         rows, columns = self.blocks[index]
@@ -210,8 +227,9 @@ class _Search:
         divided by 1 - (grad m . d) / m, which turns round near them.
         """
         q = q.copy()
+        equations, rows = self._part(rows)
         for _ in range(_ITERATIONS):
-            phi, jacobian = self.equations.scaled(q)
+            phi, jacobian = equations.scaled(q)
             residual = np.abs(phi[rows]).max(initial=0.0)
             if residual < 1e-13:
                 break
@@ -231,7 +249,7 @@ class _Search:
             if not largest < np.inf:
                 return None
             q[columns] += self._unit[columns] * step * min(1.0, _STEP / max(largest, 1e-300))
-        if not np.abs(self.equations.scaled(q)[0][rows]).max(initial=0.0) < _CLOSED:
+        if not np.abs(equations.scaled(q)[0][rows]).max(initial=0.0) < _CLOSED:
             return None
         angles = columns[self._turns[columns]]
         q[angles] = np.remainder(q[angles] + np.pi, 2 * np.pi) - np.pi
@@ -288,17 +306,20 @@ class _Search:
         column = int(columns[apart.argmax()])
         return column, float(apart.max() * self._unit[column])
 
-    def looks_the_same(self, *postures: Array) -> bool:
+    def looks_the_same(self, one: Array, two: Array) -> bool:
         """Whether all that has a mass is in one place in both: other angles of a ball, say."""
-        data, places = self.equations.data, []
-        for posture in postures:
-            pin.forwardKinematics(
-                self.model, data, self.equations.coordinates.configuration(posture)
-            )
-            places.append([
+        apart = np.abs(self._placed(one) - self._placed(two))
+        return bool(apart.max(initial=0.0) < _SAME)
+
+    def _placed(self, q: Array) -> Array:
+        """Rotations and origins (b, 3, 4) of the bodies that have a mass."""
+        key = q.tobytes()
+        if key not in self._places:
+            data = self.equations.data
+            pin.forwardKinematics(self.model, data, self.equations.coordinates.configuration(q))
+            self._places[key] = np.array([
                 np.column_stack([place.rotation, place.translation / self.equations.size])
                 for place, inertia in zip(data.oMi, self.model.inertias, strict=True)
                 if inertia.mass > 0 or self._massless
             ])  # fmt: skip
-        one, two = (np.array(place) for place in places)
-        return bool(np.abs(one - two).max(initial=0.0) < _SAME)
+        return self._places[key]

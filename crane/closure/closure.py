@@ -24,10 +24,12 @@ from crane.codegen import TooLongError, carefully, kept_result
 from crane.common.errors import BranchEdgeError, InputError, MechanismError, WrongBranchError
 from crane.common.samples import Array, as_samples, per_sample, solve
 from crane.common.shown import Brief
+from crane.common.threads import on_one_thread
 from crane.description import Coupling, LoopSpec
 
 _FEW, _FAR = 100, 0.1  # samples worth sorting: how many, how far apart as a share of the range
 _SAME = 1e-6  # rad, machine's size, between a posture and what Newton's method makes of it
+_MANY = 32  # joints
 _STEPS = 8  # from home to a target that is far from the one before it
 
 
@@ -123,7 +125,9 @@ class Closure(Brief):
         self, said: list[int] | None, loose: list[int]
     ) -> tuple[Structure, Sought | None]:
         def find() -> tuple[Structure, Sought | None]:
-            return settle(self.equations, self.active, self.passive, self.guess, said, loose)
+            # matrices of fewer joints are too small for more threads
+            run = on_one_thread(settle) if self.model.nv > _MANY else settle
+            return run(self.equations, self.active, self.passive, self.guess, said, loose)
 
         if not self.equations.names:
             return find()

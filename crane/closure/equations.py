@@ -1,12 +1,12 @@
 """The loop equations phi(q) = 0, their Jacobian and its time derivative."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.choice import size
+from crane.closure.choice import Indices, size
 from crane.closure.coordinates import Coordinates
 from crane.common.errors import MechanismError
 from crane.common.samples import Array
@@ -131,6 +131,34 @@ class LoopEquations:
         self.size = size(model)
         self.units = np.where(self.coordinates.slides, self.size, 1.0)
         self.row_units = np.where(self.is_translation, self.size, 1.0)
+
+    def groups(self, columns: Indices) -> tuple[Indices, Indices]:
+        """Joints that equations tie together, directly or through others, as groups by number.
+
+        Args:
+            columns: (k,) the joints.
+
+        Returns:
+            The groups of the joints (k,) and of the rows (m,), -1 of a row without such joints.
+        """
+        ties = np.vstack([self.sign, self.factors])[:, columns] != 0
+        group = np.arange(len(columns), dtype=np.intp)
+        for tie in ties:
+            tied = np.isin(group, group[tie])
+            group[tied] = group[tied].min(initial=len(group))
+        group = np.unique(group, return_inverse=True)[1]
+        of_name = [int(group[tie][0]) if tie.any() else -1 for tie in ties]
+        return group, np.array(of_name, dtype=np.intp)[self.loop_of_row]
+
+    def part(self, names: Collection[str]) -> "LoopEquations":
+        """The equations of some loops and couplings alone, in the same coordinates."""
+        found = LoopEquations(
+            self.model,
+            [loop for loop in self.loops if loop.name in names],
+            [coupling for coupling in self.couplings if coupling.name in names],
+        )
+        found._local.data = self.data  # which takes longer to make than all else
+        return found
 
     @property
     def data(self) -> pin.Data:

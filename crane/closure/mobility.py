@@ -33,7 +33,9 @@ def locked_up(
 
     Steps in drawn directions of the null space N are closed with all equations, the shortest way,
     and again from as far in the direction that was left: a finite motion far from the first one is
-    found that way, and of no motion rounding is left.
+    found that way, and of no motion rounding is left. Groups of joints that no equation ties to
+    each other step at once, each as far as it would alone, so that a machine of many loops takes
+    as many steps as the group with the most directions.
     Joints that N lets move and that stay in all the ways that remain are locked. A linkage in line
     that may go on in several ways (a bifurcation) has more columns of N than freedom, too, but all
     its joints move.
@@ -56,19 +58,22 @@ def locked_up(
     basis = motions(jacobian, scale, tolerance)
     if basis.shape[1] <= freedom:
         return None
+    group, group_of_row = equations.groups(np.arange(len(q)))
+    promised = np.linalg.norm(basis, axis=1)
+    directions = np.bincount(group, promised**2)  # of each group; the trace of a projector
     random = np.random.default_rng(1)
     moved = np.zeros(len(q))  # shares of the step
-    for _ in range(2 * basis.shape[1]):
+    for _ in range(2 * round(directions.max())):
         way = basis @ random.normal(size=basis.shape[1])
         for _ in range(_AGAIN):
-            near = close(q + _STEP * scale * way / np.linalg.norm(way))
-            if not np.abs(equations.scaled(near)[0]).max() < _OPEN:
-                break
-            way = (near - q) / scale
+            length = np.sqrt(np.bincount(group, way**2))[group]
+            near = close(q + _STEP * scale * way / np.where(length > 0, length, 1.0))
+            gap = np.zeros(len(directions))
+            np.maximum.at(gap, group_of_row, np.abs(equations.scaled(near)[0]))
+            way = np.where(gap[group] < _OPEN, (near - q) / scale, 0.0)
             moved = np.maximum(moved, np.abs(way) / _STEP)
             if not way.any():
                 break
-    promised = np.linalg.norm(basis, axis=1)
     if not ((promised > 1e-3) & (moved < _MOVED * promised)).any():
         return None
     rank = equations.model.nv - basis.shape[1]

@@ -2,7 +2,8 @@
 
 import functools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Generic, ParamSpec, TypeVar
 
 P = ParamSpec("P")
@@ -23,19 +24,27 @@ class PerThread(threading.local, Generic[T]):
         self.own = make()
 
 
-def on_one_thread(function: Callable[P, T]) -> Callable[P, T]:
-    """The function with the linear algebra of numpy and scipy on one thread.
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Within, the linear algebra of the libraries that are loaded computes on one thread.
 
     Of many small matrices: threads wait for each other longer than they compute, on a busy machine
     a hundred times. What is found does not depend on how many there are, to the last digit.
     """
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(1, "blas"):
+        yield
+
+
+def on_one_thread(function: Callable[P, T]) -> Callable[P, T]:
+    """The function with the linear algebra of numpy and scipy on one thread, see `one_thread`."""
 
     @functools.wraps(function)
     def alone(*args: P.args, **kwargs: P.kwargs) -> T:
         import scipy.linalg  # noqa: F401 - brings its own library, which has to be there to be told
-        from threadpoolctl import threadpool_limits
 
-        with threadpool_limits(1, "blas"):
+        with one_thread():
             return function(*args, **kwargs)
 
     return alone
