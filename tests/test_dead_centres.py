@@ -8,6 +8,7 @@ import singular
 from scipy.integrate import solve_ivp
 
 import crane
+from crane.closure import home
 from crane.common.errors import CraneWarning, SimulationError
 from crane.motion.curves import point_to_point
 
@@ -116,6 +117,23 @@ def test_parallelograms_stay_such_in_line(tmp_path, count, active):
     np.testing.assert_allclose(angle, wanted, rtol=0, atol=1e-7)
     assert np.ptp(angle) > 9 * np.pi
     assert singular.imbalance(found) < 1e-9
+
+
+def test_crossings_do_not_analyse_the_structure_anew(tmp_path, monkeypatch):
+    """Ten times the links come in line; the equations that count stay the same."""
+    analysed, whole = [], home.analyse
+
+    def counted(*arguments):
+        analysed.append(arguments)
+        return whole(*arguments)
+
+    machine = singular.windows(tmp_path, "r0", 6)
+    monkeypatch.setattr(home, "analyse", counted)
+    found = run(machine, "r0", 1.0, 10.0, step=1e-2)
+    energy = found.channels["kinetic"] + found.channels["potential"]
+    assert not analysed and np.ptp(energy) < 1e-5
+    angle = singular.postures(machine, found)[:, machine.column("r0")]
+    assert np.ptp(angle) > 9 * np.pi
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ home; what comes after it follows, from where the guess has it.
 
 import itertools
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +29,6 @@ _ITERATIONS = 15
 _CERTAIN = 0.05  # the same, off the guess: other assemblies are farther
 _FAR = 0.5  # the same: a guess that is farther says little
 _RATIO, _LOOSE = 2.0, 5.0  # of distances from the guess, up to which it does not decide
-_MANY = 32  # joints, of fewer of which matrices are too small for more threads
 _STARTS = 8  # for each unknown of a block
 
 
@@ -70,7 +68,7 @@ def ambiguities(closure: Closure, guess: Array, named: Indices, most: int) -> li
         most: Starts in one block, which bounds the work; an assembly that is not found from there
             is not told.
     """
-    with one_thread() if closure.model.nv > _MANY else nullcontext():
+    with one_thread(closure.model.nv):
         return _ambiguities(_Search(closure, guess, named), most)
 
 

@@ -12,7 +12,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from crane.closure.branch import Branch
-from crane.closure.choice import Choice, condition, proposals, scales
+from crane.closure.choice import Choice, condition, proposals
 from crane.closure.compiled import Cursor, FastClosure
 from crane.closure.equations import LoopEquations
 from crane.closure.exactness import CLOSED, Exact, Rounded, Surplus
@@ -24,12 +24,12 @@ from crane.codegen import TooLongError, carefully, kept_result
 from crane.common.errors import BranchEdgeError, InputError, MechanismError, WrongBranchError
 from crane.common.samples import Array, as_samples, per_sample, solve
 from crane.common.shown import Brief
-from crane.common.threads import on_one_thread
+from crane.common.threads import one_thread
 from crane.description import Coupling, LoopSpec
 
 _FEW, _FAR = 100, 0.1  # samples worth sorting: how many, how far apart as a share of the range
 _SAME = 1e-6  # rad, machine's size, between a posture and what Newton's method makes of it
-_MANY = 32  # joints
+_AS_GOOD = 0.1  # share of the least singular value of all equations that independent ones keep
 _STEPS = 8  # from home to a target that is far from the one before it
 
 
@@ -125,12 +125,13 @@ class Closure(Brief):
         self, said: list[int] | None, loose: list[int]
     ) -> tuple[Structure, Sought | None]:
         def find() -> tuple[Structure, Sought | None]:
-            # matrices of fewer joints are too small for more threads
-            run = on_one_thread(settle) if self.model.nv > _MANY else settle
-            return run(self.equations, self.active, self.passive, self.guess, said, loose)
+            import scipy.linalg  # noqa: F401 - which brings a library of its own
+
+            with one_thread(self.model.nv):
+                return settle(self.equations, self.active, self.passive, self.guess, said, loose)
 
         if not self.equations.names:
-            return find()
+            return settle(self.equations, self.active, self.passive, self.guess, said, loose)
         told = None if said is None else tuple(said)
         depends = (self.parts, self.active, self.guess, told, tuple(loose))
         return kept_result(("home", depends), find, "scipy.linalg", (Structure, Surplus, Sought))
@@ -203,6 +204,39 @@ class Closure(Brief):
         rows = self.structure.rows, self.structure.redundant
         if not exact.is_closed(other.home) or exact.surplus(other.home, *rows, self.active)[0]:
             raise MechanismError("the loops do not close there, or lock up")
+        return other
+
+    def around(self, q: Array) -> "Closure | None":
+        """The same coordinates on the branch of another closed posture.
+
+        Args:
+            q: (nq,) its home, whose whole turns stay.
+
+        Returns:
+            None where other independent equations determine the passive joints better there.
+
+        Raises:
+            MechanismError: The loops do not close there.
+        """
+        jacobian = self.equations.scaled(q)[1][:, self.passive]
+        least, best = (
+            np.linalg.svd(rows, compute_uv=False).min(initial=1.0)
+            for rows in (jacobian[self.structure.rows], jacobian)
+        )
+        if not least > _AS_GOOD * best:
+            return None
+        other = copy.copy(self)
+        other._local, other.sought, other.guess = threading.local(), None, q
+        other.__dict__.pop("_made", None)
+        other.structure = dataclasses.replace(self.structure, home=q)
+        other._branch = Branch(
+            self.equations, other.structure, self._names, self.active, self.passive, self._span
+        )
+        other.home = other._branch.home.q.copy()
+        other.home.flags.writeable = False
+        exact = (Exact if self.structure.surplus.allowed <= CLOSED else Rounded)(self.equations)
+        if not exact.is_closed(other.home):
+            raise MechanismError("the loops do not close there")
         return other
 
     @cached_property
@@ -314,7 +348,7 @@ class Closure(Brief):
         if targets.ndim != 2 or not len(targets):
             raise InputError("q_a is no motion, give (N, n) samples")
         first = self.solve(targets[0], guess)
-        return followed(self.equations, self.active, scales(self.model), targets, first)
+        return followed(self.equations, self.active, self.equations.scales, targets, first)
 
     def _close(self, targets: Array, out: Array, stacked: bool) -> None:
         """Close the loops at targets (N, n) into out (N, nq)."""
@@ -455,7 +489,7 @@ class Closure(Brief):
         Returns:
             () or (N,).
         """
-        return condition(self.gamma(q), scales(self.model), self.active)
+        return condition(self.gamma(q), self.equations.scales, self.active)
 
     @cached_property
     def proposals(self) -> list[Choice]:

@@ -2,11 +2,12 @@
 
 import threading
 from collections.abc import Collection, Sequence
+from functools import cached_property
 
 import numpy as np
 import pinocchio as pin
 
-from crane.closure.choice import Indices, size
+from crane.closure.choice import Indices, scales, size
 from crane.closure.coordinates import Coordinates
 from crane.common.errors import MechanismError
 from crane.common.samples import Array
@@ -159,6 +160,11 @@ class LoopEquations:
         )
         found._local.data = self.data  # which takes longer to make than all else
         return found
+
+    @cached_property
+    def scales(self) -> Array:
+        """(nv,) ways of the joints that compare, see `crane.closure.choice.scales`."""
+        return scales(self.model)
 
     @property
     def data(self) -> pin.Data:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from crane.closure.choice import Indices, motions, scales, slides, units
+from crane.closure.choice import Indices, motions, slides, units
 from crane.closure.equations import LoopEquations
 from crane.common.samples import Array, solve
 
@@ -53,7 +53,7 @@ def locked_up(
     """
     from scipy.linalg import qr  # slow to import, and not needed without loops
 
-    scale = scales(equations.model)
+    scale = equations.scales
     jacobian = equations.evaluate(q)[1] / equations.row_units[:, None]
     basis = motions(jacobian, scale, tolerance)
     if basis.shape[1] <= freedom:
@@ -99,7 +99,7 @@ def surplus_open(
     """
     if not len(surplus) or not len(active):
         return None
-    scale = scales(equations.model)
+    scale = equations.scales
     worst = int(surplus[0]), 0.0
     for held, way in _ways(equations.model.nv, active):
         # the smaller step where the branch ends within the larger one

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Generic, ParamSpec, TypeVar
 
+_SMALL = 33  # order of the matrices from which on libraries take several threads
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -25,12 +27,18 @@ class PerThread(threading.local, Generic[T]):
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def one_thread(order: int = _SMALL) -> Iterator[None]:
     """Within, the linear algebra of the libraries that are loaded computes on one thread.
 
     Of many small matrices: threads wait for each other longer than they compute, on a busy machine
     a hundred times. What is found does not depend on how many there are, to the last digit.
+
+    Args:
+        order: Of the matrices; where libraries take one thread anyway, nothing is done.
     """
+    if order < _SMALL:
+        yield
+        return
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(1, "blas"):

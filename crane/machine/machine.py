@@ -379,7 +379,7 @@ class Machine(Brief):
                 raise InputError(
                     f"joint '{name}' is named twice among the active ones, once will do"
                 )
-        return self._seen_by(names, self.home, wound=False)
+        return self._seen_by(names, self._closure(names, self.home))
 
     def seen_from(self, q: Array, names: tuple[str, ...]) -> "Machine":
         """`driven_by` with another home posture, whose assembly branch need not be this one's.
@@ -391,11 +391,14 @@ class Machine(Brief):
         Raises:
             MechanismError: See `driven_by`.
         """
-        return self._seen_by(names, q, wound=True)
+        known = self.closure.around(q) if names == self.active else None
+        return self._seen_by(names, known or self._closure(names, q, wound=True))
 
-    def _seen_by(self, names: tuple[str, ...], home: Array, wound: bool) -> "Machine":
-        loops, couplings = self.closure.equations.loops, self.closure.equations.couplings
-        closure = Closure(self.model, loops, names, home, couplings, wound=wound)
+    def _closure(self, names: tuple[str, ...], home: Array, wound: bool = False) -> Closure:
+        equations = self.closure.equations
+        return Closure(self.model, equations.loops, names, home, equations.couplings, wound=wound)
+
+    def _seen_by(self, names: tuple[str, ...], closure: Closure) -> "Machine":
         same = set(names) == set(self.active)
         return dataclasses.replace(
             self,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.closure.choice import scales, units
+from crane.closure.choice import units
 from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
 from crane.formats.adding.eyes import Eye, apart, path_between
@@ -88,7 +88,7 @@ def span_of(machine: Machine, eyes: Sequence[Eye]) -> Span:
             f"'{eyes[0]}' and '{eyes[1]}' are on one body, choose points of two that move "
             "against each other"
         )
-    scale = scales(machine.model)
+    scale = machine.closure.equations.scales
     found: dict[str, float] = {}
     for joint in machine.active:
         span = _scanned(machine, eyes, joint, _COARSE)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from crane.closure.choice import condition, scales
+from crane.closure.choice import condition
 from crane.common.samples import Array
 from crane.machine import Machine
 from crane.motion.kinematics import Kinematics
@@ -34,7 +34,7 @@ class Probe:
         self.extent = extent
         self.machine, self.kinematics, self.section = machine, kinematics, section
         self.strokes = strokes
-        self._scale = scales(machine.model)
+        self._scale = machine.closure.equations.scales
         self.scale_of_strokes = self._scale[machine.closure.active][strokes]
 
     def tips(self, q: Array) -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 
 from crane.codegen import Number, Tape
 from crane.common.samples import Array
+from crane.common.threads import one_thread
 from crane.control import At, Controller, TracedController, ValveDrive
 from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.halt import HaltedError
@@ -94,6 +95,12 @@ class ChartedSteps:
         Raises:
             HaltedError: The machine cannot go on, in no coordinates.
         """
+        with one_thread(self._chart.machine.model.nv):
+            self._run(times, state, step, rows, progress)
+
+    def _run(
+        self, times: Array, state: Array, step: float, rows: Array, progress: Progress
+    ) -> None:
         i = self.done = 0
         while i < len(times) or self._way.offset < 0:
             self._first, halt = i, None

@@ -16,7 +16,7 @@ from functools import cached_property
 
 import numpy as np
 
-from crane.closure.choice import choose, motions, scales
+from crane.closure.choice import choose, motions
 from crane.closure.structure import Indices
 from crane.closure.traced import folded
 from crane.codegen.scalar import Expression, Number, dot
@@ -148,7 +148,7 @@ class Chart:
         Joints that are independent and move no other one much stay.
         """
         machine = self.machine
-        closure, scale = machine.closure, scales(machine.model)
+        closure, scale = machine.closure, machine.closure.equations.scales
         jacobian = closure.equations.evaluate(q)[1]
         basis = motions(jacobian, scale, _SINGULAR)
         active = closure.active

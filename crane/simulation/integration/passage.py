@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.closure.choice import scales
 from crane.common.samples import Array
 from crane.machine import Machine
 
@@ -29,7 +28,7 @@ Rate = Callable[[float, Array], tuple[Array, Array]]
 def rank(machine: Machine, q: Array) -> float:
     """Least singular value of the loop equations at a posture (nq,), as a share of the largest."""
     equations, rows = machine.closure.equations, machine.closure.structure.rows
-    scaled = equations.evaluate(q)[1][rows] * scales(machine.model)
+    scaled = equations.evaluate(q)[1][rows] * equations.scales
     values = np.linalg.svd(scaled, compute_uv=False)
     return float(values[-1] / values[0]) if len(values) else 1.0
 
