@@ -10,7 +10,7 @@ from lxml import etree
 from crane.common.errors import DescriptionError, known
 from crane.common.inputs import content
 from crane.description.findings import flag
-from crane.description.spec import unit_vector
+from crane.description.spec import WITHOUT_AXIS, unit_vector
 from crane.description.tree import Placement, Vector
 
 LARGEST = 50_000_000  # bytes of a file
@@ -299,11 +299,13 @@ class XmlFile:
         return values
 
     def direction(self, element: etree._Element, what: str, default: tuple[float, ...]) -> Vector:
-        """Unit vector of the child `<axis xyz="..."/>`.
+        """Unit vector of the child `<axis xyz="..."/>`; not read where the type uses none.
 
         Raises:
             DescriptionError: It is zero or malformed.
         """
+        if element.get("type") in WITHOUT_AXIS:
+            return _X
         axis = self.only(element, "axis", what)
         xyz = default if axis is None else self.vector(axis, "xyz", f"the axis of {what}", 3)
         if (unit := unit_vector(xyz)) is None:

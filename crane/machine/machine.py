@@ -464,9 +464,9 @@ class Machine(Brief):
         asymmetry = np.abs(tensor - tensor.T).max() if tensor.shape == (3, 3) else np.inf
         if asymmetry > 1e-9 * np.abs(tensor).max():
             raise InputError("the payload's inertia is not a symmetric (3, 3) matrix")
-        problem = inertia_problem(mass, tensor)
         if not mass and tensor.any():
-            problem = "an inertia but no mass, give it a mass"
+            raise InputError("the payload has an inertia but no mass, give it a mass")
+        problem = inertia_problem(mass, tensor)
         if problem and tensor.any():
             raise InputError(f"the payload has {problem}")
         load = pin.Inertia(mass, com, tensor)

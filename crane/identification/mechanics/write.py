@@ -129,7 +129,7 @@ def _impossible(bodies: Mapping[str, Array]) -> str | None:
             return f"link '{link}' has the negative mass {body[0]:.4g} kg"
         inertia = pin.Inertia.FromDynamicParameters(body)
         if problem := inertia_problem(float(inertia.mass), inertia.inertia):
-            return f"link '{link}' has {problem.rpartition(', ')[0]}"  # without what to do
+            return f"link '{link}' has {problem.what}"
     return None
 
 
