@@ -253,7 +253,7 @@ class TestWarnings:
             crane.load(path)
         assert len(caught) == 1
         path.write_text(text.replace("drives: true", "drives: 1"), encoding="utf-8")
-        with pytest.raises(DescriptionError, match="'X2' is neither true nor false"):
+        with pytest.raises(DescriptionError, match="'X2' is 1, give true or false"):
             crane.load(path)
 
 
