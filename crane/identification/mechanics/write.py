@@ -113,7 +113,7 @@ def check_rewritable(machine: Machine) -> None:
     ):
         raise InputError(
             f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
-            f"one: crane convert {machine.path.name} FOLDER"
+            f"one: crane convert {machine.command} FOLDER"
         )
     if machine.changes:
         raise InputError(
