@@ -830,7 +830,8 @@ BARS = """<robot name="bars" xmlns:xacro="http://ros.org/wiki/xacro">
 <xacro:arg name="far" default="9"/><link name="base"/>
 <xacro:macro name="bar" params="name on at kind:=continuous">
 <link name="${name}"><xacro:if value="${kind != 'fixed'}"><inertial><mass value="1"/>
-<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></xacro:if></link><joint name="turn_${name}" type="${kind}"><parent link="${on}"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></xacro:if></link>
+<joint name="turn_${name}" type="${kind}"><parent link="${on}"/>
 <child link="${name}"/><origin xyz="${at}"/><axis xyz="0 0 1"/></joint></xacro:macro>
 <xacro:bar name="crank" on="base" at="0 0 0"/><xacro:bar name="coupler" on="crank" at="0 0.3 0"/>
 <xacro:bar name="rocker" on="base" at="0.4 0 0"/>

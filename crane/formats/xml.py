@@ -15,6 +15,10 @@ from crane.description.tree import Placement, Vector
 
 LARGEST = 50_000_000  # bytes of a file
 _X = (1.0, 0.0, 0.0)
+_ROOTS = {  # what a file holds by its suffix, if not a <robot>
+    ".sdf": "an <sdf>", ".world": "an <sdf>", ".mjcf": "a <mujoco>",
+    ".xml": "a <robot>, an <sdf> or a <mujoco>",
+}  # fmt: skip
 _LINES = 1 << 16
 _LONG = 60  # characters of a value in an error
 _SEVERAL = {"link", "joint", "loop", "visual", "collision"}  # elements that there may be more of
@@ -107,7 +111,8 @@ class XmlFile:
                 f"{file}: cannot be read ({error.strerror}), check the path"
             ) from None
         if not data.strip():
-            raise DescriptionError(f"{file.name}: the file is empty, write a <robot> in it")
+            root = _ROOTS.get(file.suffix.lower(), "a <robot>")
+            raise DescriptionError(f"{file.name}: the file is empty, write {root} in it")
         _refuse_document_type(file, data)
         if b"encoding" not in data[:200] and not data.startswith((b"\xff\xfe", b"\xfe\xff")):
             try:
