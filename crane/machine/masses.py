@@ -84,8 +84,10 @@ def _warn_of_inertia(link: Link, problem: InertiaProblem, replaced: bool) -> Non
 def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> None:
     """Warn of moving links without mass; refuse those that make the mass matrix singular.
 
-    M_A = gamma^T M gamma at home. A machine without any mass is one of kinematics alone, which
-    `Dynamics` refuses, not the loading.
+    M_A = gamma^T M gamma at home. It is definite, as M is, where each joint moves some inertia of
+    its own link, S^T I S > 0: then so does it with those that hang on it, from the ends of the
+    tree on. A machine without any mass is one of kinematics alone, which `Dynamics` refuses, not
+    the loading.
 
     Raises:
         DescriptionError: A motion of the machine moves no mass.
@@ -96,11 +98,17 @@ def check_masses(spec: MachineSpec, model: pin.Model, closure: Closure) -> None:
         return model.inertias[int(coordinates.joints[coordinates.column(joint.name)])]
 
     def lacks(joint: Joint) -> bool:
-        link, inertia = spec.tree.links[joint.child], body(joint)
-        if link.between is not None or link.refused:
+        links, inertia = spec.tree.links, body(joint)
+        if links[joint.child].between is not None or links[joint.child].refused:
             return False
         moments = np.linalg.eigvalsh(inertia.inertia)
-        return not inertia.mass > 0 or bool(moments[0] <= _DEFINITE * moments[2])
+        if links[joint.parent].between is not None:  # others of its series move the link as well
+            return not inertia.mass > 0 or bool(moments[0] <= _DEFINITE * moments[2])
+        if joint.kind == "prismatic":
+            return not inertia.mass > 0
+        arm = inertia.mass * float(np.sum(np.cross(inertia.lever, joint.axis) ** 2))
+        own = float(joint.axis @ inertia.inertia @ joint.axis) + arm
+        return own <= _DEFINITE * (arm + float(moments[2]))
 
     lacking = [joint for joint in spec.tree.moving if lacks(joint)]
     massless = [joint for joint in lacking if not body(joint).mass > 0]
