@@ -51,6 +51,7 @@ class Broken:
     message: str
     edits: tuple[Edit, ...]
     machine: str = MACHINE
+    strict: bool = False  # otherwise it is loaded, with a warning
 
 
 def swap(old: str, new: str, file: str = MACHINE) -> Edit:
@@ -61,8 +62,9 @@ def whole(new: str | bytes, file: str = MACHINE) -> Edit:
     return Edit(file, None, new)
 
 
-def case(name: str, message: str, *edits: Edit, machine: str = MACHINE):
-    return pytest.param(Broken(name, message, edits, machine), id=name.replace(" ", "-"))
+def case(name: str, message: str, *edits: Edit, machine: str = MACHINE, strict: bool = False):
+    broken = Broken(name, message, edits, machine, strict)
+    return pytest.param(broken, id=name.replace(" ", "-"))
 
 
 def copy_machine(machine: str, folder: Path) -> Path:
@@ -80,7 +82,7 @@ def assert_refused(broken: Broken, folder: Path) -> None:
     for edit in broken.edits:
         edit.apply(folder)
     with pytest.raises(CraneError) as caught:
-        crane.load(path)
+        crane.load(path, strict=broken.strict)
     message = str(caught.value)
     assert message == with_line(broken.message, folder)
     assert message.isprintable()

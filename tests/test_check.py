@@ -1,5 +1,6 @@
 """Everything that `crane check` finds, line by line."""
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -352,7 +353,8 @@ INERTIAS = [
             "ground.urdf:21: error: link 'crank_arm' has a mass but no inertia, give at "
             "least a small sphere's",
             "ground.urdf:35: error: link 'coupler_arm' has an inertia of no possible body: "
-            "principal moments 0.03 + 0.03 < 0.1 kg m2, correct it",
+            'principal moments 0.03 + 0.03 < 0.1 kg m2, the nearest possible is ixx="0.1" ixy="0" '
+            'ixz="0" iyy="0.05" iyz="0" izz="0.05", correct it',
             "rocker.urdf:12: error: link 'rocker_arm' has the negative principal moment of "
             "inertia -0.0946 kg m2, correct it",
         ],
@@ -716,7 +718,7 @@ def test_what_load_raises_is_among_the_findings(broken, tmp_path):
     for edit in broken.edits:
         edit.apply(tmp_path)
     with pytest.raises(crane.CraneError) as caught:
-        crane.load(path)
+        crane.load(path, strict=broken.strict)
     report = check(path)
     messages = [str(finding).replace(": error: ", ": ", 1) for finding in report.findings]
     assert any(message.startswith(str(caught.value)) for message in messages), messages
@@ -790,6 +792,62 @@ def test_status_and_counts_of_a_clean_machine(tmp_path):
     next_line = result.stdout.splitlines()[1]
     assert next_line == f"next: crane simulate {tmp_path / MACHINE} --task swing --out swing"
     assert result.stdout.count("\n") == 2
+
+
+WORLD = """<sdf version="1.9"><world name="w">{}{}</world></sdf>"""
+MODEL = """<model name="{}"><link name="base"><inertial><mass>5</mass></inertial></link>
+<link name="arm"><inertial><pose>0.3 0 0 0 0 0</pose><mass>2</mass>
+<inertia><ixx>0.01</ixx><iyy>0.1</iyy><izz>0.1</izz></inertia></inertial></link>
+<joint name="turn" type="revolute"><parent>base</parent><child>arm</child>
+<axis><xyz>0 1 0</xyz></axis></joint></model>"""
+
+
+@pytest.mark.parametrize("floating", [[], ["--floating"]])
+@pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+def test_the_next_command_loads_the_same_machine(tmp_path, floating):
+    """Of several models of a world, with the options that were given."""
+    (tmp_path / "a world").mkdir()
+    path = tmp_path / "a world" / "two.sdf"
+    path.write_text(WORLD.format(MODEL.format("one arm"), MODEL.format("other")))
+    options = ["--arg", "model:=one arm", "--packages", str(path.parent), "--active", "turn"]
+    result = run(path, *options, *floating, cwd=tmp_path)
+    assert result.returncode < 2, result.stdout
+    line = result.stdout.splitlines()[-1].removeprefix("next: crane ")
+    done = typed(*shlex.split(line), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    words = shlex.split(line)
+    assert [x for x in (*options, *floating) if x not in words] == []
+    machine = crane.load(path, changes={"arm.mass": 3}, arguments={"model": "other"})
+    words = shlex.split(machine.command)
+    assert words[1:] == ["--set", "arm.mass=3.0", "--arg", "model:=other"]
+    assert typed("convert", *words, tmp_path / "other").returncode == 0
+    assert crane.load(tmp_path / "other" / "other.yaml").tree.links["arm"].inertial.mass == 3
+    with pytest.raises(crane.CraneError, match="--arg model:=other --names lists"):
+        crane.load(path, changes={"arm.weight": 3}, arguments={"model": "other"})
+
+
+BARS = """<robot name="bars" xmlns:xacro="http://ros.org/wiki/xacro">
+<xacro:arg name="far" default="9"/><link name="base"/>
+<xacro:macro name="bar" params="name on at kind:=continuous">
+<link name="${name}"><xacro:if value="${kind != 'fixed'}"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></xacro:if></link>
+<joint name="turn_${name}" type="${kind}"><parent link="${on}"/>
+<child link="${name}"/><origin xyz="${at}"/><axis xyz="0 0 1"/></joint></xacro:macro>
+<xacro:bar name="crank" on="base" at="0 0 0"/><xacro:bar name="coupler" on="crank" at="0 0.3 0"/>
+<xacro:bar name="rocker" on="base" at="0.4 0 0"/>
+<xacro:bar name="pin_a" on="coupler" at="$(arg far) 0 0" kind="fixed"/>
+<xacro:bar name="pin_b" on="rocker" at="0 0.3 0" kind="fixed"/></robot>"""
+
+
+def test_the_next_command_closes_the_same_open_machine(tmp_path):
+    """Of a xacro whose argument makes the ends of a loop meet."""
+    path = tmp_path / "bars.xacro"
+    path.write_text(BARS)
+    line = run(path, "--arg", "far:=0.4", cwd=tmp_path).stdout.splitlines()[-1]
+    assert line == f"next: crane add loops {path} --arg far:=0.4"
+    done = typed(*shlex.split(line.removeprefix("next: crane ")), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert crane.load(tmp_path / "bars_closed.yaml").closure.degrees_of_freedom == 1
 
 
 def test_status_and_counts_with_warnings(tmp_path):

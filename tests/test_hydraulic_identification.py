@@ -22,7 +22,7 @@ from crane.identification.hydraulics.cylinder_signals import (
 from crane.identification.hydraulics.orifice_rows import OrificeRows, terms
 from crane.identification.hydraulics.orifices import identify_orifices
 from crane.identification.hydraulics.valve import identify_valve
-from crane.identification.signals.steady import steady
+from crane.identification.signals.steady import steady, steady_means
 from crane.identification.signals.weak_form import Windows
 
 # A lift of 8 t on one cylinder of the size of a forestry crane's; equations (21) to (23) below.
@@ -656,6 +656,50 @@ def test_valve_needs_both_directions(compensated, sense):
     word = "retracting" if sense > 0 else "extending"
     with pytest.raises(RecordingError, match=f"'boom' has no steady {word} at two signals"):
         identify_valve(compensated, driven(U, time, 0, None), "boom")
+
+
+def long_steps(time):
+    levels = np.array([5.8, 5.2, 4.6, 4.0, 5.8, 6.4, 7.0, 7.6])
+    return levels[np.minimum((time / 12).astype(int), len(levels) - 1)]
+
+
+@pytest.mark.parametrize("frequency", [1.37, 2.0, 3.1])
+def test_valve_whose_load_rings(compensated, frequency):
+    """Held for 12 s at a constant mean, about which the speed rings by a fifth of it."""
+    time = np.arange(0, 96, 5e-3)
+    U = long_steps(time)
+    rng = np.random.default_rng(3)
+
+    def ringing(U):
+        return speed_of(U) * (1 + 0.2 * np.sin(2 * np.pi * frequency * time + 0.7))
+
+    found = identify_valve(
+        compensated, driven(U, time, 5e-4, rng, lag=1e-3, speed=ringing), "boom"
+    )
+    assert found.neutral == pytest.approx(MIDDLE, abs=3e-3)
+    assert found.dead_band == pytest.approx(SHARE, abs=2e-3)
+    np.testing.assert_allclose(found.flows, FLOW, rtol=5e-3)
+    low, high, amplitude = found.ringing
+    assert low == pytest.approx(frequency, rel=5e-3)
+    assert high == pytest.approx(frequency, rel=5e-3)
+    assert amplitude == pytest.approx(0.2 * np.abs(speed_of(U)).max(), rel=0.05)
+    assert f"rings at {frequency:.3g}"[:11] in found.to_text()
+    assert "means over its periods" in found.to_text()
+
+
+def test_means_over_periods_leave_what_does_not_ring(compensated):
+    """Noise, slow ramps and plain steps are judged as they were."""
+    time = np.arange(0, 42, 1e-2)
+    run = driven(staircase(time), time, 5e-4, np.random.default_rng(0))
+    found = identify_valve(compensated, run, "boom")
+    assert found.ringing is None and "rings" not in found.to_text()
+    U, v = run.channels["voltage_boom"], run.v[:, 0]
+    means = steady_means(time, 0.5, U, v)
+    np.testing.assert_array_equal(means.kept, steady(time, 0.5, U, v))
+    assert means.answer is v
+    drift = np.where(time > 20, 0.05 * np.sin(0.3 * time), 0.0)  # no period within a held signal
+    with pytest.raises(RecordingError, match="no sample is steady"):
+        steady_means(time, 0.5, np.sin(5 * time), drift)
 
 
 # --- friction ------------------------------------------------------------------------------

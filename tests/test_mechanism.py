@@ -285,13 +285,15 @@ MINI_FORWARDER = [
         "printed inertia misread",
         'chain_c.urdf:{line of <inertia ixx="0" ixy="0" ixz="0" iyy="0}: link '
         "'link2' has an inertia of no possible body: principal moments 0 + 8.17e-06"
-        " < 8.17e-05 kg m2, correct it",
+        ' < 8.17e-05 kg m2, the nearest possible is ixx="3.6765e-05" ixy="0" ixz="0" '
+        'iyy="4.4935e-05" iyz="0" izz="8.17e-05", correct it',
         swap(
             'iyy="0.0817e-3" iyz="0" izz="0.0817e-3"',
             'iyy="0.00817e-3" iyz="0" izz="0.0817e-3"',
             CHAIN_C,
         ),
         machine=MINI,
+        strict=True,
     ),
     case(
         "joint axis out of the plane",

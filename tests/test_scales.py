@@ -211,7 +211,7 @@ def test_inertias_are_judged_by_their_mass(mass, told):
     from crane.description import inertia_problem
 
     size = 1e-6  # [m]
-    assert (inertia_problem(mass, mass * size**2 * np.eye(3)) or "") == told
-    assert "no inertia" in inertia_problem(mass, np.zeros((3, 3)))
+    assert str(inertia_problem(mass, mass * size**2 * np.eye(3)) or "") == told
+    assert "no inertia" in str(inertia_problem(mass, np.zeros((3, 3))))
     long = mass * size**2 * np.diag([1.0, 1.0, 3.0])
-    assert "no possible body" in inertia_problem(mass, long)
+    assert "no possible body" in str(inertia_problem(mass, long))

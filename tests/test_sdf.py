@@ -5,6 +5,8 @@ import warnings
 import numpy as np
 import pinocchio as pin
 import pytest
+import trimesh
+from scipy.integrate import quad
 from sdf_models import SdfWriter, draw, planar, stewart, urdf
 from typed import typed
 
@@ -254,6 +256,158 @@ def test_mass_of_collisions(tmp_path):
            0.4 * masses[1] * 0.01]  # fmt: skip
     steiner = masses @ (np.square([[0, 0.5], [1, 0]] - com[[0, 2]])).sum(axis=1)
     assert about == pytest.approx(sum(own) + steiner, rel=1e-12)
+
+
+SOLIDS = {  # radius at a height, lowest and highest, by closed forms of the shapes alone
+    "<sphere><radius>0.3</radius></sphere>": (lambda z: np.sqrt(0.09 - z * z), -0.3, 0.3),
+    "<cylinder><radius>0.2</radius><length>0.7</length></cylinder>": (lambda z: 0.2, -0.35, 0.35),
+    "<capsule><radius>0.2</radius><length>0.7</length></capsule>": (
+        lambda z: np.sqrt(np.maximum(0.04 - np.maximum(np.abs(z) - 0.35, 0.0) ** 2, 0.0)),
+        -0.55,
+        0.55,
+    ),
+    "<cone><radius>0.2</radius><length>0.8</length></cone>": (
+        lambda z: 0.2 * (0.4 - z) / 0.8, -0.4, 0.4,
+    ),
+    "<ellipsoid><radii>0.2 0.2 0.5</radii></ellipsoid>": (
+        lambda z: 0.2 * np.sqrt(1 - 4 * z * z), -0.5, 0.5,
+    ),
+}  # fmt: skip
+
+
+def body_of(folder, inertial, *collisions):
+    """The inertial of the first link with these `<collision>` elements."""
+    shapes = "".join(f'<collision name="c{i}">{x}</collision>' for i, x in enumerate(collisions))
+    text = arm(TWO, version="1.12").replace(MASS, inertial + shapes, 1)
+    return load(written(folder, text)).tree.links["a"].inertial
+
+
+@pytest.mark.parametrize("shape", SOLIDS, ids=lambda shape: shape[1:].partition(">")[0])
+def test_solids_of_revolution_by_slices(shape, tmp_path):
+    """Discs of radius r at height z: dm = rho pi r^2 dz, r^2 / 2 dm, (r^2 / 4 + z^2) dm."""
+    radius, low, high = SOLIDS[shape]
+    found = body_of(
+        tmp_path, '<inertial auto="true"/>',
+        f"<density>2700</density><geometry>{shape}</geometry>",
+    )  # fmt: skip
+
+    def total(weight):
+        area = lambda z: np.pi * radius(z) ** 2 * 2700 * weight(z)  # noqa: E731
+        ends = [low, *(x for x in (-0.35, 0.35) if low < x < high), high]
+        pairs = zip(ends, ends[1:], strict=False)
+        return sum(quad(area, a, b, epsabs=1e-12, epsrel=1e-12)[0] for a, b in pairs)
+
+    mass = total(lambda z: 1.0)
+    centre = total(lambda z: z) / mass
+    across = total(lambda z: radius(z) ** 2 / 4 + (z - centre) ** 2)
+    along = total(lambda z: radius(z) ** 2 / 2)
+    assert found.mass == pytest.approx(mass, rel=1e-9)
+    assert np.allclose(found.com, [0, 0, centre], atol=1e-9)
+    assert np.allclose(found.tensor, [across, 0, 0, across, 0, along], rtol=1e-9, atol=1e-9)
+
+
+def mesh_of(folder, mesh, name="part.stl", scale="1 1 1"):
+    mesh.export(folder / name)
+    uri = f"<uri>{name}</uri><scale>{scale}</scale>"
+    return f"<density>800</density><geometry><mesh>{uri}</mesh></geometry>"
+
+
+def test_a_closed_mesh_is_the_solid_that_it_bounds(tmp_path):
+    """A box as triangles, out of the middle, scaled, and inside out by a mirror."""
+    box = trimesh.creation.box((0.2, 0.4, 0.6))
+    box.apply_translation((5, -3, 1))
+    for name, scale in (("a.stl", "1 0.5 2"), ("b.obj", "1 0.5 2"), ("c.ply", "-1 0.5 2")):
+        found = body_of(tmp_path, '<inertial auto="true"/>', mesh_of(tmp_path, box, name, scale))
+        x, y, z = 0.2, 0.2, 1.2
+        mass = 800 * x * y * z
+        moments = mass / 12 * np.array([y * y + z * z, x * x + z * z, x * x + y * y])
+        assert found.mass == pytest.approx(mass, rel=1e-6)  # STL has seven digits
+        assert np.allclose(found.com, [np.copysign(5, float(scale.split()[0])), -1.5, 2])
+        assert np.allclose(
+            found.tensor, np.diag(moments)[np.triu_indices(3)], rtol=1e-5, atol=1e-5
+        )
+
+
+def test_any_closed_mesh_as_trimesh_has_it(tmp_path):
+    """Non-convex and askew: an L in one surface, by trimesh's own integrals."""
+    outline = np.array([[0, 0], [2, 0], [2, 0.5], [0.5, 0.5], [0.5, 1], [0, 1]]) * 0.1
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 4], [0, 4, 5]])
+    mesh = trimesh.creation.extrude_triangulation(outline, faces, 0.3)
+    mesh.apply_transform(trimesh.transformations.random_rotation_matrix(np.array([0.1, 0.6, 0.3])))
+    mesh.density = 800
+    found = body_of(tmp_path, '<inertial auto="true"/>', mesh_of(tmp_path, mesh, "l.ply"))
+    assert mesh.is_watertight
+    assert found.mass == pytest.approx(mesh.mass, rel=1e-6)
+    assert np.allclose(found.com, mesh.center_mass, atol=1e-7)
+    tensor = mesh.moment_inertia[np.triu_indices(3)]
+    assert np.allclose(found.tensor, tensor, rtol=1e-5, atol=1e-7)
+
+
+def test_density_and_mass_of_the_whole(tmp_path):
+    """Density by collision, then by link, then water; a mass keeps the shape of the tensor."""
+    boxes = [
+        f"<pose>{x} 0 0 0 0 0</pose>{density}"
+        "<geometry><box><size>0.1 0.1 0.1</size></box></geometry>"
+        for x, density in ((0, ""), (1, "<density>3000</density>"))
+    ]
+    water = body_of(tmp_path, '<inertial auto="true"/>', *boxes)
+    assert (water.mass, water.com[0]) == pytest.approx((4.0, 0.75))
+    oil = body_of(tmp_path, '<inertial auto="1"><density>500</density></inertial>', *boxes)
+    assert (oil.mass, oil.com[0]) == pytest.approx((3.5, 3 / 3.5))
+    for given in (
+        '<inertial auto="true"><mass>8</mass></inertial>',
+        '<inertial><mass>8</mass><inertia auto="true"/></inertial>',
+    ):
+        weighed = body_of(tmp_path, given, *boxes)
+        assert weighed.mass == 8 and weighed.com == pytest.approx(water.com)
+        assert weighed.tensor == pytest.approx([2 * x for x in water.tensor])
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        ("<mesh><uri>open.stl</uri></mesh>", "the mesh 'open.stl', which 3 edges leave open, so"),
+        ("<mesh><uri>none.stl</uri></mesh>", "the mesh 'none.stl', which is not there, so that"),
+        ("<mesh><uri>bad.stl</uri></mesh>", "the mesh 'bad.stl', which cannot be read ("),
+        ("<mesh><uri>open.stl</uri><submesh><name>a</name></submesh></mesh>", "takes a part of"),
+        (
+            "<plane><normal>0 0 1</normal></plane>",
+            "is no box, capsule, cone, cylinder, ellipsoid, ",
+        ),
+        ("<sphere><radius>-1</radius></sphere>", "<radius> of a collision of link 'a' is not pos"),
+    ],
+    ids=["open", "missing", "damaged", "part", "plane", "negative"],
+)
+def test_shapes_without_a_volume(shape, message, tmp_path):
+    box = trimesh.creation.box((1, 1, 1))
+    box.update_faces(np.arange(12) > 0)
+    box.export(tmp_path / "open.stl")
+    (tmp_path / "bad.stl").write_text("no mesh")
+    with pytest.raises(CraneError) as caught:
+        body_of(tmp_path, '<inertial auto="true"/>', f"<geometry>{shape}</geometry>")
+    assert message in str(caught.value) and str(caught.value).startswith("arm.sdf:")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.sdf", "", "a.sdf: the file is empty, write an <sdf> in it"),
+        ("a.world", " ", "a.world: the file is empty, write an <sdf> in it"),
+        ("a.mjcf", "", "a.mjcf: the file is empty, write a <mujoco> in it"),
+        ("a.xml", "", "a.xml: the file is empty, write a <robot>, an <sdf> or a <mujoco> in it"),
+        ("a.sdf", "<model/>", "a.sdf:1: an SDF starts with <sdf>, this file with <model>"),
+    ],
+)
+def test_files_without_an_sdf(name, text, message, tmp_path):
+    with pytest.raises(CraneError) as caught:
+        load(written(tmp_path, text, name))
+    assert str(caught.value) == message
+
+
+@pytest.mark.parametrize("kind", ["fixed", "ball"])
+def test_an_axis_that_a_joint_does_not_use_is_not_read(kind, tmp_path):
+    joint = hinge("q", "a", "b", axis="0 0 0", kind=kind)
+    assert load(written(tmp_path, arm(hinge("p", "world", "a") + joint))).joints
 
 
 def test_models_within_models(tmp_path):

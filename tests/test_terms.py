@@ -187,11 +187,31 @@ def test_the_machine_file_says_it_and_keeps_it(arm, tmp_path):
     assert not [name for name in Model(held).names if name.startswith("q6")]
 
 
+@pytest.mark.parametrize("word", ["{}", "'{}'", '"{}"'])
+@pytest.mark.parametrize(("off", "on"), [("off", "on"), ("no", "Yes"), ("FALSE", "true")])
+def test_on_and_off_may_be_quoted(edited, word, off, on):
+    terms = f"{{crank.rotor_inertia: {word.format(on)}, rocker.viscous: {word.format(off)}}}"
+    machine = edited(
+        "four_bar.yaml",
+        "tip: coupler_pin",
+        f"tip: coupler_pin\nidentification: {{terms: {terms}}}",
+        "viscous: 0.1, smoothing",
+        f"viscous: 0.1, viscous_offset: 0.2, drives: {word.format(on)}, smoothing",
+    )
+    assert machine.estimation.terms == {"crank.rotor_inertia": (), "rocker.viscous": None}
+
+
+def test_numbers_that_yaml_reads_as_text_are_numbers(edited):
+    terms = "identification: {terms: {crank.presliding: 2e5}}"
+    machine = edited("four_bar.yaml", "tip: coupler_pin", f"tip: coupler_pin\n{terms}")
+    assert machine.estimation.terms == {"crank.presliding": (2e5,)}
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("{term: {}}", "unknown key 'term' in 'identification', did you mean 'terms'?"),
-        ("{terms: {q1.root: maybe}}", "'q1.root' of 'terms' is 'maybe', give a number"),
+        ("{terms: {q1.root: maybe}}", "'q1.root' of 'terms' is 'maybe', give on, off, a number"),
         ("{terms: {q1.root: }}", "'q1.root' of 'terms' is empty, give its value"),
         ("{prior: {q1.viscous: about 5}}", "'q1.viscous' of 'prior': 'about 5' says no standard"),
         ("{bandwidth: 0}", "'bandwidth' is 0, give one in Hz"),

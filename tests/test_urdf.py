@@ -223,6 +223,7 @@ BODIES = [
             '<inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>',
             GROUND,
         ),
+        strict=True,
     ),
     case(
         "negative moment",
@@ -247,12 +248,14 @@ BODIES = [
     case(
         "triangle inequality",
         "ground.urdf:21: link 'crank_arm' has an inertia of no possible body: "
-        "principal moments 0.006 + 0.006 < 0.1 kg m2, correct it",
+        'principal moments 0.006 + 0.006 < 0.1 kg m2, the nearest possible is ixx="0.1" ixy="0" '
+        'ixz="0" iyy="0.05" iyz="0" izz="0.05", correct it',
         swap(
             '<inertia ixx="0.001" ixy="0" ixz="0" iyy="0.006" iyz="0" izz="0.006"/>',
             '<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.006" iyz="0" izz="0.006"/>',
             GROUND,
         ),
+        strict=True,
     ),
     case(
         "nan inertia",
@@ -281,14 +284,15 @@ BODIES = [
     case(
         "fixed parts that add up to no body",
         "ground.urdf:31: link 'coupler_arm' with what is fixed to it has an inertia"
-        " of no possible body: principal moments 1.034 + 1.034 < 10 kg m2, correct "
-        "it",
+        " of no possible body: principal moments 1.034 + 1.034 < 10 kg m2, the nearest possible "
+        'is ixx="10.001" ixy="0" ixz="0" iyy="5.0005" iyz="0" izz="5.0005", correct it',
         swap(
             '<link name="coupler_pin"/>',
             '<link name="coupler_pin"><inertial><mass value="0.1"/><inertia ixx="10" '
             'ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>',
             GROUND,
         ),
+        strict=True,
     ),
 ]
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from crane.cli.shared import Force, MachineName, OutFile, app
+from crane.cli.shared import Argument, Force, MachineName, OutFile, Packages, app, arguments
 
 add = typer.Typer(no_args_is_help=True, help="Put a part into a machine, and write it.")
 app.add_typer(add, name="add")
@@ -42,8 +42,15 @@ def cylinder(
 
 
 @add.command()
-def loops(machine: MachineName, out: OutFile = None, force: Force = False) -> None:
+def loops(
+    machine: MachineName,
+    out: OutFile = None,
+    packages: Packages = None,
+    argument: Argument = None,
+    force: Force = False,
+) -> None:
     """Close the loops that `crane check` proposes, and write the closed machine."""
     from crane.formats.adding import add_loops
 
-    print(add_loops(machine, out=out, force=force))
+    values = arguments(argument)
+    print(add_loops(machine, out=out, force=force, packages=packages or (), arguments=values))

@@ -14,6 +14,7 @@ import crane
 from crane.cli.shared import INTERRUPTED, app, say
 from crane.cli.waiting import watched
 from crane.common.errors import CraneError, CraneWarning, one_line
+from crane.common.packages import giving
 
 _SPARING = 20_000  # objects between collections: nearly all that starting makes is there to stay
 
@@ -54,15 +55,15 @@ def program(command: str = "") -> typer.Typer:
 def main() -> None:
     """Run the command line: errors are one line, exit status 2."""
     gc.set_threshold(_SPARING)
-    arguments = [word for word in sys.argv[1:] if word != "--debug"]
-    debug = len(arguments) < len(sys.argv) - 1
+    arguments = [word for word in sys.argv[1:] if word not in ("--debug", "--strict")]
+    debug, strict = (word in sys.argv[1:] for word in ("--debug", "--strict"))
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files may be no text
         sys.stdout.reconfigure(errors="backslashreplace")
     warnings.showwarning = _show_warning
     warnings.simplefilter("once", CraneWarning)
     try:
         run = program(*arguments[:1])
-        with watched(" ".join(["crane", *arguments[:1]])):
+        with watched(" ".join(["crane", *arguments[:1]])), giving(strict=strict):
             status = run(args=arguments, standalone_mode=False, prog_name="crane")
         if status == INTERRUPTED:  # what the parser makes of KeyboardInterrupt
             raise KeyboardInterrupt
@@ -117,7 +118,8 @@ def _options(
 ) -> None:
     """Machines with closed kinematic chains: simulate, identify and show.
 
-    Add --debug to any command to see where an error comes from.
+    Add --strict to any command to refuse inertias that no body has, which are computed with
+    otherwise, and --debug to see where an error comes from.
     """
 
 

@@ -72,6 +72,7 @@ def excite(
     from crane.cli.calibrate import fits
     from crane.cli.runs import check_folder
     from crane.common.output import staging
+    from crane.description.sources import command_words
     from crane.identification.excitation.excite import excite as find_motion
     from crane.identification.excitation.signals import excite_valves
     from crane.view.plots.excitation import plot_excitation, plot_signals
@@ -104,8 +105,7 @@ def excite(
             plot_signals(signals, part / "signals.png")
     text = motion.to_text() if wanted is None else signals.to_text()
     view = f"see it with: crane view {out}/reference.csv"
-    words = [*(f"--set {x}" for x in change or ()), *(f"--lock {x}" for x in lock or ())]
-    same = " ".join([str(machine), *words])
+    same = command_words(machine, changes=loaded.changes, lock=loaded.locks)
     play = f"play it with: crane simulate {same} --inputs {out}/signals.csv --out run"
     print(f"{text}\n\nwritten to {out}; {view if wanted is None else play}")
 

@@ -164,7 +164,8 @@ def terms(words: Sequence[str] | None) -> "dict[str, Numbers | None]":
     for word in words or ():
         name, equals, text = word.partition("=")
         try:
-            numbers = tuple(map(float, text.split(","))) if equals and text != "off" else ()
+            is_word = not equals or text in ("on", "off")
+            numbers = () if is_word else tuple(map(float, text.split(",")))
         except ValueError:
             raise InputError(f"--term is '{word}', write {_TERM}") from None
         if name in found:

@@ -37,12 +37,14 @@ class Given:
         packages: Folders of packages, or in which there are some.
         arguments: Values by name of the file's arguments.
         floating: Whether the root is to float.
+        strict: Whether what only has an odd form is refused, as `crane.load` has it.
         found: Packages that were sought while it holds, by name and by who asked.
     """
 
     packages: tuple[str, ...] = ()
     arguments: Mapping[str, str] = field(default_factory=dict)
     floating: bool = False
+    strict: bool = False
     found: dict[tuple[str, Path], Path | None] = field(default_factory=dict, repr=False)
 
 
@@ -59,6 +61,7 @@ def giving(
     packages: Sequence[str] = (),
     arguments: Mapping[str, object] | None = None,
     floating: bool = False,
+    strict: bool = False,
 ) -> Iterator[Given]:
     """Read files with packages in these folders and with values of arguments.
 
@@ -66,9 +69,10 @@ def giving(
         packages: Folders.
         arguments: Values by name; numbers and truth values are written as XML has them.
         floating: Whether the root is to float.
+        strict: Whether what only has an odd form is refused, here and in all that is read within.
     """
     values = {str(name): _text(value) for name, value in (arguments or {}).items()}
-    now = Given(tuple(packages), values, floating)
+    now = Given(tuple(packages), values, floating, strict or given().strict)
     token = _given.set(now)
     try:
         yield now

@@ -23,7 +23,7 @@ from crane.description.sensors import (
     unit_of,
     with_numbers,
 )
-from crane.description.sources import bundled
+from crane.description.sources import bundled, command_words
 from crane.description.spec import (
     Chain,
     Coupling,
@@ -253,7 +253,7 @@ def unknown_parameter(spec: MachineSpec, names: Iterable[str], wanted: str) -> s
         meant += f"like it are {' and '.join(map(repr, near[1:]))}; "
     at = spec.path.stem if bundled().get(spec.path.stem) == spec.path else spec.path
     what = f"parameter '{wanted}' is unknown"
-    return f"{what}, {meant}crane info {at} --names lists all names"
+    return f"{what}, {meant}crane info {command_words(at)} --names lists all names"
 
 
 def _warn_of_units(spec: MachineSpec, part: str, values: Mapping[str, float]) -> None:

@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any
 
 from crane.common.errors import CraneError
+from crane.common.packages import given
 
 MOST = 200  # findings in one run: who has more has one cause for most of them
 
@@ -155,6 +156,11 @@ def remember_file(file: object) -> None:
     """Keep a parsed file for further checks."""
     if (found := _current.get()) is not None:
         found.files.append(file)
+
+
+def is_strict() -> bool:
+    """Whether what only has an odd form is an error: in a check, and where the user says so."""
+    return going_on() or given().strict
 
 
 def going_on() -> bool:

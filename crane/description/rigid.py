@@ -46,11 +46,11 @@ def inertia(inertial: Inertial | None) -> pin.Inertia:
     """The inertia of a link in its frame, zero without one."""
     if inertial is None:
         return pin.Inertia.Zero()
-    xx, xy, xz, yy, yz, zz = inertial.tensor
     turn = rotation(inertial.rpy)
-    tensor = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
     out = pin.Inertia(inertial.mass, np.array(inertial.com), np.zeros((3, 3)))
-    out.inertia = tensor  # the constructor refuses what assembling refuses with the link's name
+    out.inertia = (
+        turn @ inertial.matrix @ turn.T
+    )  # the constructor refuses what assembling refuses with the link's name
     return out
 
 
@@ -74,4 +74,6 @@ def loaded(tree: Tree, frame: str, load: pin.Inertia) -> Tree:
         link = above[link].parent
     body = tree.links[link]
     whole = inertial(inertia(body.inertial) + load)
+    if whole is not None and body.inertial is not None:
+        whole = dataclasses.replace(whole, doubt=body.inertial.doubt)
     return tree.replacing(dataclasses.replace(body, inertial=whole))

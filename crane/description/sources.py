@@ -1,11 +1,14 @@
 """Where machines are found: bundled by name, example-robot-data by name, or a path."""
 
+import shlex
 import sys
+from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import takewhile
 from pathlib import Path
 
 from crane.common.errors import DescriptionError, known
+from crane.common.packages import Given, given
 
 WITH = " with "  # between a machine and the numbers of it that are changed, see `Machine.call`
 FOLDERS = ("robot.yaml", "model.sdf")  # of example-parallel-robots, of Gazebo
@@ -60,6 +63,37 @@ def examples() -> dict[str, Path]:
 def unchanged(call: str) -> str:
     """The machine or file in what `Machine.call` says."""
     return call.partition(WITH + "{")[0]
+
+
+def command_words(
+    name: str | Path,
+    active: Sequence[str] | None = None,
+    free: Sequence[str] | None = None,
+    changes: Mapping[str, float] | None = None,
+    lock: Mapping[str, float] | None = None,
+    beside: Given | None = None,
+) -> str:
+    """A machine as commands take it: its name, and the options with which it loads as it did.
+
+    Args:
+        name: As for `load`.
+        active: Driven joints, where they are chosen.
+        free: Coordinates that nothing drives, where they are chosen.
+        changes: New values of numbers.
+        lock: Coordinates of joints that are held.
+        beside: Packages, arguments, and whether the root floats; as files are read now if not
+            given.
+    """
+    beside = given() if beside is None else beside
+    words = [str(name)]
+    for option, values in {"--set": changes, "--lock": lock}.items():
+        words += [x for key, value in (values or {}).items() for x in (option, f"{key}={value!r}")]
+    for option, joints in {"--active": active, "--free": free}.items():
+        words += [] if joints is None else [option, ",".join(joints)]
+    words += ["--floating"] * beside.floating
+    words += [x for folder in beside.packages for x in ("--packages", folder)]
+    words += [x for key, value in beside.arguments.items() for x in ("--arg", f"{key}:={value}")]
+    return shlex.join(words)
 
 
 def find(name: str | Path) -> Path:

@@ -140,6 +140,7 @@ def unit_vector(xyz: Sequence[float]) -> Vector | None:
 
 
 # Locked directions of a loop joint whose axis is local z: three translations, three rotations.
+WITHOUT_AXIS = ("fixed", "floating", "spherical")  # types of joints and loops that use none
 LOOP_TYPES: Mapping[str, tuple[int, int, int, int, int, int]] = {
     "fixed": (1, 1, 1, 1, 1, 1),
     "revolute": (1, 1, 1, 1, 1, 0),

@@ -4,6 +4,8 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 Vector = tuple[float, float, float]
 Placement = tuple[Vector, Vector]  # xyz [m], rpy [rad] as URDF has them: R_z(y) R_y(p) R_x(r)
 
@@ -24,12 +26,21 @@ class Inertial:
         com: Centre of mass in the link's frame [m].
         rpy: Turns the axes of the link's frame into those of the tensor [rad].
         tensor: xx, xy, xz, yy, yz, zz about the centre of mass [kg m2].
+        doubt: File and line, where a file has a tensor that is no body's for its form alone, see
+            `crane.description.inertia`.
     """
 
     mass: float
     com: Vector
     rpy: Vector
     tensor: tuple[float, ...]
+    doubt: str = ""
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The tensor (3, 3) along the axes that it is written in."""
+        xx, xy, xz, yy, yz, zz = self.tensor
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ def _replace(path: Path, text: str) -> None:
 
 
 def _check_place(machine: Machine, path: Path) -> None:
-    elsewhere = f"write it into a copy: crane convert {machine.reference} FOLDER"
+    elsewhere = f"write it into a copy: crane convert {machine.command} FOLDER"
     packaged = {place.resolve() for place in (*bundled().values(), *examples().values())}
     if path in packaged:
         raise OutputError(f"{path}: belongs to a package, {elsewhere}")

@@ -25,7 +25,7 @@ from crane.machine.assemble import assemble, closed, home_guess
 from crane.machine.between import check_elements
 from crane.machine.drives import free_joints, motors
 from crane.machine.machine import Machine, fixed
-from crane.machine.masses import check_masses
+from crane.machine.masses import check_masses, with_computable_inertias
 
 
 def load(
@@ -37,6 +37,7 @@ def load(
     floating: bool | Sequence[str] = False,
     packages: Sequence[str | Path] = (),
     arguments: Mapping[str, object] | None = None,
+    strict: bool = False,
 ) -> Machine:
     """Load a machine, perhaps with some of its numbers changed, or joints locked.
 
@@ -59,6 +60,8 @@ def load(
         arguments: Values of the arguments of a xacro file; `model` of an SDF with several models;
             `urdf_constraint`, true where a URDF's `<constraint>` elements, as proposed upstream,
             are to be read as loops, see `crane.formats.urdf.constraints`.
+        strict: Whether to refuse, as `check` does, what can be computed with in spite of its
+            form: inertias that no body has, see `crane.machine.masses`.
 
     Returns:
         The machine, its home posture closed.
@@ -70,7 +73,7 @@ def load(
     """
     folders, values = package_folders(packages), values_by_name(arguments)
     floating = floating if isinstance(floating, bool) else freedoms_of(floating)
-    with few_warnings(), giving(folders, values, bool(floating)) as said:
+    with few_warnings(), giving(folders, values, bool(floating), strict) as said:
         machine = _load(name, changes, lock, active, free, floating)
         return replace(machine, packages=said.packages, arguments=MappingProxyType(said.arguments))
 
@@ -182,6 +185,7 @@ def _assembled(
     model = assemble(spec)
     closure = known(model, spec.loops, spec.couplings) or _closed(spec, model)
     _UNCHANGED[closure] = unchanged
+    spec, model = with_computable_inertias(spec, model, closure)
     check_masses(spec, model, closure)
     check_elements(spec, closure)
     coordinates = closure.equations.coordinates

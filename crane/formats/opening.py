@@ -39,6 +39,8 @@ def opened(file: Path) -> Opened:
     xml = XmlFile(file)
     if needs_xacro(xml):
         xml = expanded(xml)
+    if file.suffix.lower() in _SDF and xml.root.tag not in ("sdf", "robot"):
+        raise xml.fail(xml.root, f"an SDF starts with <sdf>, this file with <{xml.root.tag}>")
     if xml.root.tag == "sdf":
         from crane.formats.sdf.translate import translated  # most files are none
 

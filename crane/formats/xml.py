@@ -10,11 +10,15 @@ from lxml import etree
 from crane.common.errors import DescriptionError, known
 from crane.common.inputs import content
 from crane.description.findings import flag
-from crane.description.spec import unit_vector
+from crane.description.spec import WITHOUT_AXIS, unit_vector
 from crane.description.tree import Placement, Vector
 
 LARGEST = 50_000_000  # bytes of a file
 _X = (1.0, 0.0, 0.0)
+_ROOTS = {  # what a file holds by its suffix, if not a <robot>
+    ".sdf": "an <sdf>", ".world": "an <sdf>", ".mjcf": "a <mujoco>",
+    ".xml": "a <robot>, an <sdf> or a <mujoco>",
+}  # fmt: skip
 _LINES = 1 << 16
 _LONG = 60  # characters of a value in an error
 _SEVERAL = {"link", "joint", "loop", "visual", "collision"}  # elements that there may be more of
@@ -107,7 +111,8 @@ class XmlFile:
                 f"{file}: cannot be read ({error.strerror}), check the path"
             ) from None
         if not data.strip():
-            raise DescriptionError(f"{file.name}: the file is empty, write a <robot> in it")
+            root = _ROOTS.get(file.suffix.lower(), "a <robot>")
+            raise DescriptionError(f"{file.name}: the file is empty, write {root} in it")
         _refuse_document_type(file, data)
         if b"encoding" not in data[:200] and not data.startswith((b"\xff\xfe", b"\xfe\xff")):
             try:
@@ -299,11 +304,13 @@ class XmlFile:
         return values
 
     def direction(self, element: etree._Element, what: str, default: tuple[float, ...]) -> Vector:
-        """Unit vector of the child `<axis xyz="..."/>`.
+        """Unit vector of the child `<axis xyz="..."/>`; not read where the type uses none.
 
         Raises:
             DescriptionError: It is zero or malformed.
         """
+        if element.get("type") in WITHOUT_AXIS:
+            return _X
         axis = self.only(element, "axis", what)
         xyz = default if axis is None else self.vector(axis, "xyz", f"the axis of {what}", 3)
         if (unit := unit_vector(xyz)) is None:

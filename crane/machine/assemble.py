@@ -1,7 +1,7 @@
 """The spanning tree and its closure, from a description."""
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -13,7 +13,7 @@ from crane.closure.structure import ActiveError
 from crane.common.errors import DescriptionError, MechanismError, at
 from crane.common.samples import Array
 from crane.description import LoopSpec, MachineSpec, inertia_problem
-from crane.description.findings import flag, recoverable
+from crane.description.findings import flag, is_strict, recoverable
 from crane.description.floating import flyers
 from crane.description.rigid import inertia, se3
 from crane.description.tree import Joint, Link, Tree
@@ -245,24 +245,32 @@ def _kind(joint: Joint) -> pin.JointModel:
 
 def _check_bodies(spec: MachineSpec, model: pin.Model) -> None:
     links = spec.tree.links
-    doubtful = {
-        model.frames[frame_id(model, link.name)].parentJoint
-        for link in links.values()
-        if link.refused
-    }
+
+    def bodies(some: Iterable[Link]) -> set[int]:
+        return {model.frames[frame_id(model, link.name)].parentJoint for link in some}
+
+    refused = bodies(link for link in links.values() if link.refused)
+    doubtful = bodies(link for link in links.values() if _is_doubtful(link))
     floating = flyers(spec)
     for index in range(1, model.njoints):
         name = model.names[index]
         joint = spec.tree.joints[floating[name][-1] if name in floating else name]
         link = links[joint.child]
-        if link.between is not None or index in doubtful:
+        if link.between is not None or index in refused:
             continue
         with recoverable(harmless=True):
-            _check_body(link, model.inertias[index])
+            _check_body(link, model.inertias[index], index in doubtful)
 
 
-def _check_body(link: Link, inertia: pin.Inertia) -> None:
-    if problem := inertia_problem(inertia.mass, inertia.inertia):
+def _is_doubtful(link: Link) -> bool:
+    return link.inertial is not None and bool(link.inertial.doubt)
+
+
+def _check_body(link: Link, inertia: pin.Inertia, doubtful: bool) -> None:
+    """Refuse a body that cannot be; of doubtful parts only where their form is no excuse."""
+    problem = inertia_problem(inertia.mass, inertia.inertia)
+    excused = doubtful and (_is_doubtful(link) or not is_strict())
+    if problem is not None and not (excused and problem.formal):
         raise DescriptionError(
             f"{link.where}: link '{link.name}' with what is fixed to it has {problem}"
         )

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from crane.closure import Closure, frame_id
 from crane.closure.coordinates import Coordinates
 from crane.common.errors import InputError, LimitError, known
+from crane.common.packages import Given
 from crane.common.samples import Array, as_number, as_sample, as_samples
 from crane.common.shown import Brief, counted
 from crane.description import (
@@ -36,7 +37,7 @@ from crane.description import (
 from crane.description.estimation import Estimation
 from crane.description.external import ExternalForce, PhasedWrench
 from crane.description.rigid import loaded
-from crane.description.sources import WITH
+from crane.description.sources import WITH, command_words
 from crane.description.tree import Tree
 from crane.hydraulics import Hydraulics
 from crane.machine.between import misplaced
@@ -232,6 +233,13 @@ class Machine(Brief):
         }  # fmt: skip
         given = {name: what for name, what in (given | dict(self.chosen)).items() if what}
         return f"{self.reference}{WITH}{json.dumps(given)}" if given else self.reference
+
+    @property
+    def command(self) -> str:
+        """What commands take to load it again, as words of a shell, see `command_words`."""
+        beside = Given(self.packages, self.arguments, bool(self.floats))
+        active, free = self.chosen.get("active"), self.chosen.get("free")
+        return command_words(self.reference, active, free, self.changes, self.locks, beside)
 
     @property
     def coordinates(self) -> Coordinates:
@@ -467,9 +475,9 @@ class Machine(Brief):
         asymmetry = np.abs(tensor - tensor.T).max() if tensor.shape == (3, 3) else np.inf
         if asymmetry > 1e-9 * np.abs(tensor).max():
             raise InputError("the payload's inertia is not a symmetric (3, 3) matrix")
-        problem = inertia_problem(mass, tensor)
         if not mass and tensor.any():
-            problem = "an inertia but no mass, give it a mass"
+            raise InputError("the payload has an inertia but no mass, give it a mass")
+        problem = inertia_problem(mass, tensor)
         if problem and tensor.any():
             raise InputError(f"the payload has {problem}")
         load = pin.Inertia(mass, com, tensor)

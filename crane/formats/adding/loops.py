@@ -1,12 +1,14 @@
 """The loops that a description leaves open, put into a machine file."""
 
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from crane.common.errors import CraneError, CraneWarning, InputError, MechanismError
 from crane.common.output import file_name, filling
+from crane.common.packages import giving
 from crane.description import MachineSpec
 from crane.formats.adding.open_loops import Proposal, proposals
 from crane.formats.adding.place import check_free, machine_file
@@ -41,7 +43,12 @@ class AddedLoops:
 
 
 def add_loops(
-    machine: str | Path, *, out: str | Path | None = None, force: bool = False
+    machine: str | Path,
+    *,
+    out: str | Path | None = None,
+    force: bool = False,
+    packages: Sequence[str | Path] = (),
+    arguments: Mapping[str, object] | None = None,
 ) -> AddedLoops:
     """Close the loops that `crane check` proposes, and write the closed machine.
 
@@ -53,6 +60,8 @@ def add_loops(
         out: The machine file to write, its URDFs go to a folder beside of the same name without
             suffix; NAME_closed.yaml in this folder if not given.
         force: Whether files that are there are replaced.
+        packages: As for `load`.
+        arguments: As for `load`.
 
     Returns:
         The loops, the active joints, and the file that was written.
@@ -62,7 +71,7 @@ def add_loops(
         MechanismError: The machine does not close with them.
         OutputError: The files cannot be written, or are there already.
     """
-    loaded, spec = _quietly(machine)
+    loaded, spec = _quietly(machine, packages, arguments)
     found = proposals(spec, loaded.model, loaded.home)
     if not found:
         raise InputError(
@@ -88,11 +97,17 @@ def add_loops(
     return AddedLoops(file, found, tuple(driven), closed.closure.degrees_of_freedom)
 
 
-def _quietly(machine: str | Path) -> tuple[Machine, MachineSpec]:
+def _quietly(
+    machine: str | Path,
+    packages: Sequence[str | Path],
+    arguments: Mapping[str, object] | None,
+) -> tuple[Machine, MachineSpec]:
     """The open machine, whose loops are not worth a warning any more, and as it was read."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
-        return load(machine), read(machine)
+        loaded = load(machine, packages=packages, arguments=arguments)
+        with giving(loaded.packages, loaded.arguments):
+            return loaded, read(machine)
 
 
 def _closed(path: Path, found: tuple[Proposal, ...]) -> Machine:

@@ -17,7 +17,7 @@ from crane.formats.ambiguity import warn_of_assemblies
 from crane.formats.home import warn_of_home
 from crane.machine.assemble import assemble, closed, home_guess
 from crane.machine.between import check_elements
-from crane.machine.masses import check_masses
+from crane.machine.masses import check_masses, with_computable_inertias
 
 _OPEN = 1e-6  # [rad], [machine's size] from which on a loop is said to be open
 
@@ -51,6 +51,7 @@ def check_mechanism(spec: MachineSpec, found: Findings) -> Closure | None:
             return None
         flag(error)
         loops.remove(idle[0])
+    spec, model = with_computable_inertias(spec, model, closure)
     check_masses(spec, model, closure)
     check_elements(spec, closure)
     _warn_of_limits(spec, closure)

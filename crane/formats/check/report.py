@@ -4,18 +4,18 @@ import re
 import shlex
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from crane.closure import Closure
 from crane.common.counted import kind
 from crane.common.errors import CraneWarning
 from crane.common.output import file_name
-from crane.common.packages import giving, package_folders, values_by_name
+from crane.common.packages import given, giving, package_folders, values_by_name
 from crane.description import MachineSpec, driven
 from crane.description.findings import Findings, collecting, recoverable
 from crane.description.floating import floated
-from crane.description.sources import find
+from crane.description.sources import command_words, find
 from crane.formats.adding.open_loops import Proposal, proposals
 from crane.formats.check.circuit import shortage, warn_of_circuit
 from crane.formats.check.mechanism import check_mechanism
@@ -195,7 +195,10 @@ def _check(
     if spec is not None and closure is not None:
         open_loops = proposals(spec, closure.model, closure.home)
     notes = tuple(shortage(spec)) if spec is not None and summary is not None else ()
-    what_next = _next(name, spec, closure, summary, bool(open_loops))
+    called = command_words(name, active, free)
+    if open_loops and summary is not None:  # driven as the closed machine will be
+        called = command_words(name, beside=replace(given(), floating=False))
+    what_next = _next(called, spec, closure, summary, bool(open_loops))
     return Report(tuple(ordered[:_MOST]), summary, full, what_next, open_loops, notes)
 
 
@@ -210,14 +213,13 @@ def _together(alike: list[Finding]) -> str:
 
 
 def _next(
-    name: str | Path,
+    called: str,
     spec: MachineSpec | None,
     closure: Closure | None,
     summary: str | None,
     is_open: bool,
 ) -> str:
-    """What to type next."""
-    called = shlex.quote(str(name))
+    """What to type next, with a machine as `command_words` has it."""
     if spec is None or closure is None or summary is None:
         return f"crane check {called} again, once the errors are mended"
     if is_open:

@@ -1,11 +1,12 @@
 """The section of a machine file on what an identification estimates, `identification`."""
 
+import math
 from typing import Any
 
 from crane.common.errors import InputError
 from crane.description.estimation import Estimation, Known, Numbers
 from crane.description.findings import recoverable
-from crane.formats.machine_file.section import Section
+from crane.formats.machine_file.section import Section, as_float, as_truth
 from crane.machine import Machine
 
 _TERMS = "on, off, a number or a list of numbers"
@@ -51,8 +52,11 @@ def estimation_data(machine: Machine) -> dict[str, Any]:
 def _numbers(section: Section, name: str) -> Numbers | None:
     """() of `on`, None of `off`."""
     value = section.raw(name)
-    if isinstance(value, bool):
-        return () if value else None
+    if (wanted := as_truth(value)) is not None:
+        return () if wanted else None
+    if isinstance(value, str) and not math.isfinite(as_float(value)):
+        what = f"'{name}' of {section.title} is '{value}'"
+        raise section.fail(name, f"{what}, give {_TERMS}")
     return section.numbers(name) if isinstance(value, list) else (section.number(name),)
 
 

@@ -36,9 +36,7 @@ def _friction(joint: str, item: Section) -> Friction:
         stiction=item.number("stiction", 0.0, minimum=0.0),
         stribeck=stribeck,
     )
-    meant = item.raw("drives") if "drives" in item else False
-    if not isinstance(meant, bool):
-        raise item.fail("drives", f"'drives' of friction of '{joint}' is neither true nor false")
+    meant = item.truth("drives", False)
     for kind in ("coulomb", "viscous"):
         mean, offset = getattr(friction, kind), getattr(friction, f"{kind}_offset")
         if abs(offset) > mean and not meant:

@@ -14,6 +14,7 @@ from crane.description.ground import Contact
 from crane.description.sources import find
 from crane.description.spec import (
     LOOP_TYPES,
+    WITHOUT_AXIS,
     Chain,
     Coupling,
     Drive,
@@ -341,6 +342,8 @@ def _loop(section: Section, tree: TreeBuilder, before: Container[str]) -> LoopSp
     axis = None
     with recoverable():
         axis = unit_vector(section.numbers("axis", (0.0, 0.0, 1.0)))
+        if axis is None and kind in WITHOUT_AXIS:
+            axis = (0.0, 0.0, 1.0)
         if axis is None:
             problem = f"the axis of {what} is no direction"
             raise section.fail("axis", f"{problem}, give three numbers, not all zero")

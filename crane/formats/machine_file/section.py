@@ -95,6 +95,7 @@ def _construct_map(loader: Any, node: yaml.MappingNode) -> _Map:
 _Strict.add_constructor("tag:yaml.org,2002:map", _construct_map)
 
 _MISSING: Any = object()
+_TRUTHS = {"on": True, "yes": True, "true": True, "off": False, "no": False, "false": False}
 LARGEST = 2_000_000  # bytes of a file; the reader takes a minute for ten million
 
 
@@ -116,7 +117,7 @@ def _shown(value: Any) -> str:
     return text if len(text) < 60 else f"{text[:60]}..."
 
 
-def _as_float(value: Any) -> float:
+def as_float(value: Any) -> float:
     """What a value is as a number, NaN where it is none; PyYAML reads 2e5 as text."""
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         return math.nan
@@ -124,6 +125,13 @@ def _as_float(value: Any) -> float:
         return float(value)
     except (ValueError, OverflowError):
         return math.nan
+
+
+def as_truth(value: Any) -> bool | None:
+    """What a value is as true or false, None where it is neither; YAML's words may be quoted."""
+    if isinstance(value, str):
+        return _TRUTHS.get(value.strip().lower())
+    return value if isinstance(value, bool) else None
 
 
 def _composed(text: str) -> tuple[Any, yaml.Node | None]:
@@ -314,7 +322,7 @@ class Section:
             return math.nan
 
     def _number(self, key: str, value: Any) -> float:
-        number = _as_float(value)
+        number = as_float(value)
         if math.isfinite(number):
             return number
         hint = "give a number"
@@ -323,6 +331,14 @@ class Section:
         elif isinstance(value, str) and "," in value:
             hint = "give a number with a decimal point"
         raise self.fail(key, f"'{key}' of {self.title} is {_shown(value)}, {hint}")
+
+    def truth(self, key: str, default: bool) -> bool:
+        """True or false, as on and off, in quotes or without."""
+        value = as_truth(self.raw(key)) if key in self._data else default
+        if value is None:
+            shown = _shown(self._data[key])
+            raise self.fail(key, f"'{key}' of {self.title} is {shown}, give true or false")
+        return value
 
     def numbers(self, key: str, default: Any = _MISSING) -> tuple[float, ...]:
         """A list of finite numbers."""

@@ -1,9 +1,7 @@
 """Mass and inertia of links of SDF."""
 
-import math
 import warnings
 
-import numpy as np
 import pinocchio as pin
 from lxml import etree
 
@@ -11,6 +9,7 @@ from crane.common.errors import CraneWarning
 from crane.description.rigid import inertial, placement
 from crane.formats.sdf.frames import Frames
 from crane.formats.sdf.scope import Scope
+from crane.formats.sdf.solids import solid
 from crane.formats.sdf.values import Item
 
 _KEYS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -20,13 +19,14 @@ _WATER = 1000.0  # [kg/m3], the density that SDF takes
 def add_inertial(element: etree._Element, scope: Scope, link: Item, frames: Frames) -> None:
     """The `<inertial>` of a link, whose numbers SDF completes: 1 kg, 1 kg m2.
 
-    With `auto="true"` it is that of its collisions, of one density each.
+    With `auto="true"` it is that of its collisions, of one density each; with a `<mass>` as well,
+    of that mass.
 
     Raises:
         DescriptionError: A number is malformed, or shapes have no volume that is known.
     """
     given = link.only("inertial")
-    if given is not None and given.element.get("auto", "").lower() in ("true", "1"):
+    if given is not None and _is_automatic(given):
         _add_computed(element, scope, link, given, frames)
         return
     if given is None:
@@ -36,6 +36,13 @@ def add_inertial(element: etree._Element, scope: Scope, link: Item, frames: Fram
     tensor = given.only("inertia") or Item(given.xml, etree.Element("inertia"), given.what)
     values = [tensor.number(key, 1.0 if key[1] == key[2] else 0.0) for key in _KEYS]
     _write(element, mass, placement(place), values)
+
+
+def _is_automatic(given: Item) -> bool:
+    """Whether an `<inertial>` says so, or its `<inertia>`, where some write it."""
+    places = (given, given.only("inertia"))
+    said = (place.element.get("auto", "").lower() for place in places if place is not None)
+    return any(word in ("true", "1") for word in said)
 
 
 def warn_of_no_inertial(link: Item) -> None:
@@ -68,31 +75,10 @@ def _add_computed(
     for child in link.element.iterfind("collision"):
         shape = Item(link.xml, child, f"a collision of {link.what}", link.base)
         place = own.actInv(frames.of(scope, shape, link.name))
-        whole += place.act(_solid(shape, shape.number("density", density)))
+        whole += place.act(solid(shape, shape.number("density", density)))
     made = inertial(whole)
     if made is None:
         raise link.xml.fail(given.element, f"{link.what} has no collision to take its mass from")
-    _write(element, made.mass, (made.com, made.rpy), list(made.tensor))
-
-
-def _solid(shape: Item, density: float) -> pin.Inertia:
-    """A body of a shape and a density [kg/m3], about its centre."""
-    geometry = shape.only("geometry")
-    tags = [] if geometry is None else [x.tag for x in geometry.element if isinstance(x.tag, str)]
-    solid = geometry.only(tags[0]) if geometry is not None and tags else None
-    if solid is None or tags[0] not in ("box", "sphere", "cylinder", "ellipsoid"):
-        raise shape.xml.fail(
-            shape.element, f"{shape.what} is no box, sphere, cylinder or ellipsoid, whose volume "
-            "is known: write its <mass> and <inertia> instead of auto"
-        )  # fmt: skip
-    if tags[0] == "box":
-        x, y, z = solid.numbers("size", 3, (1.0, 1.0, 1.0))
-        return pin.Inertia.FromBox(density * x * y * z, x, y, z)
-    if tags[0] == "cylinder":
-        radius, length = solid.number("radius", 1.0), solid.number("length", 1.0)
-        mass = density * math.pi * radius**2 * length
-        return pin.Inertia.FromCylinder(mass, radius, length)
-    radii = solid.numbers("radii", 3, (1.0, 1.0, 1.0))
-    if tags[0] == "sphere":
-        radii = (solid.number("radius", 1.0),) * 3
-    return pin.Inertia.FromEllipsoid(density * 4 / 3 * math.pi * float(np.prod(radii)), *radii)
+    mass = given.number("mass", made.mass)
+    tensor = [x * mass / made.mass for x in made.tensor]
+    _write(element, mass, (made.com, made.rpy), tensor)

@@ -20,7 +20,8 @@ from crane.formats.sdf.values import Item
 WORLD = "::world"  # as no link can be called
 _ONE = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 _TWO = ("universal", "revolute2")
-TYPES = (*_ONE, *_TWO, "fixed", "ball", "screw", "gearbox")
+_NO_AXIS = ("fixed", "ball")
+TYPES = (*_ONE, *_TWO, *_NO_AXIS, "screw", "gearbox")
 
 
 @dataclass(frozen=True)
@@ -150,12 +151,10 @@ class Joints:
         child = joint.text("child")
         in_scope = self._frames.of(scope, joint, "" if ends[1] == WORLD else child)
         place = self._frames.in_top(scope, self._top) * in_scope
-        axes = [
-            self._axis(scope, joint, tag, in_scope)
-            for tag in ("axis", "axis2") if tag == "axis" or kind in (*_TWO, "gearbox")
-        ]  # fmt: skip
+        tags = ("axis", "axis2")[: 2 if kind in (*_TWO, "gearbox") else kind not in _NO_AXIS]
+        axes = [self._axis(scope, joint, tag, in_scope) for tag in tags]
         self._axes[name] = [name]
-        if kind in ("fixed", "ball"):
+        if kind in _NO_AXIS:
             self.edges.append(Edge(name, kind, *ends, place, joint))
         elif kind in _ONE:
             self.edges.append(Edge(name, _ONE[kind], *ends, place, joint, axes[0]))

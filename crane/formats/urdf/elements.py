@@ -4,11 +4,10 @@ import dataclasses
 import math
 import warnings
 
-import numpy as np
 from lxml import etree
 
 from crane.common.errors import CraneWarning
-from crane.description.findings import FollowUpError, flag, recoverable
+from crane.description.findings import FollowUpError, flag, is_strict, recoverable
 from crane.description.inertia import inertia_problem
 from crane.description.spec import Friction
 from crane.description.tree import Inertial, Joint, Limits, Link, limit
@@ -56,14 +55,20 @@ def _read_inertial(xml: XmlFile, what: str, inertial: etree._Element, moved: boo
         raise xml.fail(mass_tag, f"{what} has the mass {mass:g} kg, give a positive one")
     if not all(map(math.isfinite, (mass, *tensor, *com, *rpy))):
         raise FollowUpError(f"{what} has no inertia")
-    xx, xy, xz, yy, yz, zz = tensor
-    if problem := inertia_problem(mass, np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])):
-        error = xml.fail(tensor_tag, f"{what} has {problem}")
-        if moved:
-            raise error
+    found = Inertial(mass, com, rpy, tensor)
+    problem = inertia_problem(mass, found.matrix)
+    if problem is None:
+        return found
+    error = xml.fail(tensor_tag, f"{what} has {problem}")
+    if moved and not problem.formal:
+        raise error
+    if moved and is_strict():
+        flag(error, harmless=True)
+    elif is_strict() or not problem.formal:
         # rigidly attached, it only adds to another body, whose sum is checked later
         warnings.warn(str(error), CraneWarning, stacklevel=2)
-    return Inertial(mass, com, rpy, tensor)
+    doubt = xml.where(tensor_tag) if problem.formal else ""
+    return dataclasses.replace(found, doubt=doubt)
 
 
 def read_joint(xml: XmlFile, name: str, element: etree._Element, ends: tuple[str, str]) -> Joint:

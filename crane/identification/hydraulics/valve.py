@@ -20,7 +20,7 @@ from crane.common.shown import Brief
 from crane.common.threads import on_one_thread
 from crane.identification.estimation import estimators
 from crane.identification.hydraulics.cylinder_signals import channel, parts, speed
-from crane.identification.signals.steady import steady
+from crane.identification.signals.steady import steady_means
 from crane.machine import Machine
 from crane.recordings.recording import Recording
 
@@ -45,6 +45,8 @@ class ValveCurve(Brief):
         signal: Steady samples used (M,) [V].
         speed: Their speeds (M,).
         noise: Standard deviation of the speeds about the curve.
+        ringing: Lowest and highest frequency [Hz] and largest amplitude of speeds that ring while
+            the signal is held, of which means over periods are taken; None where none does.
     """
 
     joint: str
@@ -56,6 +58,7 @@ class ValveCurve(Brief):
     signal: Array
     speed: Array
     noise: float
+    ringing: tuple[float, float, float] | None = None
 
     def derived(self) -> tuple[tuple[str, ...], Array, Array]:
         """What a machine file takes: names, values (5,) and Jacobian (5, 4) of them.
@@ -123,6 +126,13 @@ class ValveCurve(Brief):
         ]
         for (name, (value, low, high)), text in zip(self.table().items(), units, strict=True):
             lines.append(f"{name:<12}{value:>12.5g}   {low:.5g} to {high:.5g} {text}".rstrip())
+        if self.ringing is not None:
+            low, high, size = self.ringing
+            at = f"{low:.3g}" if high < 1.02 * low else f"{low:.3g} to {high:.3g}"
+            told = (
+                f"the speed rings at {at} Hz by up to {size:.3g} {unit}/s while the signal is held"
+            )
+            lines.append(f"{told}: means over its periods are taken")
         return "\n".join(lines) + "\n"
 
 
@@ -132,7 +142,8 @@ def identify_valve(
 ) -> ValveCurve:
     """Dead band and gains of one valve from slow ramps or a staircase of its signal.
 
-    Samples count whose signal and speed hardly changed over the last `settle` seconds. With
+    Samples count whose signal and speed hardly changed over the last `settle` seconds, or, where
+    the speed rings while the signal is held, whose means over its period did. With
     pressures recorded, those that move are left out where the compensator has no margin (supply
     less inlet below the valve's margin), or where the inlet is sucked empty (below half of the
     tank's pressure) since the load runs ahead. The spool's lag moves the edges by lag times rate
@@ -154,7 +165,8 @@ def identify_valve(
     cylinder, valve = parts(machine, joint)
     signal = channel(recording, f"voltage_{joint}", "V")
     v = speed(recording, joint)
-    kept = steady(recording.time, settle, signal, v)
+    means = steady_means(recording.time, settle, signal, v)
+    kept, signal, v = means.kept.copy(), means.signal, means.answer
     fastest = float(np.abs(v).max())
     names = (f"pressure_{joint}_a", f"pressure_{joint}_b", "pressure_supply")
     if valve.margin and all(name in recording.channels for name in names):
@@ -191,6 +203,7 @@ def identify_valve(
         signal=U,
         speed=speeds,
         noise=float(told.noise[0]),
+        ringing=None if means.frequency is None else (*means.frequency, means.amplitude),
     )
 
 

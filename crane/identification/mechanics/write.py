@@ -113,7 +113,7 @@ def check_rewritable(machine: Machine) -> None:
     ):
         raise InputError(
             f"{machine.path.name}: an identified machine needs a machine file or URDF, make "
-            f"one: crane convert {machine.path.name} FOLDER"
+            f"one: crane convert {machine.command} FOLDER"
         )
     if machine.changes:
         raise InputError(
@@ -129,7 +129,7 @@ def _impossible(bodies: Mapping[str, Array]) -> str | None:
             return f"link '{link}' has the negative mass {body[0]:.4g} kg"
         inertia = pin.Inertia.FromDynamicParameters(body)
         if problem := inertia_problem(float(inertia.mass), inertia.inertia):
-            return f"link '{link}' has {problem.rpartition(', ')[0]}"  # without what to do
+            return f"link '{link}' has {problem.what}"
     return None
 
 

@@ -1,5 +1,7 @@
 """Where a motion is steady."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from crane.common.errors import InputError, RecordingError
@@ -7,6 +9,8 @@ from crane.common.samples import Array, as_number
 from crane.identification.signals.motion import low_pass, sampling
 
 _SHARE = 0.02  # of a signal's range, by which it may change
+_PERIODS = 3  # that tell a ringing
+_UNTOLD = 0.5  # share of the squares about a line that one frequency may leave
 
 
 def steady(
@@ -31,6 +35,17 @@ def steady(
         InputError: settle is not above two steps.
         RecordingError: No sample is steady.
     """
+    kept = _hardly_moved(time, settle, *signals, share=share, relative=relative)
+    if not kept.any():
+        raise RecordingError(
+            f"no sample is steady for {settle:g} s, record slower ramps or longer steps"
+        )
+    return kept
+
+
+def _hardly_moved(
+    time: Array, settle: float, *signals: Array, share: float = _SHARE, relative: bool = False
+) -> np.ndarray:
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
     step = sampling(time)
@@ -49,8 +64,102 @@ def steady(
         span = maximum_filter1d(smooth, size, origin=back)
         span -= minimum_filter1d(smooth, size, origin=back)
         kept &= span <= share * (np.abs(smooth) if relative else np.ptp(smooth))
-    if not kept.any():
-        raise RecordingError(
-            f"no sample is steady for {settle:g} s, record slower ramps or longer steps"
-        )
     return kept
+
+
+@dataclass(frozen=True)
+class SteadyMeans:
+    """Steady samples of a signal and its answer, by means over periods where the answer rings.
+
+    Attributes:
+        kept: Mask (N,) of the steady samples.
+        signal: (N,) the signal, or its means over the last period.
+        answer: (N,) the answer likewise.
+        frequency: Lowest and highest of the ringing [Hz], None where nothing rings.
+        amplitude: The largest of the ringing, in the unit of the answer.
+    """
+
+    kept: np.ndarray
+    signal: Array
+    answer: Array
+    frequency: tuple[float, float] | None = None
+    amplitude: float = 0.0
+
+
+def steady_means(time: Array, settle: float, signal: Array, answer: Array) -> SteadyMeans:
+    """Where a signal and what answers to it are steady, or ring about a steady mean.
+
+    Samples that `steady` takes stay as they are. Others count where both have steady means over
+    one period of the ringing, which is sought in each stretch with a steady signal.
+
+    Args:
+        time: Equidistant instants (N,) [s].
+        settle: As for `steady`.
+        signal: (N,) what is held.
+        answer: (N,).
+
+    Raises:
+        InputError: settle is not above two steps.
+        RecordingError: No sample is steady.
+    """
+    plain = _hardly_moved(time, settle, signal, answer)
+    held = _hardly_moved(time, settle, signal)
+    step = sampling(time)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]]).astype(int)))
+    means, found = plain.copy(), []
+    pairs = np.stack([signal, answer])
+    for start, end in edges.reshape(-1, 2).tolist():
+        if plain[start:end].all():
+            continue
+        period, amplitude = _ringing(time[start:end], answer[start:end], settle)
+        if not period or end - start <= round((period + settle) / step):
+            continue
+        part = _means(time[start:end], pairs[:, start:end], period)
+        whole = pairs.copy()  # so that shares are those of the whole range
+        whole[:, start:end] = part
+        new = _hardly_moved(time, settle, *whole)[start:end] & ~plain[start:end]
+        new[: round((period + settle) / step)] = False
+        if new.any():
+            means[start:end] |= new
+            pairs[:, start:end] = np.where(new, part, pairs[:, start:end])
+            found.append((1 / period, amplitude))
+    if not means.any():
+        return SteadyMeans(steady(time, settle, signal, answer), signal, answer)  # raises
+    if not found:
+        return SteadyMeans(means, signal, answer)
+    frequencies, amplitudes = zip(*found, strict=True)
+    ends = min(frequencies), max(frequencies)
+    return SteadyMeans(means, pairs[0], pairs[1], ends, max(amplitudes))
+
+
+def _ringing(time: Array, x: Array, settle: float) -> tuple[float, float]:
+    """Period [s] and amplitude of what a stretch does about a straight line, zeros for nothing."""
+    length = float(time[-1] - time[0])
+    if length < max(_PERIODS * settle, 16 * float(time[1] - time[0])):
+        return 0.0, 0.0
+    late = time >= time[0] + 0.25 * length  # what the step before it set off is over
+    t, x = time[late], x[late]
+    rest = x - np.polynomial.Polynomial.fit(t, x, 1)(t)
+    bare = rest * np.hanning(len(rest))
+    size = 16 * len(bare)  # a line between bins is found to a few thousandths
+    power = np.abs(np.fft.rfft(bare, size)) ** 2
+    at = np.fft.rfftfreq(size, t[1] - t[0])
+    power[(at * (t[-1] - t[0]) < _PERIODS) | (at > 4 / settle)] = 0
+    frequency = float(at[power.argmax()])
+    if not power.any():
+        return 0.0, 0.0
+    angle = 2 * np.pi * frequency * t
+    rows = np.column_stack([np.cos(angle), np.sin(angle)])
+    both = np.linalg.lstsq(rows, rest, rcond=None)[0]
+    if np.sum((rest - rows @ both) ** 2) > _UNTOLD * np.sum(rest**2):
+        return 0.0, 0.0
+    return 1 / frequency, float(np.hypot(*both))
+
+
+def _means(time: Array, rows: Array, period: float) -> Array:
+    """Means (m, N) over the period before each sample, at first over what there is of it."""
+    steps = np.diff(time) * 0.5 * (rows[:, 1:] + rows[:, :-1])
+    whole = np.concatenate([np.zeros((len(rows), 1)), np.cumsum(steps, axis=1)], axis=1)
+    since = np.maximum(time - period, time[0])
+    before = np.stack([np.interp(since, time, row) for row in whole])
+    return np.asarray((whole - before) / np.maximum(time - since, time[1] - time[0]))
