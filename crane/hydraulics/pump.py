@@ -26,12 +26,14 @@ class Pump:
         fed: What it feeds.
         speed: Of the engine over its set speed.
         share: Of its displacement, where that takes time.
+        sensed: What its load-sensing line tells it [Pa], where that takes time.
 
     Attributes:
         flows: Into its line, and out of it past the pump, the relief valve and open centres.
         asked: Share of the displacement that the regulator asks for.
         share: Share that it has.
         share_rate: Its rate, where it takes time.
+        sensed_rate: That of what it senses, likewise.
         shaft: Power that turns the pump [W].
         torque: The same over the speed's share [W].
         heat: What is lost in it beside its slip [W].
@@ -48,11 +50,16 @@ class Pump:
         fed: Sequence[DrivenCylinder],
         speed: Number,
         share: Number | None,
+        sensed: Number | None,
     ):
         self._name, self._supply, self._numbers, self._fed = name, supply, numbers, fed
         self._p, self._tank = pressures[name], pressures[TANK]
         self.flows: list[Flow] = []
         before = self._bypass()
+        self.sensed_rate: list[Number] = []
+        if sensed is not None:
+            self.sensed_rate = [(load - sensed) * numbers["per_sensing"]]
+            load = sensed
         self.asked = self._regulated(load, limiting, before)
         self.share = self.asked if share is None else share
         self.share_rate: list[Number] = []
