@@ -388,9 +388,7 @@ class Circuit:
             if self.hydraulics.oil.air > 0:
                 free = common["air"] * soft / common["oil"]
                 soft = soft + bubbles(common, free, pressures[name])
-            rates.append(net / soft)
-            if name in pumps:
-                rates += [*pumps[name].share_rate, *pumps[name].sensed_rate]
+            rates += [net / soft, *(pumps[name].rates if name in pumps else ())]
             stored[name], oil = pressures[name] * net, oil + net
         for name, gas in gases.items():
             net = books.nets[name]

@@ -32,8 +32,7 @@ class Pump:
         flows: Into its line, and out of it past the pump, the relief valve and open centres.
         asked: Share of the displacement that the regulator asks for.
         share: Share that it has.
-        share_rate: Its rate, where it takes time.
-        sensed_rate: That of what it senses, likewise.
+        rates: Those of the share and of what it senses, where they take time.
         shaft: Power that turns the pump [W].
         torque: The same over the speed's share [W].
         heat: What is lost in it beside its slip [W].
@@ -56,15 +55,14 @@ class Pump:
         self._p, self._tank = pressures[name], pressures[TANK]
         self.flows: list[Flow] = []
         before = self._bypass()
-        self.sensed_rate: list[Number] = []
+        late: list[Number] = []
         if sensed is not None:
-            self.sensed_rate = [(load - sensed) * numbers["per_sensing"]]
-            load = sensed
+            late, load = [(load - sensed) * numbers["per_sensing"]], sensed
         self.asked = self._regulated(load, limiting, before)
         self.share = self.asked if share is None else share
-        self.share_rate: list[Number] = []
+        self.rates = late
         if share is not None:
-            self.share_rate = [(self.asked - share) * numbers["per_response"]]
+            self.rates = [(self.asked - share) * numbers["per_response"], *late]
         above = self._p - self._tank
         delivered = self.share * numbers["flow"] * speed
         self.flows.append(Flow(TANK, name, delivered, "pump"))
