@@ -94,6 +94,7 @@ if TYPE_CHECKING:
         working_range,
     )
     from crane.recordings import Recording
+    from crane.recordings.limit_cycles import limit_cycles
     from crane.recordings.measured import read_measured
     from crane.simulation import InterruptedRun, simulate
     from crane.simulation.batch import Batch, simulate_batch
@@ -156,6 +157,7 @@ _HOMES = {
     "crane.ratings": "Breakout Capacity Rule ToolForce Torques WorkingRange breakout capacity "
     "tool_force torques working_range",
     "crane.recordings": "Recording",
+    "crane.recordings.limit_cycles": "limit_cycles",
     "crane.recordings.measured": "read_measured",
     "crane.simulation": "InterruptedRun simulate",
     "crane.simulation.batch": "Batch simulate_batch",
@@ -183,7 +185,8 @@ __all__ = [
     "add_cylinder", "add_loops", "breakout", "calibrate", "capacity", "casadi_function", "check",
     "cross_validate", "design", "excite", "excite_valves", "fastest", "gradient",
     "identification_report", "identify", "identify_cylinder_friction", "identify_orifices",
-    "identify_payload", "identify_valve", "joystick", "linear_models", "linearize", "load",
+    "identify_payload", "identify_valve", "joystick", "limit_cycles", "linear_models", "linearize",
+    "load",
     "point_to_point", "polynomial", "power_account", "read_measured", "read_path", "replay",
     "report", "retimed", "robot_description", "sensitivities", "simulate", "simulate_batch",
     "sketch", "sketch_circuit",

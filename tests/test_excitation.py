@@ -302,3 +302,21 @@ def test_command(tmp_path):
         result = typed(*arguments, *extra)
         assert result.returncode == 2 and result.stdout == ""
         assert len(result.stderr.splitlines()) == 1 and text in result.stderr
+
+
+def test_all_cylinders_together_take_what_the_pump_gives():
+    """Of velocities of rod and piston sides at instants that the search has not seen."""
+    machine = crane.load("patu655")
+    found = crane.excite(machine, period=8.0, harmonics=2, seed=1)
+    hydraulics = machine.hydraulics
+    _, v, _ = found.trajectory(np.linspace(0, 24, 7013))
+    drawn = np.zeros(len(v))
+    for joint, cylinder in hydraulics.cylinders.items():
+        i, valve = machine.active.index(joint), hydraulics.valves[joint]
+        taken = np.where(v[:, i] > 0, cylinder.area_a, -cylinder.area_b) * v[:, i]
+        assert taken.max() <= max(valve.c1, valve.c4) * np.sqrt(valve.margin)
+        drawn += taken
+    assert drawn.max() <= hydraulics.supply.flow
+    assert drawn.max() == pytest.approx(
+        0.95 * found.used[4].max() * hydraulics.supply.flow, rel=0.01
+    )

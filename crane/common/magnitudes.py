@@ -92,6 +92,7 @@ USUAL = {
     "power": Magnitude("W", 1e3, 2e6, 8e4, ((("kW", 1e3), ("hp", 745.7)),)),
     "drag": Magnitude("W", 20.0, 1e5, 2e3, ((("kW", 1e3),),)),
     "response": Magnitude("s", 1e-3, 5.0, 0.1, ((("ms", 1e-3),),)),
+    "sensing": Magnitude("", 0.0, 20.0, 0.3),
     "delay": Magnitude("s", 1e-4, 1.0, 0.02, ((("ms", 1e-3),),)),
     "slip": _LEAK,
     "air": Magnitude("", 0.0, 0.2, 0.01, ((("percent", 0.01),),)),

@@ -34,6 +34,11 @@ class Anything(tuple[Any, ...]):
     def __bool__(self) -> bool:
         return True
 
+    def __add__(self, _: object) -> "Anything":
+        return self
+
+    __radd__ = __add__
+
 
 class Findings:
     """What a check has found so far.

@@ -38,7 +38,7 @@ BALANCES = {
 _COMMON = ("oil", "hose", "steel", "vapour", "gas_power", "air", "pump", "tank")
 _PUMP = (
     "pressure", "flow", "per_droop", "line", "margin", "standby", "signal", "throttle", "least",
-    "per_response", "power", "relief", "relief_gain", "slip", "friction", "drag",
+    "per_response", "per_sensing", "power", "relief", "relief_gain", "slip", "friction", "drag",
 )  # fmt: skip
 _ENGINE = ("speed", "torque", "per_droop", "droop", "per_inertia")
 _ACCUMULATOR = ("line", "volume", "precharge", "exponent", "per_time")
@@ -86,9 +86,9 @@ class Circuit:
 
     States per cylinder: those of the pressures in A and B, the compression of the series spring
     if there is one, per spool the signal behind its play, position and rate if these are;
-    then per pump that of its line's pressure if its flow is limited, and of its displacement if
-    that takes time; per line and accumulator that of its pressure, and the oil in it if heat
-    leaves its gas; the engine's speed; then `BALANCES`.
+    then per pump that of its line's pressure if its flow is limited, of its displacement and of
+    the load that it senses if these take time; per line and accumulator that of its pressure, and
+    the oil in it if heat leaves its gas; the engine's speed; then `BALANCES`.
 
     The state of a pressure is p - p_vapour where that is positive. Below zero the chamber holds
     vapour at p_vapour, of the volume that the state's size times a constant compressibility says:
@@ -171,6 +171,8 @@ class Circuit:
             pressure(name, pump.volume)
             if pump.response > 0:
                 add(f"share_{name}", "", 1e-7)
+            if pump.sensing_time > 0:
+                add(f"load_{name}", "Pa", _PRESSURE)
         for name, line in hydraulics.lines.items():
             pressure(name, line.volume)
         for name, item in hydraulics.accumulators.items():
@@ -202,7 +204,8 @@ class Circuit:
         return [
             pump.pressure, pump.flow, 1.0 / pump.droop, pump.volume / modulus,
             pump.margin, pump.standby, pump.signal, pump.throttle,
-            pump.least, 1.0 / pump.response if pump.response else 0.0, pump.power, pump.relief,
+            pump.least, 1.0 / pump.response if pump.response else 0.0,
+            1.0 / pump.sensing_time if pump.sensing_time else 0.0, pump.power, pump.relief,
             pump.relief_gain, pump.slip, pump.friction, pump.drag,
         ]  # fmt: skip
 
@@ -256,6 +259,8 @@ class Circuit:
             state[self._place[f"pressure_{name}"]] = pump.rest(tank) - vapour
             if pump.response > 0:
                 state[self._place[f"share_{name}"]] = pump.least
+            if pump.sensing_time > 0:
+                state[self._place[f"load_{name}"]] = tank
         for name, line in self.hydraulics.lines.items():
             state[self._place[f"pressure_{name}"]] = (line.pressure or tank) - vapour
         for name, item in self.hydraulics.accumulators.items():
@@ -369,7 +374,7 @@ class Circuit:
             name: Pump(
                 name, pump, pump_rows[name], pressures, loads.get(name, tank),
                 self._limiting(name, pressures, pump_rows), fed[name], speed,
-                own.get(f"share_{name}"),
+                own.get(f"share_{name}"), own.get(f"load_{name}"),
             )
             for name, pump in self.pumps.items()
         }  # fmt: skip
@@ -383,7 +388,7 @@ class Circuit:
             if self.hydraulics.oil.air > 0:
                 free = common["air"] * soft / common["oil"]
                 soft = soft + bubbles(common, free, pressures[name])
-            rates += [net / soft, *(pumps[name].share_rate if name in pumps else ())]
+            rates += [net / soft, *(pumps[name].rates if name in pumps else ())]
             stored[name], oil = pressures[name] * net, oil + net
         for name, gas in gases.items():
             net = books.nets[name]

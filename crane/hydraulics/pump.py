@@ -26,12 +26,13 @@ class Pump:
         fed: What it feeds.
         speed: Of the engine over its set speed.
         share: Of its displacement, where that takes time.
+        sensed: What its load-sensing line tells it [Pa], where that takes time.
 
     Attributes:
         flows: Into its line, and out of it past the pump, the relief valve and open centres.
         asked: Share of the displacement that the regulator asks for.
         share: Share that it has.
-        share_rate: Its rate, where it takes time.
+        rates: Those of the share and of what it senses, where they take time.
         shaft: Power that turns the pump [W].
         torque: The same over the speed's share [W].
         heat: What is lost in it beside its slip [W].
@@ -48,16 +49,20 @@ class Pump:
         fed: Sequence[DrivenCylinder],
         speed: Number,
         share: Number | None,
+        sensed: Number | None,
     ):
         self._name, self._supply, self._numbers, self._fed = name, supply, numbers, fed
         self._p, self._tank = pressures[name], pressures[TANK]
         self.flows: list[Flow] = []
         before = self._bypass()
+        late: list[Number] = []
+        if sensed is not None:
+            late, load = [(load - sensed) * numbers["per_sensing"]], sensed
         self.asked = self._regulated(load, limiting, before)
         self.share = self.asked if share is None else share
-        self.share_rate: list[Number] = []
+        self.rates = late
         if share is not None:
-            self.share_rate = [(self.asked - share) * numbers["per_response"]]
+            self.rates = [(self.asked - share) * numbers["per_response"], *late]
         above = self._p - self._tank
         delivered = self.share * numbers["flow"] * speed
         self.flows.append(Flow(TANK, name, delivered, "pump"))

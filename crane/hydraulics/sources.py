@@ -22,8 +22,9 @@ class Supply:
         positive:      sum of |y| over its valves, times their `demand`,
         fixed:         1,
 
-    with p_LS the highest load of its open valves and p_N the pressure before the throttle that
-    ends its open centre, which stands there even if no valve has one. It is at least `least`, and
+    with p_LS the highest load of its open valves, as the load-sensing line tells it, and p_N the
+    pressure before the throttle that ends its open centre, which stands there even if no valve has
+    one. It is at least `least`, and
     at most (pressure - p) / droop (cut-off; not of a fixed pump) and power / (flow (p - p_tank)),
     a hyperbola with its corner at power / flow; where `summed` names pumps, of their mean p,
     weighted by their power: together they take up no more than the sum of it, whatever their
@@ -42,6 +43,8 @@ class Supply:
         throttle: Coefficient of the throttle behind the open centre [m3/(s Pa^0.5)]; 0 for none.
         least: Share of its flow that it always gives.
         response: Time constant of the displacement [s]; 0 for none.
+        sensing: Time constant of the load-sensing line, behind its damping orifice, over
+            `response`; 0 for none.
         power: The most that it takes up at the set speed [W]; 0 for no limit.
         relief: Pressure above the vacuum at which the line is relieved to the tank [Pa]; 0 for no
             relief valve.
@@ -64,6 +67,7 @@ class Supply:
     throttle: float = 0.0
     least: float = 0.0
     response: float = 0.0
+    sensing: float = 0.3
     power: float = 0.0
     relief: float = 0.0
     relief_gain: float = above(1.0e-8)
@@ -118,6 +122,11 @@ class Supply:
                 f"relief of the supply is {self.relief:g} Pa, not above the tank's "
                 f"{self.tank:g} Pa, so that it would never close{hint}",
             )
+
+    @property
+    def sensing_time(self) -> float:
+        """Time constant of its load-sensing line [s]; 0 for none."""
+        return self.sensing * self.response if self.control == "load-sensing" else 0.0
 
     def rest(self, tank: float) -> float:
         """Pressure of its line while nothing moves, over a tank's [Pa]."""

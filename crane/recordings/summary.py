@@ -10,6 +10,7 @@ from crane.common.samples import Array
 from crane.common.scratch import in_blocks, release
 from crane.common.units import quantity
 from crane.description.sources import unchanged
+from crane.recordings.limit_cycles import ringing
 from crane.recordings.recording import FORCE_UNITS, REFERENCE, Recording
 
 SUPPORT = "support_"
@@ -57,6 +58,7 @@ class Summary:
         tip_rms_error: Root of the time average of its square [m]; None without one.
         stability: How far it is from tipping, in words, "" where that is not recorded.
         balance: How far the balance of energy is off, see `energy_balance`, likewise.
+        ringing: Pressures that swing without decaying, see `limit_cycles`, likewise.
     """
 
     duration: float
@@ -65,6 +67,7 @@ class Summary:
     tip_rms_error: float | None
     stability: str = ""
     balance: str = ""
+    ringing: str = ""
 
     def to_markdown(self) -> str:
         """A table with one row per joint, in degrees and millimetres."""
@@ -99,7 +102,8 @@ class Summary:
             rows.append(("tip", "", "", "", "", *errors))
         table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
         balance = f"energy balance: {self.balance}" if self.balance else ""
-        return "\n".join([table, *(f"{text}\n" for text in (self.stability, balance) if text)])
+        told = (self.stability, self.ringing, balance)
+        return "\n".join([table, *(f"{text}\n" for text in told if text)])
 
 
 def tipping(recording: Recording) -> str:
@@ -190,6 +194,7 @@ def summarize(recording: Recording) -> Summary:
         tip_rms_error=None if distance is None else rms(time, distance),
         stability=_stability(recording),
         balance=_balance(recording),
+        ringing=ringing(recording),
     )
 
 

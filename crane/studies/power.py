@@ -362,8 +362,8 @@ class _Columns:
             return self._there["engine_speed"] / engine.speed
         if word == "pressure":
             return self._there[name] - oil.vapour_pressure
-        if name.startswith("spool_rate_"):
-            return np.zeros_like(self._recording.time)  # no flow depends on it
+        if name.startswith("spool_rate_") or word == "load":
+            return np.zeros_like(self._recording.time)  # no flow depends on it, given the share
         return self._spool(owner) if word in ("play", "spool") else self._there[name]
 
     def signals(self) -> list[Array]:

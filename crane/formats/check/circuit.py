@@ -1,5 +1,6 @@
 """What of a hydraulic circuit can be and is hardly meant: its connections, and what pumps give."""
 
+import math
 import warnings
 from collections.abc import Iterator, Sequence
 
@@ -7,6 +8,7 @@ from crane.common.errors import CraneWarning
 from crane.description import MachineSpec
 from crane.hydraulics.components import Hydraulics, Valve
 from crane.hydraulics.connections import drained, fed, joined, wanted
+from crane.hydraulics.load_sensing import driven_swings, least_sensing
 from crane.hydraulics.sources import MAIN, TANK
 
 _SHORT = 1.01  # times a pump's flow from which on its valves take more than it has
@@ -105,6 +107,15 @@ def _odd_pumps(hydraulics: Hydraulics) -> Iterator[tuple[str, str]]:
                 key,
                 f"relief of '{name}' is {supply.relief:g} Pa, not above its pressure of "
                 f"{supply.pressure:g} Pa: what the pump gives flows off there, give a higher one",
+            )
+        modulus = hydraulics.oil.bulk_modulus
+        if valves and (band := driven_swings(supply, modulus)):
+            least = math.ceil(100.0 * least_sensing(supply, modulus)) / 100.0
+            yield (
+                key,
+                f"'{name}' follows its loads so closely that it drives those that swing at "
+                f"{band[0]:.3g} to {band[1]:.3g} Hz: pressures may ring on, give 'sensing' "
+                f"{least:g} or more (damping of the load-sensing line)",
             )
         # what it gives until its displacement is back, in a line that no way leads out of
         rise = supply.flow * supply.response * hydraulics.oil.bulk_modulus / supply.volume

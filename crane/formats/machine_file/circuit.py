@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 from crane.common.errors import CraneWarning, InputError, known
 from crane.common.magnitudes import doubt
-from crane.description.findings import FollowUpError, flag, recoverable
+from crane.description.findings import Anything, FollowUpError, flag, recoverable
 from crane.formats.machine_file.curves import read_curve
 from crane.formats.machine_file.section import Section
 from crane.formats.machine_file.tree_builder import TreeBuilder
@@ -85,18 +85,18 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
         section.spread(key, section.listed(key))
     for key in ("valves", "control"):
         section.spread(key, [*section.listed("cylinders"), *section.listed("motors")])
-    named: dict[str, list[str]] = {"cylinder": [], "valve": [], "control": []}
+    driving = section.judged("cylinders") + section.judged("motors")
+    gains = section.judged("control")
+    named = {"cylinder": driving, "valve": section.judged("valves")}
     cylinders: dict[str, Cylinder] = {}
     keys: tuple[str, ...] = (*number_names(Cylinder), *HOLDING, *_BORED)
     for joint, item in section.mappings("cylinders", "cylinder of", *keys):
-        named["cylinder"].append(joint)
         with recoverable():
             check_active(joint, item, active)
             cylinders[joint] = _cylinder(joint, item, tree)
             _check_relief(item, supply, cylinders[joint])
     keys = tuple(MOTOR)
     for joint, item in section.mappings("motors", "motor of", *keys):
-        named["cylinder"].append(joint)
         with recoverable():
             check_active(joint, item, active)
             if joint in cylinders:
@@ -107,27 +107,27 @@ def read_hydraulics(top: Section, tree: TreeBuilder, active: tuple[str, ...]) ->
     given = (*number_names(Valve), "type", "flow", "meter_out", "supply", "return_a", "return_b",
              "priority", "spool_b")  # fmt: skip
     for joint, item in section.mappings("valves", "valve of", *given):
-        named["valve"].append(joint)
         with recoverable():
             check_active(joint, item, active)
             valves[joint] = _valve(item, joint)
-    driven = (*named["cylinder"], *named["valve"])
+    driven = (*driving, *named["valve"])
     for joint, what in itertools.product(driven, ("cylinder", "valve")):
         if joint not in named[what]:
             flag(section.fail(f"{what}s", f"'{joint}' has no {what}, add it"))
     control: dict[str, PDGains] = {}
     for joint, item in section.mappings("control", "control of", *number_names(PDGains)):
-        named["control"].append(joint)
         with recoverable():
             check_active(joint, item, active)
             control[joint] = part_of(item, PDGains)
-    if named["control"] and set(named["control"]) != set(named["cylinder"]):
-        listed = ", ".join(named["cylinder"])
+    known_all = not isinstance(gains + driving, Anything)
+    if known_all and gains and {*gains} != {*driving}:
+        listed = ", ".join(driving)
         flag(section.fail("control", f"give gains of all of {listed}, or none"))
-    if not named["cylinder"]:
+    if not driving:
         flag(section.fail(None, "'hydraulics' drives nothing, give cylinders and valves"))
     others = read_network(section)
-    if supply is None or not cylinders.keys() == valves.keys() <= set(active):
+    lack = control and not cylinders.keys() <= control.keys()
+    if supply is None or lack or not cylinders.keys() == valves.keys() <= set(active):
         raise FollowUpError("the circuit is not complete")
     order = [joint for joint in active if joint in cylinders]
     made = checked(
@@ -261,7 +261,7 @@ def _cylinder(joint: str, item: Section, tree: TreeBuilder) -> Cylinder:
 def _areas(item: Section, turning: bool) -> dict[str, Any]:
     """How many cylinders there are side by side, and their areas if bore and rod are given."""
     count = item.number("count", 1.0)
-    if count != int(count) or count < 1:
+    if not count.is_integer() or count < 1:
         raise item.fail("count", f"'count' of {item.title} is {count:g}, give a whole number")
     if turning:
         for key in (*_BORED, "tube"):

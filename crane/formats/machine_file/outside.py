@@ -37,7 +37,8 @@ def _frame(item: Section, tree: TreeBuilder) -> str:
     frame = item.text("frame")
     tree.check_link(frame, item.where("frame"), "the frame")
     if not tree.moves(frame):
-        raise item.fail("frame", f"'{frame}' does not move, a load on it does nothing")
+        problem = f"'{frame}' does not move, a load on it does nothing"
+        raise tree.unknown(str(item.fail("frame", problem)))
     return frame
 
 

@@ -30,9 +30,13 @@ def phased_task(
             "duration", f"task '{name}' ends when its last phase does, leave 'duration' out"
         )
     limits = {x: (joint.limits.lower, joint.limits.upper) for x, joint in tree.joints.items()}
-    before, phases = home | start, []
-    keys = () if isinstance(valves, Anything) else ("name", "levers", "until", "within")
-    for section in item.sections("phases", "phase", *keys):
+    before = {  # what is beyond the limits is told at home
+        joint: at
+        for joint, at in (home | start).items()
+        if joint not in limits or limits[joint][0] <= at <= limits[joint][1]
+    }
+    phases: list[Phase] = []
+    for section in item.sections("phases", "phase", "name", "levers", "until", "within"):
         with recoverable():
             phase = _phase(section)
             if not isinstance(valves, Anything):

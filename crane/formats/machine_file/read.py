@@ -196,9 +196,8 @@ def _supports(
     for link in names:
         tree.check_link(link, top.where("supports"), "the support")
         if tree.moves(link) and link not in contacts:
-            raise top.fail(
-                "supports", f"support '{link}' moves, name links of the base or those of contacts"
-            )
+            problem = f"support '{link}' moves, name links of the base or those of contacts"
+            raise tree.unknown(str(top.fail("supports", problem)))
     if names and len(names) < 3:
         raise top.fail("supports", f"{len(names)} supports make no area, name three or more")
     return names
@@ -252,7 +251,8 @@ def _tip(top: Section, tree: TreeBuilder) -> str | None:
     with recoverable(harmless=True):
         tree.check_link(tip, top.where("tip"), "the tip frame")
         if not tree.moves(tip):
-            raise top.fail("tip", f"the tip frame '{tip}' does not move, choose another")
+            problem = f"the tip frame '{tip}' does not move, choose another"
+            raise tree.unknown(str(top.fail("tip", problem)))
     return tip
 
 

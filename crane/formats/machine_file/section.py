@@ -12,7 +12,7 @@ import yaml
 
 from crane.common.errors import DescriptionError, known
 from crane.common.inputs import content
-from crane.description.findings import flag, recoverable
+from crane.description.findings import Anything, flag, recoverable
 from crane.description.sources import bundled
 
 ALL = "all"  # an item whose keys hold for all beside it
@@ -368,7 +368,7 @@ class Section:
         """A list of different names."""
         value = self._list(key, "a list such as [q1, q2]")
         for item in value:
-            if not isinstance(item, str):
+            if not isinstance(item, str) or not item:
                 raise self.fail(
                     key, f"'{key}' lists {_shown(item)}, which is not a name, quote it"
                 )
@@ -452,10 +452,19 @@ class Section:
                         own.put(common, word)
                 outer[name], outer.places[name] = own, outer.places.get(name, place)
 
-    def listed(self, key: str) -> list[str]:
+    def listed(self, key: str) -> tuple[str, ...]:
         """Names in a mapping, none where there is none."""
         outer = self._data.get(key)
-        return [name for name in outer if name != ALL] if isinstance(outer, _Map) else []
+        return tuple(name for name in outer if name != ALL) if isinstance(outer, _Map) else ()
+
+    def judged(self, key: str) -> tuple[str, ...]:
+        """Names in a mapping of mappings, whatever they are where that or an item is refused."""
+        outer = self._data.get(key)
+        if outer is None:
+            return ()
+        names = self.listed(key)
+        right = isinstance(outer, _Map) and all(isinstance(outer[x], _Map) for x in names)
+        return names if right else Anything()
 
     def _filled(self, key: str, title: str, keys: Iterable[str]) -> "Section":
         """A mapping that is not empty."""
@@ -465,7 +474,7 @@ class Section:
         return section
 
     def sections(self, key: str, title: str, *keys: str) -> "Iterator[Section]":
-        """The mappings of a list, with these keys; none where the list is absent."""
+        """The mappings of a list, with these keys, any if none; none where it is absent."""
         value = self._take(key, None)
         if value is None:
             return
@@ -481,7 +490,8 @@ class Section:
                 self.complete = False
                 continue
             section = Section(item, _titled(title, item))
-            section.only(*keys)
+            if keys:
+                section.only(*keys)
             yield section
 
     def __iter__(self) -> Iterator[str]:

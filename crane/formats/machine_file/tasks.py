@@ -35,6 +35,10 @@ def read_tasks(
         with recoverable():
             spaces = {"tip": TIP, "active": active, "joystick": valves}
             phased = "phases" in item
+            levers = "phases" if phased else "joystick"
+            if levers in item and not valves:
+                problem = f"task '{name}' moves levers of no valve, add 'hydraulics'"
+                raise item.fail(levers, problem)
             if phased:
                 task = phased_task(name, item, _start(name, item, active), valves, tree, home)
             else:
@@ -102,7 +106,9 @@ def _via_task(
         if key in item:
             raise item.fail(key, f"task '{name}' {why}, leave '{key}' out")
     active, attitude = spaces["active"], tuple(x for group in ATTITUDES for x in group)
-    every = (*active, *(x for x in (*TIP, *attitude) if x not in active))
+    every = active
+    if not isinstance(active, Anything):
+        every = (*active, *(x for x in (*TIP, *attitude) if x not in active))
     title = f"via point of task '{name}'"
     keys = () if isinstance(active, Anything) else ("time", "rates", *every)
     points = list(item.sections("via", title, *keys))
@@ -147,7 +153,8 @@ def _via(point: Section, title: str, every: tuple[str, ...]) -> Via:
     rates = point.section("rates", f"'rates' of a {title}")
     if rates is None:
         return Via(time, given)
-    rates.only(*(x for x in every if x in given))
+    if not isinstance(every, Anything):
+        rates.only(*(x for x in every if x in given))
     return Via(time, given, {x: rates.number(x) for x in rates})
 
 

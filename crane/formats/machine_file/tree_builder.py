@@ -91,7 +91,8 @@ class TreeBuilder:
         if chain.parent not in self.links:
             raise self.unknown(
                 f"{chain.where}: chain '{chain.name}' hangs from '{chain.parent}', no frame "
-                f"of an earlier chain, {known(self.links, chain.parent)}"
+                f"of an earlier chain, {known(self.links, chain.parent)}",
+                chain.parent,
             )
         joint = chain.attached(urdf.root)
         if (earlier := self._same(joint)) is not None:
@@ -99,9 +100,10 @@ class TreeBuilder:
         self._enter(joint)
         self._body[urdf.root] = self._body.get(chain.parent, urdf.root)
 
-    def unknown(self, message: str) -> CraneError:
-        """The error about a name that is not there, unless a chain is not, either."""
-        return DescriptionError(message) if self.complete else FollowUpError(message)
+    def unknown(self, message: str, name: str = "?") -> CraneError:
+        """The error about a name, unless a chain is not there or the name has been refused."""
+        told = not self.complete or not name
+        return FollowUpError(message) if told else DescriptionError(message)
 
     def _attach(self, urdf: Urdf) -> None:
         """Find out which links of a chain make one body."""
@@ -120,12 +122,14 @@ class TreeBuilder:
         if joint in self._every:
             problem = f"{where}: joint '{joint}' is fixed, name a moving one"
             raise DescriptionError(problem) if self.joints else FollowUpError(problem)
-        raise self.unknown(f"{where}: joint '{joint}' is unknown, {known(self.joints, joint)}")
+        problem = f"{where}: joint '{joint}' is unknown, {known(self.joints, joint)}"
+        raise self.unknown(problem, joint)
 
     def check_link(self, link: str, where: str, what: str) -> None:
         """Raise for a link that does not exist, called `what`."""
         if link not in self.links:
-            raise self.unknown(f"{where}: {what} '{link}' is unknown, {known(self.links, link)}")
+            problem = f"{where}: {what} '{link}' is unknown, {known(self.links, link)}"
+            raise self.unknown(problem, link)
 
     def joint(self, section: Section) -> str:
         """The joint that a section names."""

@@ -50,7 +50,7 @@ class Excitation(Brief):
         before: What the first random reference within the limits would tell.
         after: What this one will tell.
         limits: That it keeps.
-        used: (4, n) share of them that it uses, by `QUANTITIES`.
+        used: (5, n) share of them that it uses, by `QUANTITIES`.
         noise: (n,) of the forces [N], [N m].
         criterion: It is best in.
         seed: Of the random references.

@@ -11,7 +11,7 @@ from crane.identification.mechanics.base import strokes
 from crane.identification.mechanics.term import Samples
 from crane.machine import Machine
 
-QUANTITIES = ("stroke", "velocity", "acceleration", "force")
+QUANTITIES = ("stroke", "velocity", "acceleration", "force", "flow")
 _GEAR = 5.0  # times as fast as at home, passive joints near the edge of the assembly branch
 
 
@@ -25,6 +25,9 @@ class Limits:
         velocity: (n,).
         acceleration: (n,).
         force: (n,) [N], [N m].
+        flow: (n,) of the pump that feeds a joint, for all that it feeds [m3/s].
+        areas: (2, n, n) areas of A and B of joint j where one pump feeds i and j, else 0 [m2],
+            [m3/rad]: the pump of i gives the sum over j of max(A_ij v_j, -B_ij v_j).
     """
 
     middle: Array
@@ -32,21 +35,25 @@ class Limits:
     velocity: Array
     acceleration: Array
     force: Array
+    flow: Array
+    areas: Array
 
     @property
     def all(self) -> Array:
-        """(4, n) by `QUANTITIES`, of strokes their half lengths."""
-        return np.stack([self.half, self.velocity, self.acceleration, self.force])
+        """(5, n) by `QUANTITIES`, of strokes their half lengths."""
+        return np.stack([self.half, self.velocity, self.acceleration, self.force, self.flow])
 
     def shares(self, q_a: Array, v_a: Array, a_a: Array, tau: Array) -> Array:
-        """What of the limits a motion uses, 1 at a limit, (..., 4, n) as in `QUANTITIES`."""
-        return np.abs(np.stack([q_a - self.middle, v_a, a_a, tau], axis=-2)) / self.all
+        """What of the limits a motion uses, 1 at a limit, (..., 5, n) as in `QUANTITIES`."""
+        out, back = self.areas
+        drawn = np.maximum(v_a, 0.0) @ out.T + np.maximum(-v_a, 0.0) @ back.T
+        return np.abs(np.stack([q_a - self.middle, v_a, a_a, tau, drawn], axis=-2)) / self.all
 
 
 def limits(
     machine: Machine, acceleration: Mapping[str, float] | None = None, margin: float = 0.05
 ) -> Limits:
-    """Limits of the active joints, strokes, velocities and forces as in the URDF.
+    """Limits of the active joints: strokes, velocities and forces as in the URDF, flow of pumps.
 
     A joint without end keeps within 1 rad (1 m) of home. Accelerations need no limit of their
     own: one below velocity V with harmonics up to K w is below K w V (Bernstein).
@@ -63,19 +70,47 @@ def limits(
         raise InputError(f"the margin is {margin:g}, give a share from 0 to below 1")
     columns = machine.closure.active
     lower, upper = strokes(machine)
+    velocity, flow, areas = _fed(machine)
     found = Limits(
         (lower + upper) / 2,
         (upper - lower) / 2 * (1 - margin),
-        machine.model.velocityLimit[columns] * (1 - margin),
+        np.minimum(machine.model.velocityLimit[columns], velocity) * (1 - margin),
         by_joint(machine, acceleration, "acceleration", np.full(len(columns), np.inf))
         * (1 - margin),
         machine.model.effortLimit[columns] * (1 - margin),
+        flow * (1 - margin),
+        areas,
     )
     for what, values in zip(QUANTITIES, found.all, strict=True):
         for joint, value in zip(machine.active, values, strict=True):
             if not value > 0:
                 raise InputError(f"the {what} limit of '{joint}' is 0, give one above")
     return found
+
+
+def _fed(machine: Machine) -> tuple[Array, Array, Array]:
+    """The fastest that valve and pump let each joint move alone, and `Limits.flow`, `.areas`.
+
+    A valve that keeps a flow gives c sqrt(margin) at most, any valve what its pump has.
+    """
+    n = len(machine.active)
+    velocity, flow, areas = np.full(n, np.inf), np.full(n, np.inf), np.zeros((2, n, n))
+    hydraulics = machine.hydraulics
+    if hydraulics is None:
+        return velocity, flow, areas
+    column = {joint: machine.active.index(joint) for joint in hydraulics.joints}
+    for joint, i in column.items():
+        valve, cylinder = hydraulics.valves[joint], hydraulics.cylinders[joint]
+        pump = hydraulics.sources[valve.supply]
+        flow[i] = pump.flow or np.inf
+        for edge, area in ((valve.c1, cylinder.area_a), (valve.c4, cylinder.area_b)):
+            most = edge * np.sqrt(valve.margin) if valve.margin else np.inf
+            velocity[i] = min(velocity[i], most / area, flow[i] / area)
+        for other, j in column.items():
+            if pump.flow and hydraulics.valves[other].supply == valve.supply:
+                beside = hydraulics.cylinders[other]
+                areas[:, i, j] = beside.area_a, beside.area_b
+    return velocity, flow, areas
 
 
 def by_joint(

@@ -207,7 +207,7 @@ class Search:
         return min(fitted, key=lambda x: float(self.rate(x[None])[0][0]), default=start)
 
     def used(self, trajectory: Fourier) -> Array:
-        """Largest share of every limit over a whole trajectory, (4, n) as in `QUANTITIES`."""
+        """Largest share of every limit over a whole trajectory, (5, n) as in `QUANTITIES`."""
 
         def shares(times: Array) -> Array:
             q, v, a = trajectory(times)

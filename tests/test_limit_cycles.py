@@ -1,0 +1,180 @@
+"""Oscillations that do not decay: found in samples, told of runs, foretold of load sensing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hydraulic_rig import rig
+from scipy.integrate import solve_ivp
+
+import crane
+from crane.hydraulics.load_sensing import driven_swings, least_sensing
+from crane.hydraulics.sources import Supply
+from crane.recordings.limit_cycles import limit_cycles, ringing, sustained
+from crane.recordings.summary import summarize
+
+TIME = np.arange(0.0, 10.0, 2e-3)
+SENSING = {
+    "control": "load-sensing", "pressure": 20e6, "flow": 2e-3, "margin": 1.2e6, "standby": 2.5e6,
+    "response": 0.1, "relief": 22e6,
+}  # fmt: skip
+VALVE = {"type": "compensated", "flow": 2e-3, "margin": 2e6, "bandwidth": 31.4, "dead_band": 0.1}
+MODULUS = 1.2e9  # of the rig's oil [Pa]
+
+
+def lifted(folder, mass=3000.0, level=0.8, duration=4.0, **supply):
+    machine = rig(folder, valve=VALVE, mass=mass, supply=SENSING | supply)
+    lever = crane.Signals(machine, [0.0, 0.1, 0.3, duration], {"x": [0.0, 0.0, level, level]})
+    return machine, crane.simulate(machine, lever, duration=duration, step=1e-3)
+
+
+@pytest.mark.parametrize(("frequency", "amplitude"), [(0.9, 3e6), (7.0, 2e6), (40.0, 5e5)])
+def test_a_sine_on_a_drift_is_found(frequency, amplitude):
+    found = sustained(TIME, 1e7 + 1e5 * TIME + amplitude * np.sin(6.3 * frequency * TIME), 1e5)
+    assert found.frequency == pytest.approx(6.3 * frequency / (2 * np.pi), rel=1e-2)
+    assert found.amplitude == pytest.approx(amplitude, rel=0.05)
+    assert found.start < 1.0 and found.end > 8.8
+
+
+@pytest.mark.parametrize("mu", [0.1, 1.0])
+def test_the_cycle_of_van_der_pol(mu):
+    """Of amplitude 2 whatever mu is, from far inside; period 2 pi (1 + mu^2 / 16) to 1 percent."""
+    time = np.arange(0.0, 400.0, 0.05)
+    run = solve_ivp(lambda t, y: [y[1], mu * (1 - y[0] ** 2) * y[1] - y[0]], (0, 400), [0.01, 0.0],
+                    t_eval=time, rtol=1e-8)  # fmt: skip
+    found = sustained(time, run.y[0], 0.1)
+    assert found.amplitude == pytest.approx(2.0, rel=0.02)
+    assert found.frequency == pytest.approx(1 / (2 * np.pi * (1 + mu**2 / 16)), rel=0.012)
+
+
+@pytest.mark.parametrize("damping", [0.005, 0.02, 0.1])
+def test_what_decays_is_none(damping):
+    w = 2 * np.pi * 7.0
+    swing = 2e6 * np.exp(-damping * w * TIME) * np.sin(w * TIME)
+    assert sustained(TIME, 1e7 + swing, 1e5) is None
+
+
+def test_noise_steps_and_ramps_are_none():
+    rng = np.random.default_rng(3)
+    for values in (
+        2e5 * rng.standard_normal(len(TIME)), np.cumsum(1e5 * rng.standard_normal(len(TIME))),
+        1e6 * np.floor(TIME), 1e6 * TIME, np.zeros(len(TIME)),
+    ):  # fmt: skip
+        assert sustained(TIME, 1e7 + values, 1e5) is None
+
+
+@pytest.mark.parametrize("harmonic", [1, 2, 3])
+def test_what_is_commanded_is_none(harmonic):
+    swing, command = np.sin(2 * np.pi * 3 * harmonic * TIME), np.sin(2 * np.pi * 3 * TIME)
+    assert sustained(TIME, 2e6 * swing, 1e5, [command]) is None
+    assert sustained(TIME, 2e6 * swing, 1e5, [TIME, np.ones_like(TIME)]) is not None
+
+
+def test_load_sensing_without_damping_rings_and_is_told(tmp_path):
+    machine, run = lifted(tmp_path, sensing=0.0)
+    largest = limit_cycles(run)[0]
+    assert largest.channel == "pressure_supply"
+    # independent of how it is found: the spectrum of the same second
+    part = slice(600, 1600)
+    left = run["pressure_supply"][part]
+    left = left - np.polyval(np.polyfit(run.time[part], left, 2), run.time[part])
+    lines = np.abs(np.fft.rfft(left * np.hanning(len(left)), 16 * len(left)))
+    peak = np.fft.rfftfreq(16 * len(left), 1e-3)[lines.argmax()]
+    assert largest.frequency == pytest.approx(peak, rel=0.06) and 10 < peak < 15
+    assert largest.amplitude == pytest.approx(np.ptp(left) / 2, rel=0.25) and np.ptp(left) > 3e6
+    assert "pressures ring" in summarize(run).to_markdown()
+    report = crane.check(machine.path)
+    (told,) = [one.what for one in report.findings if "'sensing'" in one.what]
+    assert "0 to 39 Hz" in told and "0.08 or more" in told and report.status == 1
+
+
+@pytest.mark.parametrize("changes", [{}, {"margin": 2.4e6}, {"droop": 1e6}, {"volume": 5e-3}])
+@pytest.mark.parametrize("mass", [3000.0, 10000.0])
+def test_load_sensing_as_it_is_by_default_is_quiet(tmp_path, mass, changes):
+    machine, run = lifted(tmp_path, mass, **changes)
+    assert ringing(run) == "" and "ring" not in summarize(run).to_markdown()
+    assert not crane.check(machine.path).findings
+
+
+def test_peak_forces_are_smaller_without_the_cycle(tmp_path):
+    peaks = []
+    for sensing in (0.0, 0.3):
+        (folder := tmp_path / f"{sensing}").mkdir()
+        _, run = lifted(folder, 10000.0, margin=2.4e6, sensing=sensing)
+        moving = run.time > 0.5
+        peaks.append(np.abs(run.tau[moving]).max())
+    assert peaks[0] > 1.1 * peaks[1]
+
+
+def supplies(count=40):
+    rng = np.random.default_rng(11)
+    for _ in range(count):
+        droop, volume = 10 ** rng.uniform(4.5, 6.5), 10 ** rng.uniform(-4, -2)
+        yield Supply(
+            20e6, flow=10 ** rng.uniform(-4, -2), droop=droop, volume=volume, margin=2e6,
+            response=10 ** rng.uniform(-2, 0), control="load-sensing",
+            sensing=rng.choice([0.0, 10 ** rng.uniform(-2.5, 0.5)]),
+        )  # fmt: skip
+
+
+def test_driven_swings_are_where_the_admittance_is_active():
+    """By the transfer function itself, over openings of all sizes."""
+    s = 2j * np.pi * np.logspace(-3, 3, 4001)
+    for supply in supplies():
+        a, late, b = 1 / supply.response, supply.sensing_time, MODULUS / supply.volume
+        square = b * supply.flow * a / supply.droop
+        g = np.logspace(-16, -6, 40)[:, None] * supply.volume / MODULUS * 1e9
+        flow = -g * (s * (s + a) + square * late * s / (1 + late * s))
+        flow = flow / (s * s + (a + b * g) * s + square + a * b * g)
+        active = (flow.real > 1e-9 * np.abs(flow)).any(axis=0)
+        band = driven_swings(supply, MODULUS)
+        if band is None:
+            assert not active.any()
+            continue
+        found = np.abs(s[active]) / (2 * np.pi)
+        if len(found) < 3:  # narrower than the frequencies that are tried
+            continue
+        assert found.max() == pytest.approx(min(band[1], 1e3), rel=0.02)
+        assert found.min() == pytest.approx(max(band[0], 1e-3), rel=0.02)
+
+
+def test_no_load_swings_up_from_the_least_sensing_on():
+    """Eigenvalues of pump, valve and a mass on a cylinder, whatever they are; some do below it."""
+    rng, grown = np.random.default_rng(5), 0
+    for supply in supplies(60):
+        least = least_sensing(supply, MODULUS)
+        for share in (0.02, 1.01):
+            some = replace(supply, sensing=max(share * least, 1e-6))
+            for _ in range(20):
+                stiff, area = MODULUS / 10 ** rng.uniform(-4, -2), 10 ** rng.uniform(-3, -1.5)
+                mass, g = 10 ** rng.uniform(2, 5), 10 ** rng.uniform(-12, -8)
+                a, b, late = 1 / some.response, MODULUS / some.volume, some.sensing_time
+                system = np.array([  # share, sensed, supply [1e6 Pa], load, speed
+                    [-a, a * 1e6 / some.droop, -a * 1e6 / some.droop, 0, 0],
+                    [0, -1 / late, 0, 1 / late, 0],
+                    [b * some.flow * 1e-6, 0, -b * g, b * g, 0],
+                    [0, 0, stiff * g, -stiff * g, -stiff * area * 1e-6],
+                    [0, 0, 0, area * 1e6 / mass, 0],
+                ])  # fmt: skip
+                growth = np.linalg.eigvals(system).real.max()
+                scale = np.abs(np.linalg.eigvals(system)).max()
+                if share > 1:
+                    assert growth < 1e-9 * scale
+                grown += share < 1 and growth > 1e-6 * scale
+    assert grown > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "task"), [
+    ("excavator_ls", "dig"), ("excavator_ls", "load_truck"), ("excavator_two_pumps", "dig"),
+    ("excavator_two_pumps", "load_truck"), ("patu655_ls", "stir"), ("excavator", "dig"),
+    ("patu655", "stir"),
+])  # fmt: skip
+@pytest.mark.parametrize("droop", [None, 2e5, 1e6])
+def test_bundled_machines_do_not_ring(name, task, droop):
+    changes = {"supply.droop": droop} if droop else {}
+    machine = crane.load(name, changes=changes)
+    loaded = machine.under(*machine.tasks[task].loads)
+    duration = machine.tasks[task].duration or None
+    run = crane.simulate(loaded, crane.joystick(loaded, task), duration=duration, step=5e-3)
+    assert ringing(run) == ""
