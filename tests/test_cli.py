@@ -261,8 +261,9 @@ def test_an_interrupted_run_leaves_what_it_has(tmp_path):
     recording = crane.Recording.from_csv(out / "recording.csv")
     last = recording.time[-1]
     assert 20 < last < 40 and line.startswith(f"interrupted at t = {last:g} s")
-    assert recording.task == f"free motion (cut at {last:g} s of 40 s)"
-    assert "cut at" in (out / "summary.md").read_text().splitlines()[0]
+    assert recording.task == "free motion"
+    assert recording.stopped == f"at t = {last:g} s of 40 s: interrupted"
+    assert f"stopped at {last:.4g} s" in (out / "summary.md").read_text().splitlines()[0]
     whole = crane.simulate(machine, duration=0.5)
     np.testing.assert_allclose(recording.q[: len(whole.time)], whole.q, rtol=0, atol=1e-12)
 

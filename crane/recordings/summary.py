@@ -57,6 +57,7 @@ class Summary:
         tip_rms_error: Root of the time average of its square [m]; None without one.
         stability: How far it is from tipping, in words, "" where that is not recorded.
         balance: How far the balance of energy is off, see `energy_balance`, likewise.
+        stopped: When and why it ended before its time, "" if it did not.
     """
 
     duration: float
@@ -65,9 +66,10 @@ class Summary:
     tip_rms_error: float | None
     stability: str = ""
     balance: str = ""
+    stopped: str = ""
 
     def to_markdown(self) -> str:
-        """A table with one row per joint, in degrees and millimetres."""
+        """A table with one row per joint, in degrees and millimetres, and what is to be said."""
         head = (
             "joint",
             "range",
@@ -99,7 +101,9 @@ class Summary:
             rows.append(("tip", "", "", "", "", *errors))
         table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
         balance = f"energy balance: {self.balance}" if self.balance else ""
-        return "\n".join([table, *(f"{text}\n" for text in (self.stability, balance) if text)])
+        end = f"**Stopped {self.stopped}**\n\n" if self.stopped else ""
+        below = (f"{text}\n" for text in (self.stability, balance) if text)
+        return end + "\n".join([table, *below])
 
 
 def tipping(recording: Recording) -> str:
@@ -157,6 +161,17 @@ def subject(recording: Recording) -> str:
     return recording.machine_name or Path(unchanged(recording.machine)).stem
 
 
+def label(recording: Recording) -> str:
+    """What a recording shows: its task, and until when where it was stopped."""
+    until = f"(stopped at {recording.time[-1]:.4g} s)" if recording.stopped else ""
+    return f"{recording.task} {until}".strip()
+
+
+def heading(recording: Recording) -> str:
+    """What its results are headed with."""
+    return title(subject(recording), label(recording))
+
+
 def summarize(recording: Recording) -> Summary:
     """Ranges, peaks, RMS values and tracking errors of a recording.
 
@@ -190,6 +205,7 @@ def summarize(recording: Recording) -> Summary:
         tip_rms_error=None if distance is None else rms(time, distance),
         stability=_stability(recording),
         balance=_balance(recording),
+        stopped=recording.stopped,
     )
 
 
