@@ -477,7 +477,10 @@ REFUSED = {
         "lift), choose other points",
     ),
     "no machine file": ({"out": "d.urdf"}, "d.urdf: a machine file is written, let its name end"),
-    "no folder": ({"out": "missing/d.yaml"}, "missing/d.yaml: there is no folder missing, create"),
+    "file as a folder": (
+        {"out": "digger.urdf/d.yaml"},
+        "digger.urdf: is a file, give the name of a folder",
+    ),
 }  # fmt: skip
 
 

@@ -305,6 +305,28 @@ def test_simulate_writes_recording_and_summary(free_run):
     assert "| X1 |" in result.stdout
 
 
+def test_results_go_to_a_folder_called_as_the_command(tmp_path):
+    machine = Path(__file__).parent / "data" / "slider_crank.yaml"
+    command = "simulate", machine, "--duration", "0.01"
+    assert "written to simulate; see it with" in typed(*command, cwd=tmp_path).stdout
+    assert (tmp_path / "simulate" / "summary.md").is_file()
+    assert "simulate: is not empty" in one_error(typed(*command, cwd=tmp_path))
+    assert typed("working-range", "excavator", "--frame", "bucket", cwd=tmp_path).returncode == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["simulate", "working_range"]
+
+
+def test_folders_are_made_where_files_are_written(tmp_path):
+    machine = Path(__file__).parent / "data" / "slider_crank.yaml"
+    for command in (
+        ("convert", machine, "a/b/x.urdf"), ("convert", machine, "c/x.xml"),
+        ("convert", machine, "d/e"), ("sketch", machine, "--out", "f/x.png"),
+    ):  # fmt: skip
+        done = typed(*command, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    assert all((tmp_path / x).is_file() for x in ("a/b/x.urdf", "c/x.xml", "f/x.png"))
+    crane.load(tmp_path / "a" / "b" / "x.urdf")
+
+
 def test_simulate_a_task(tmp_path):
     result = typed(
         "simulate", "mini_forwarder", "--task", "lift", "--duration", "0.01",
@@ -391,7 +413,8 @@ def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
         (["info"], "Missing argument 'MACHINE'"),
         (["info", "mini_forwardr"], "did you mean 'mini_forwarder'?"),
         (["check", "nothing.yaml"], "nothing.yaml: no such file"),
-        (["simulate", "mini_forwarder"], "Missing option '--out'"),
+        (["simulate", "mini_forwarder"], "name a --task (loading, return, lift)"),
+        (["study", "mini_forwarder"], "Missing option '--vary'"),
         (["simulate", "mini_forwarder", "--out", "x"], "name a --task (loading, return, lift)"),
         (
             ["simulate", "mini_forwarder", "--out", "x", "--task", "lft"],
@@ -409,7 +432,10 @@ def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
         (["plot", "nowhere"], "nowhere: no such file"),
         (["plot", "."], "no recording.csv in this folder"),
         (["view", "nowhere.csv"], "nowhere.csv: no such file"),
-        (["view", "mini_forwarder", "--no-open", "--out", "no/folder.html"], "no/folder.html"),
+        (
+            ["convert", "mini_forwarder", "/dev/null/x.urdf"],
+            "/dev/null: is a file, give the name of a folder",
+        ),
     ],
 )
 def test_errors_are_one_line_and_write_nothing(arguments, text, tmp_path):

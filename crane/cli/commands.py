@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from crane.cli.shared import (
+    BY_COMMAND,
     Active,
     Argument,
     Columns,
@@ -175,7 +176,7 @@ def plot(
 
 
 @app.command()
-def demo(out: Out = Path("demo-output"), force: Force = False) -> None:
+def demo(out: Out = BY_COMMAND, force: Force = False) -> None:
     """Simulate the three published trajectories of the reduced-scale forwarder."""
     from crane.cli.demo import run_demo
     from crane.cli.runs import FIGURE, PAGE, check_folder

@@ -11,6 +11,7 @@ import typer
 
 from crane.cli.loads import Load, loads_of
 from crane.cli.shared import (
+    BY_COMMAND,
     INTERRUPTED,
     Active,
     Argument,
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 @app.command()
 def simulate(
     machine: MachineName,
-    out: Out,
+    out: Out = BY_COMMAND,
     task: Annotated[str | None, typer.Option(help="A task of the machine.")] = None,
     controller: Annotated[
         str | None,
