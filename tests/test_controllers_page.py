@@ -42,7 +42,7 @@ def test_the_page_does_what_it_says(page):
 
 
 def test_the_program_of_a_control_unit_holds_its_signals(page):
-    """From the recorded state alone: each period's signal is the program's at its first instant."""
+    """A period's signal is what the program says of the recorded state at its first instant."""
     run, crane_, lift = page["raised"], page["log_crane"], page["lift"]
     assert run["X_lift"][0] < 0.15 and run["X_lift"][-1] == pytest.approx(0.2, abs=2e-3)
     assert run.controller == "Sampled" and run.time[1] == pytest.approx(1e-3)
@@ -61,7 +61,7 @@ def test_the_program_of_a_control_unit_holds_its_signals(page):
     for i, name in enumerate(page["spools"]):
         held = np.repeat(np.array(wanted)[:, i], 10)
         np.testing.assert_allclose(run[f"voltage_{name}"][:-1], held, rtol=0, atol=1e-6)
-    assert (pressures[:, lift, 0] > 180e5).any()
+    assert (pressures[:, lift, 0] > 80e5).any()
 
 
 def test_errors_of_three_controllers_are_the_page_s(page):
