@@ -92,6 +92,49 @@ def test_info_says_what_the_machine_is():
     assert re.search(r"^  driven ", result.stdout, re.M) is None  # free ones are among them
 
 
+def listed(*words):
+    """Kind and name of each line, and what is said of it."""
+    done = typed("info", "patu655", *words)
+    assert (done.returncode, done.stderr) == (0, "")
+    rows = (line.split(maxsplit=2) for line in done.stdout.splitlines())
+    return {(row[0], row[1]): " ".join(row[2:]) for row in rows}
+
+
+def test_info_finds_names_by_a_part_of_them(mini):
+    machine = crane.load("patu655")
+    found = listed("--names", "X_LIFT")
+    assert found == listed("x_lift")  # with the option or without, in any case
+    names = {kind: [name for of, name in found if of == kind] for kind, _ in found}
+    assert list(names) == ["joint", "column", "parameter"]
+    assert names["joint"] == ["X_lift"]
+    assert found["column", "pressure_X_lift_a"] == "Pa"
+    assert found["column", "voltage_X_lift"] == "V"
+    area = machine.hydraulics.cylinders["X_lift"].area_a
+    assert found["parameter", "cylinder.X_lift.area_a"] == f"{area:.6g} m2"
+    # each is one that the machine has
+    eyes = listed("--names", "lift_*e*")
+    assert {kind for kind, _ in eyes} == {"joint", "frame", "column", "parameter"}
+    for kind, name in eyes:
+        assert name.startswith("lift_"), name
+        if kind == "frame":
+            machine.frame(name)
+        elif kind == "joint":
+            machine.column(name)
+    assert not [name for kind, name in listed("barrel") if name.startswith("voltage_")]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "hint"),
+    [
+        ("X_lft", "did you mean 'X_lift' or"), ("X_lift?", "did you mean 'X_lift' or"),
+        ("bulk_modulos", "did you mean 'oil.bulk_modulus' or"), ("zqjk", "leave it out for all par"),
+    ],
+)  # fmt: skip
+def test_names_that_nothing_has_are_answered_by_the_nearest(pattern, hint):
+    line = one_error(typed("info", "patu655", "--names", pattern))
+    assert f"nothing is called like '{pattern}', {hint}" in line
+
+
 def test_info_has_the_whole_home_posture_and_the_path(mini):
     lines = typed("info", "mini_forwarder").stdout.splitlines()
     told = dict(
