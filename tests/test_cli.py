@@ -127,7 +127,7 @@ def test_info_finds_names_by_a_part_of_them(mini):
     ("pattern", "hint"),
     [
         ("X_lft", "did you mean 'X_lift' or"), ("X_lift?", "did you mean 'X_lift' or"),
-        ("bulk_modulos", "did you mean 'oil.bulk_modulus' or"), ("zqjk", "leave it out for all par"),
+        ("bulk_modulos", "did you mean 'oil.bulk_modulus' or"), ("zqjk", "leave it out for"),
     ],
 )  # fmt: skip
 def test_names_that_nothing_has_are_answered_by_the_nearest(pattern, hint):
