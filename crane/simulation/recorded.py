@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -76,38 +75,37 @@ def stopped(
         task: Name to put into the recording.
         until: When it should have ended [s].
     """
-    stop = run.stop
-    assert stop is not None
-    interrupted = isinstance(stop, KeyboardInterrupt)
-    sound = _bounded(run.array)
-    if not sound:
+    assert (stop := run.stop) is not None
+    if not len(run.time):
         return stop
-    run = run.until(sound, stop)
+    largest = scratch.in_blocks(
+        lambda part: np.abs(run.array[part]).max(axis=1, keepdims=True), len(run.time)
+    )
+    # what has exploded is no motion
+    run = run.until(int(np.append(largest < LARGEST, False).argmin()), stop)
+    if not len(run.time):
+        return stop
+    interrupted = isinstance(stop, KeyboardInterrupt)
     text = one_line(" ".join(str(stop).split())) or type(stop).__name__
     if interrupted:
         text = f"at t = {run.time[-1]:g} s of {until:g} s: interrupted"
     elif not text.startswith("at t = "):
         text = f"at t = {run.time[-1]:g} s: {text}"
     with suppress(CraneError):  # channels that cannot be computed there hide no error
-        recording = replace(recorded(machine, control, run.time, run.rows, task), stopped=text)
+        recording = recorded(machine, control, run.time, run.rows, task, text)
         if interrupted:
             return InterruptedRun(recording)
         stop.recording = recording  # type: ignore[attr-defined]
     return stop
 
 
-def _bounded(array: Array) -> int:
-    """How many of the rows (N, .) come before one that has exploded."""
-    for start in range(0, len(array), scratch.AT_ONCE):
-        wild = ~(np.abs(array[start : start + scratch.AT_ONCE]) < LARGEST).all(axis=1)
-        scratch.release()
-        if wild.any():
-            return start + int(np.argmax(wild))
-    return len(array)
-
-
 def recorded(
-    machine: Machine, control: Controller, time: Array, rows: Parts, task: str
+    machine: Machine,
+    control: Controller,
+    time: Array,
+    rows: Parts,
+    task: str,
+    stopped: str = "",
 ) -> Recording:
     """What the integration left as a recording.
 
@@ -117,6 +115,7 @@ def recorded(
         time: (N,) [s].
         rows: See `integrate`.
         task: Name to put into it.
+        stopped: When and why it ended before its time.
     """
     active = machine.closure.active
     q_a = scratch.in_blocks(lambda part: rows.q[part][:, active], len(time))
@@ -139,6 +138,7 @@ def recorded(
         ideal=True,
         free=machine.free,
         machine_name=shortened(machine.name).strip(),
+        stopped=stopped,
         copy=False,
     )
 
