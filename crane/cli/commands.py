@@ -95,12 +95,15 @@ def info(
     """Show what a machine consists of, or what of it has a name."""
     if parameters or pattern is not None:
         from crane.common.packages import giving, package_folders
+        from crane.description import parameters as parameters_of
         from crane.description.names import matching, names_of
         from crane.formats import read
 
         with giving(package_folders(packages or ()), arguments(argument)):
-            names = names_of(read(machine))
-        every = {"parameter": names["parameter"]} if pattern is None else matching(names, pattern)
+            spec = read(machine)
+        every = {"parameter": {name: f"{x:.6g}" for name, x in parameters_of(spec).items()}}
+        if pattern is not None:
+            every = matching(names_of(spec), pattern)
         width = max((len(name) for values in every.values() for name in values), default=0)
         for kind, values in every.items():
             before = f"{kind:<11}" * (pattern is not None)

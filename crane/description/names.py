@@ -1,6 +1,5 @@
 """What a machine's joints, frames, columns and parameters are called, and which are meant."""
 
-from collections.abc import Mapping
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 
@@ -12,7 +11,7 @@ from crane.description.spec import MachineSpec
 
 _LISTED, _NEAR = 5, 0.6  # names that are proposed at most, and their likeness at least
 
-Names = Mapping[str, Mapping[str, str]]  # what is to be said of a thing by its kind and name
+Names = dict[str, dict[str, str]]  # what is to be said of a thing by its kind and name
 
 
 def names_of(spec: MachineSpec) -> Names:
