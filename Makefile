@@ -7,6 +7,8 @@ READY := .venv/.installed
 READY_DEV := .venv/.installed-dev
 READY_DOCS := .venv/.installed-docs
 INSTALL := $(BIN)/python -m pip install --disable-pip-version-check
+# tests as pytest rewrites them are kept, whatever the shell says: collecting them again takes a third
+export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:

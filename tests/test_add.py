@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from excavators import FOLD, LIFT, planar, spatial
+from oracles import SliderCrank
 from typed import typed
 
 import crane
@@ -306,6 +307,55 @@ def test_home_goes_where_the_cylinder_fits(tmp_path):
     assert line.startswith("'lift' moves from -1.1 to 0.2 rad, and a cylinder of 1.8 to 2.4 m dri")
 
 
+def test_its_ends_are_where_the_stroke_ends(tmp_path):
+    """By the law of cosines about the pin, at radii a and b: L^2 = a^2 + b^2 - 2 a b cos."""
+    a, b = np.hypot(0.6, 0.8), np.hypot(1.9, 0.3)
+    added, told = told_by(crane.add_cylinder, planar(tmp_path), out=tmp_path / "d.yaml", **LIFT)
+
+    def lift(length):
+        angle = np.arccos((a**2 + b**2 - length**2) / (2 * a * b))
+        return angle - np.arctan2(0.8, 0.6) - np.arctan2(0.3, 1.9)
+
+    def lever(value):
+        angle = value + np.arctan2(0.8, 0.6) + np.arctan2(0.3, 1.9)
+        return a * b * np.sin(angle) / np.sqrt(a**2 + b**2 - 2 * a * b * np.cos(angle))
+
+    low, high = added.covered
+    assert low == pytest.approx(-lift(2.2), abs=1e-8) and high == 0.2
+    assert added.strokes[0] == 0.9 and 0 < added.strokes[1] < 0.9
+    values = -np.linspace(low, high, 20001)
+    assert added.lever == pytest.approx((lever(values).min(), lever(values).max()), rel=1e-5)
+    assert f"drives it from {low:.4g} to {high:.4g}: its eyes" in told[0]
+
+
+@pytest.mark.parametrize("along", [0.2, 0.35])
+def test_its_ends_are_dead_centres_where_these_come_first(tmp_path, along):
+    """Where both eyes and the pin between them lie on a line."""
+    eyes = ["house:0.6,0,1.5", f"boom:-1.0,0,{along}"]
+    steel = {"bore": 0.1, "rod": 0.07, "stroke": 1.2, "dead_length": 1.35}
+    added, told = told_by(
+        crane.add_cylinder, planar(tmp_path), eyes, out=tmp_path / "d.yaml", **steel
+    )
+    dead = -np.arctan2(along, 1.0)
+    assert dead in [pytest.approx(x, abs=1e-6) for x in added.covered]
+    assert f"with a dead centre at {dead:.4g}: its" in told[0]
+
+
+def test_its_ends_are_where_the_machine_closes(tmp_path):
+    """Of a slider that its crank and rod let go no farther than they reach in line."""
+    data = Path(__file__).parent / "data"
+    text = (data / "slider_crank.yaml").read_text().replace("urdf: ", f"urdf: {data}/")
+    (tmp_path / "s.yaml").write_text(text.replace("active: [theta]", "active: [s]"))
+    reach = np.sqrt((SliderCrank.r + SliderCrank.rod) ** 2 - SliderCrank.e**2)
+    eyes = ["base:-0.5,0,0.3", "slider"]
+    steel = {"bore": 0.05, "rod": 0.03, "stroke": 0.3, "dead_length": 0.65}
+    added = crane.add_cylinder(tmp_path / "s.yaml", eyes, out=tmp_path / "d.yaml", **steel)
+    assert added.covered == pytest.approx((0.15, reach), abs=1e-6)
+    assert added.limits[1] == pytest.approx(reach, abs=1e-8)
+    assert added.strokes == pytest.approx((0.0, reach - 0.15), abs=1e-6)
+    assert added.lever == pytest.approx((1.0, 1.0))
+
+
 def test_strokes_beyond_a_dead_centre_are_told(tmp_path):
     given = FOLD | {"between": ["boom:1.5,0,0.9", "arm:-0.6,0,0.1"], "stroke": 1.2}
     given["dead_length"] = 1.64
@@ -397,7 +447,20 @@ REFUSED = {
         "'boom:1.9,0,0.3', 1.503 to 2.629 m apart with lift at -1.1 to 0.2 rad: choose another "
         "stroke, dead length or eyes",
     ),
-    "stroke in millimetres": ({"stroke": 900}, "a cylinder of 900.4 to 1800 m does not fit betw"),
+    "stroke in millimetres": (
+        {"stroke": 900},
+        "the stroke is 900 m: looks like mm, write 900e-3 or cm, write 900e-2",
+    ),
+    "bore in millimetres": ({"bore": 100}, "the bore is 100 m: looks like mm, write 100e-3"),
+    "dead length beyond all": (
+        {"dead_length": 1e7},
+        "the dead length is 1e+07 m, longer than any part of a machine, give metres",
+    ),
+    "machine in millimetres": (
+        {"between": ["house:600,0,700", "boom:1900,0,300"]},
+        "'house:600,0,700' and 'boom:1900,0,300' are 1003 m apart and more, farther than a "
+        "machine is large: look at its units with crane check, lengths are metres",
+    ),
     "no stroke": ({"stroke": 0}, "the stroke is 0 m, it must be positive"),
     "short dead length": (
         {"dead_length": 0.9},
@@ -414,7 +477,10 @@ REFUSED = {
         "lift), choose other points",
     ),
     "no machine file": ({"out": "d.urdf"}, "d.urdf: a machine file is written, let its name end"),
-    "no folder": ({"out": "missing/d.yaml"}, "missing/d.yaml: there is no folder missing, create"),
+    "file as a folder": (
+        {"out": "digger.urdf/d.yaml"},
+        "digger.urdf: is a file, give the name of a folder",
+    ),
 }  # fmt: skip
 
 
@@ -437,7 +503,7 @@ def test_the_command(tmp_path):
     done = typed("add", "cylinder", "digger.urdf", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
-        "hoist drives lift from -0.5215 to 0.2 rad, with 0.8984 to 0.2035 m of its stroke, "
+        "hoist drives lift from -0.5233 to 0.2 rad, with 0.9 to 0.2035 m of its stroke, "
         "lever arm 0.874 to 1 m",
         "barrel 41.86 kg, rod 39.4 kg of steel, without oil",
         "written to digger_hoist.yaml",

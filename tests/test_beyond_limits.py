@@ -219,6 +219,10 @@ def test_a_piston_that_leaves_its_cylinder_ends_the_run(unstopped):
         before = crane.simulate(unstopped, command, duration=round(float(told[1]) - 2e-3, 3))
     cylinder = unstopped.hydraulics.cylinders["X_lift"]
     room = cylinder.hose_b / cylinder.area_b
+    part = caught.value.recording
+    assert part.stopped == str(caught.value) and part["X_lift"][-1] - 0.535 < room
+    assert part.time[-1] == pytest.approx(float(told[1]) - 1e-3)
+    np.testing.assert_array_equal(part.q[: len(before.time)], before.q)
     assert room - 0.02 < before["X_lift"][-1] - 0.535 < room
 
 

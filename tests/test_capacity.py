@@ -223,7 +223,8 @@ def test_what_cannot_be_is_said_in_one_line(excavator, given, said):
     [
         ("excavator", "bucket", ["boom_lift.y", "arm.mass", "cylinder.X_boom.area_a"],
          {"rule": "iso10567", "slope": 0.05, "slews": [0.0, 1.0]}),
-        ("patu655", None, ["lift_eye.x", "supply.pressure"], {}),
+        pytest.param("patu655", None, ["lift_eye.x", "supply.pressure"], {},
+                     marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_slopes_are_those_of_charts_beside(name, frame, numbers, given):

@@ -141,8 +141,18 @@ def test_what_cannot_be_is_refused(changes, message):
     ("name", "alike", "other"),
     [
         ("mini_forwarder", {"link3.mass": 0.25, "friction.X1.coulomb": 20.0}, {"link3_G.x": 0.1}),
-        ("patu655", {"payload.mass": 300.0, "valve.X_lift.c1": 6e-7}, {"X_lift.upper": 0.4}),
-        ("excavator", {"oil.bulk_modulus": 1e9, "bucket.mass": 400.0}, {"slew.lower": -1.0}),
+        pytest.param(
+            "patu655",
+            {"payload.mass": 300.0, "valve.X_lift.c1": 6e-7},
+            {"X_lift.upper": 0.4},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            "excavator",
+            {"oil.bulk_modulus": 1e9, "bucket.mass": 400.0},
+            {"slew.lower": -1.0},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_numbers_that_leave_the_loops_alone_do_not_close_them_again(

@@ -92,6 +92,49 @@ def test_info_says_what_the_machine_is():
     assert re.search(r"^  driven ", result.stdout, re.M) is None  # free ones are among them
 
 
+def listed(*words):
+    """Kind and name of each line, and what is said of it."""
+    done = typed("info", "patu655", *words)
+    assert (done.returncode, done.stderr) == (0, "")
+    rows = (line.split(maxsplit=2) for line in done.stdout.splitlines())
+    return {(row[0], row[1]): " ".join(row[2:]) for row in rows}
+
+
+def test_info_finds_names_by_a_part_of_them(mini):
+    machine = crane.load("patu655")
+    found = listed("--names", "X_LIFT")
+    assert found == listed("x_lift")  # with the option or without, in any case
+    names = {kind: [name for of, name in found if of == kind] for kind, _ in found}
+    assert list(names) == ["joint", "column", "parameter"]
+    assert names["joint"] == ["X_lift"]
+    assert found["column", "pressure_X_lift_a"] == "Pa"
+    assert found["column", "voltage_X_lift"] == "V"
+    area = machine.hydraulics.cylinders["X_lift"].area_a
+    assert found["parameter", "cylinder.X_lift.area_a"] == f"{area:.6g} m2"
+    # each is one that the machine has
+    eyes = listed("--names", "lift_*e*")
+    assert {kind for kind, _ in eyes} == {"joint", "frame", "column", "parameter"}
+    for kind, name in eyes:
+        assert name.startswith("lift_"), name
+        if kind == "frame":
+            machine.frame(name)
+        elif kind == "joint":
+            machine.column(name)
+    assert not [name for kind, name in listed("barrel") if name.startswith("voltage_")]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "hint"),
+    [
+        ("X_lft", "did you mean 'X_lift' or"), ("X_lift?", "did you mean 'X_lift' or"),
+        ("bulk_modulos", "did you mean 'oil.bulk_modulus' or"), ("zqjk", "leave it out for"),
+    ],
+)  # fmt: skip
+def test_names_that_nothing_has_are_answered_by_the_nearest(pattern, hint):
+    line = one_error(typed("info", "patu655", "--names", pattern))
+    assert f"nothing is called like '{pattern}', {hint}" in line
+
+
 def test_info_has_the_whole_home_posture_and_the_path(mini):
     lines = typed("info", "mini_forwarder").stdout.splitlines()
     told = dict(
@@ -261,8 +304,9 @@ def test_an_interrupted_run_leaves_what_it_has(tmp_path):
     recording = crane.Recording.from_csv(out / "recording.csv")
     last = recording.time[-1]
     assert 20 < last < 40 and line.startswith(f"interrupted at t = {last:g} s")
-    assert recording.task == f"free motion (cut at {last:g} s of 40 s)"
-    assert "cut at" in (out / "summary.md").read_text().splitlines()[0]
+    assert recording.task == "free motion"
+    assert recording.stopped == f"at t = {last:g} s of 40 s: interrupted"
+    assert f"stopped at {last:.4g} s" in (out / "summary.md").read_text().splitlines()[0]
     whole = crane.simulate(machine, duration=0.5)
     np.testing.assert_allclose(recording.q[: len(whole.time)], whole.q, rtol=0, atol=1e-12)
 
@@ -302,6 +346,28 @@ def test_simulate_writes_recording_and_summary(free_run):
     recording = crane.Recording.from_csv(folder / "recording.csv")
     assert len(recording.time) == 21 and recording.machine == "mini_forwarder"
     assert "| X1 |" in result.stdout
+
+
+def test_results_go_to_a_folder_called_as_the_command(tmp_path):
+    machine = Path(__file__).parent / "data" / "slider_crank.yaml"
+    command = "simulate", machine, "--duration", "0.01"
+    assert "written to simulate; see it with" in typed(*command, cwd=tmp_path).stdout
+    assert (tmp_path / "simulate" / "summary.md").is_file()
+    assert "simulate: is not empty" in one_error(typed(*command, cwd=tmp_path))
+    assert typed("working-range", "excavator", "--frame", "bucket", cwd=tmp_path).returncode == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["simulate", "working_range"]
+
+
+def test_folders_are_made_where_files_are_written(tmp_path):
+    machine = Path(__file__).parent / "data" / "slider_crank.yaml"
+    for command in (
+        ("convert", machine, "a/b/x.urdf"), ("convert", machine, "c/x.xml"),
+        ("convert", machine, "d/e"), ("sketch", machine, "--out", "f/x.png"),
+    ):  # fmt: skip
+        done = typed(*command, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    assert all((tmp_path / x).is_file() for x in ("a/b/x.urdf", "c/x.xml", "f/x.png"))
+    crane.load(tmp_path / "a" / "b" / "x.urdf")
 
 
 def test_simulate_a_task(tmp_path):
@@ -390,7 +456,8 @@ def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
         (["info"], "Missing argument 'MACHINE'"),
         (["info", "mini_forwardr"], "did you mean 'mini_forwarder'?"),
         (["check", "nothing.yaml"], "nothing.yaml: no such file"),
-        (["simulate", "mini_forwarder"], "Missing option '--out'"),
+        (["simulate", "mini_forwarder"], "name a --task (loading, return, lift)"),
+        (["study", "mini_forwarder"], "Missing option '--vary'"),
         (["simulate", "mini_forwarder", "--out", "x"], "name a --task (loading, return, lift)"),
         (
             ["simulate", "mini_forwarder", "--out", "x", "--task", "lft"],
@@ -408,7 +475,10 @@ def test_page_of_a_machine_whose_name_is_no_file_name(tmp_path):
         (["plot", "nowhere"], "nowhere: no such file"),
         (["plot", "."], "no recording.csv in this folder"),
         (["view", "nowhere.csv"], "nowhere.csv: no such file"),
-        (["view", "mini_forwarder", "--no-open", "--out", "no/folder.html"], "no/folder.html"),
+        (
+            ["convert", "mini_forwarder", "/dev/null/x.urdf"],
+            "/dev/null: is a file, give the name of a folder",
+        ),
     ],
 )
 def test_errors_are_one_line_and_write_nothing(arguments, text, tmp_path):

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::crane.common.errors.CraneWarnin
 def page():
     """What is defined after the page's blocks."""
     blocks = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), re.DOTALL | re.MULTILINE)
-    assert len(blocks) == 5
+    assert len(blocks) == 6
     names: dict = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
@@ -39,6 +39,29 @@ def test_the_page_does_what_it_says(page):
         slow, fast = getattr(page["slow"], name), getattr(page["fast"], name)
         np.testing.assert_allclose(fast, slow, rtol=0, atol=1e-9 * np.abs(slow).max())
     assert np.ptp(page["swinging"].q, axis=0).min() > 1e-6
+
+
+def test_the_program_of_a_control_unit_holds_its_signals(page):
+    """A period's signal is what the program says of the recorded state at its first instant."""
+    run, crane_, lift = page["raised"], page["log_crane"], page["lift"]
+    assert run["X_lift"][0] < 0.15 and run["X_lift"][-1] == pytest.approx(0.2, abs=2e-3)
+    assert run.controller == "Sampled" and run.time[1] == pytest.approx(1e-3)
+    rows = range(0, len(run.time) - 1, 10)
+    pressures = np.stack(
+        [
+            np.column_stack([run[f"pressure_{joint}_{side}"][rows] for side in "ab"])
+            for joint in crane_.hydraulics.joints
+        ],
+        axis=1,
+    )
+    wanted = [
+        page["control_unit"](run.time[k], run.q[k], run.v[k], p)
+        for k, p in zip(rows, pressures, strict=True)
+    ]
+    for i, name in enumerate(page["spools"]):
+        held = np.repeat(np.array(wanted)[:, i], 10)
+        np.testing.assert_allclose(run[f"voltage_{name}"][:-1], held, rtol=0, atol=1e-6)
+    assert (pressures[:, lift, 0] > 80e5).any()
 
 
 def test_errors_of_three_controllers_are_the_page_s(page):

@@ -141,7 +141,7 @@ def test_it_is_the_transpose_of_sensitivities(made, parted, monkeypatch):
     assert parted or made is forwarder or switches > 2
 
 
-@pytest.mark.parametrize("made", [forwarder, hydraulic])
+@pytest.mark.parametrize("made", [forwarder, pytest.param(hydraulic, marks=pytest.mark.slow)])
 def test_its_own_choice_of_steps_is_as_good(made):
     back, forward, size, _ = both(*made(), follow.ACCURACY)
     assert (np.abs(back - forward) <= 1e-6 * size).all(), np.abs(back - forward) / size

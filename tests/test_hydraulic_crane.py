@@ -137,7 +137,7 @@ def test_stiff_oil_moves_with_its_flow(loaded):
     assert gaps[2] < gaps[1] / 5
 
 
-@pytest.mark.parametrize("task", ["reach", "swing"])
+@pytest.mark.parametrize("task", [pytest.param("reach", marks=pytest.mark.slow), "swing"])
 def test_halving_the_step_changes_nothing(task):
     """Where friction does not fall with speed, two motions side by side stay so."""
     even = {f"friction.{joint}.stiction": 0.0 for joint in ("X_lift", "X_tilt", "X_ext")}
@@ -148,7 +148,7 @@ def test_halving_the_step_changes_nothing(task):
     assert np.abs(half.q[::2] - whole.q).max() < 1e-7
 
 
-@pytest.mark.parametrize("task", ["reach", "swing"])
+@pytest.mark.parametrize("task", [pytest.param("reach", marks=pytest.mark.slow), "swing"])
 def test_halving_the_step_changes_less_than_a_start_beside(loaded, task):
     """A rod that slows down below the Stribeck velocity sticks and slips.
 
@@ -185,6 +185,7 @@ def test_machine_code_agrees_with_scipy_on_pinocchio(patu):
     assert set(fast.channels) == set(slow.channels)
 
 
+@pytest.mark.slow
 def test_a_minute_of_work_balances(loaded):
     """Every function, both ways, over 60 s: oil to 1e-9, energy to 1e-4 of the throughput."""
     levers = {

@@ -170,6 +170,61 @@ def test_command_line(log, tmp_path):
     assert "name it so" in run(*given[:-1], tmp_path / "run.npz").stderr
 
 
+PATU = """# machine: patu655
+time [s] = t
+X_lift [m] = motors[0] / 100
+q2 [rad] = motors[1] / 100
+pressure_X_lift_a [bar] = 100
+reference_q2 [rad] = 0
+pressure_X_grip_a [bar] = 50
+pressure_pump [bar] = 200
+X_9 [m] = 0
+"""
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [
+        ("X_lfit", "X_lift"), ("x_lift", "X_lift"), ("Xlift", "X_lift"), ("X_liftt", "X_lift"),
+        ("X_lift_velocty", "X_lift_velocity"), ("X_lift_forces", "X_lift_force"),
+        ("presure_X_lift_b", "pressure_X_lift_b"), ("pressure_X_lif_b", "pressure_X_lift_b"),
+        ("voltage_X_titl", "voltage_X_tilt"), ("inclination_lift_bom", "inclination_lift_boom"),
+        ("Q3", "q3"), ("pressure_suply", "pressure_supply"),
+    ],
+)  # fmt: skip
+def test_a_misspelt_quantity_is_refused_where_the_machine_is_named(log, tmp_path, written, meant):
+    described = columns(tmp_path, f"{PATU}{written} = t\n")
+    done = typed("import", log, described, "--out", tmp_path / "run.csv")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        f"error: {described}: '{written}' is no quantity of 'patu655', did you mean '{meant}'? "
+        "If it is a channel of its own, give it another name\n"
+    )
+    assert not (tmp_path / "run.csv").exists()
+    with pytest.raises(RecordingError, match=f"did you mean '{meant}'"):
+        crane.read_measured(crane.load("patu655"), log, columns=described)
+
+
+def test_channels_of_their_own_are_kept(log, tmp_path):
+    """What differs by more than a slip, by a number, or is a node of the circuit."""
+    machine = crane.load("patu655")
+    nodes = [f"pressure_{x.replace('.', '_')}" for x in machine.hydraulics.nodes]
+    own = [name for name in nodes if name not in PATU]
+    text = PATU + "".join(f"{name} [bar] = 1\n" for name in own)
+    done = typed("import", log, columns(tmp_path, text), "--out", tmp_path / "run.csv")
+    assert (done.returncode, done.stderr) == (0, "")
+    units = timeseries.read(tmp_path / "run.csv").units
+    assert {"pressure_X_grip_a", "pressure_pump", "X_9", *own} < set(units)
+
+
+def test_names_are_not_checked_where_the_machine_is_not_found(log, tmp_path):
+    done = typed("import", log, columns(tmp_path, GOOD), "--out", tmp_path / "run.csv")
+    assert done.returncode == 0
+    assert (
+        done.stderr.startswith("warning: ") and "names of columns are not checked" in done.stderr
+    )
+
+
 @recorded
 def test_the_measured_arms_come_as_their_owners_wrote_them():
     """Against the conversion written out in numpy; limits of the machines hold."""

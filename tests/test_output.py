@@ -44,9 +44,9 @@ def test_permissions_follow_the_umask(tmp_path):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("missing/result.txt", "there is no folder"),
         ("folder", "is a folder"),
-        ("file/result.txt", "there is no folder"),
+        ("file/result.txt", "file: is a file, give the name of a folder"),
+        ("file/a/result.txt", "file is a file, give the name of a folder"),
     ],
 )
 def test_bad_places(tmp_path, name, message):
@@ -54,6 +54,18 @@ def test_bad_places(tmp_path, name, message):
     (tmp_path / "file").write_text("x")
     with pytest.raises(OutputError, match=message), replacing(tmp_path / name) as part:
         part.write_text("x")
+
+
+def test_folders_are_made_as_soon_as_there_is_something_to_put_there(tmp_path):
+    path = tmp_path / "a" / "b" / "result.txt"
+    with pytest.raises(ZeroDivisionError), replacing(path) as part:
+        part.write_text("half")
+        1 / 0  # noqa: B018
+    assert os.listdir(tmp_path) == []
+    with replacing(path) as part:
+        part.write_text("new")
+        assert part.parent == tmp_path
+    assert path.read_text() == "new" and len(list(tmp_path.rglob("*"))) == 3
 
 
 def test_operating_system_error_is_told(tmp_path):

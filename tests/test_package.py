@@ -111,3 +111,15 @@ def test_robots_are_found_where_conda_puts_them(monkeypatch, tmp_path):
     robots = tmp_path / "share" / "example-robot-data" / "robots"
     robots.mkdir(parents=True)
     assert sources.example_root.__wrapped__() == robots
+
+
+def test_tables_of_the_pages_are_whole():
+    """No text stands against a row: Markdown would make a row of it, or no table of the rows."""
+    for page in (*sorted((ROOT / "docs").rglob("*.md")), ROOT / "README.md"):
+        code, before = False, ""
+        for number, line in enumerate(page.read_text().splitlines(), start=1):
+            if line.startswith("```"):
+                code = not code
+            elif not code and line and before:
+                assert line.startswith("|") == before.startswith("|"), f"{page.name}:{number}"
+            before = "" if code else line

@@ -205,9 +205,10 @@ def test_a_machine_s_own_name_is_kept_where_its_file_has_another(tmp_path):
 
 
 def test_failed_writing_leaves_nothing(tmp_path):
-    with pytest.raises(OutputError, match="there is no folder"):
-        make().to_csv(tmp_path / "missing" / "run.csv")
-    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="is a file, give the name of a folder"):
+        make().to_csv(tmp_path / "file" / "run.csv")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 BROKEN = {

@@ -137,13 +137,15 @@ def test_files_that_results_cannot_go_to(tmp_path):
         ("file", False, "exists already"),
         ("pipe", True, "is no plain file"),
         ("", True, "is a folder"),
-        ("none/page", True, "there is no folder"),
+        ("file/page", True, "is a file, give the name of a folder"),
         ("x" * 300, True, "cannot be written"),
     ):
         with pytest.raises(OutputError, match=message):
             check_free(tmp_path / name, force)
     check_free(tmp_path / "file", True)
     check_free(tmp_path / "new", False)
+    check_free(tmp_path / "none" / "page", False)
+    assert not (tmp_path / "none").exists()
 
 
 def test_views_of_an_earlier_run_do_not_stay_beside_a_new_one(tmp_path, recording):

@@ -251,7 +251,11 @@ def test_every_operation_and_the_formulas_of_their_own_agree(monkeypatch):
     np.testing.assert_allclose(found, other, rtol=0, atol=1e-12 * np.abs(other).max())
 
 
-@pytest.mark.parametrize("name", (*BUNDLED, "four_bar", "planar_leg"))
+@pytest.mark.parametrize(
+    "name",
+    ("mini_forwarder", "four_bar", "planar_leg")
+    + tuple(pytest.param(x, marks=pytest.mark.slow) for x in BUNDLED if x != "mini_forwarder"),
+)
 def test_numbers_of_the_machine(name):
     """A sample of all kinds of them, pins of closed loops among them."""
     machine = machine_of(name)

@@ -421,8 +421,8 @@ def test_what_cannot_be_drawn_leaves_the_old_page(machine, recording, tmp_path):
     with pytest.raises(CraneError):
         report(machine, recording, page)
     assert page.read_text() == "old"
-    with pytest.raises(OutputError, match="there is no folder"):
-        report(machine, None, tmp_path / "none" / "page.html")
+    with pytest.raises(CraneError):
+        report(machine, recording, tmp_path / "none" / "page.html")
     assert list(tmp_path.iterdir()) == [page]
 
 

@@ -1,11 +1,11 @@
 """The command on how hard a machine digs: breakout."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from crane.cli.shared import (
+    BY_COMMAND,
     Active,
     Argument,
     Change,
@@ -49,7 +49,7 @@ def breakout(
     step: Annotated[
         float | None, typer.Option(metavar="M", help="Between places of the reach, in m.")
     ] = None,
-    out: Out = Path("breakout"),
+    out: Out = BY_COMMAND,
     change: Change = None,
     lock: Lock = None,
     active: Active = None,

@@ -2,12 +2,12 @@
 
 import dataclasses
 import warnings
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from crane.cli.shared import (
+    BY_COMMAND,
     Active,
     Argument,
     Change,
@@ -32,7 +32,7 @@ _MOST = 8  # slew angles that a page shows
 @app.command()
 def capacity(
     machine: MachineName,
-    out: Out = Path("capacity"),
+    out: Out = BY_COMMAND,
     frame: Annotated[
         str | None,
         typer.Option(metavar="LINK", help="Where the load hangs; the tip if not given."),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from crane.cli.shared import (
+    BY_COMMAND,
     Active,
     Argument,
     Columns,
@@ -68,12 +69,21 @@ def list_machines(
 @app.command()
 def info(
     machine: MachineName,
+    pattern: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[PATTERN]",
+            help="List its joints, frames, columns and parameters of such names: a part of one, "
+            "or with * and ? all of it.",
+        ),
+    ] = None,
     parameters: Annotated[
         bool,
         typer.Option(
             "--parameters",
             "--names",
-            help="List the names that --set, --vary and --fit take, and their values.",
+            help="List the names that --set, --vary and --fit take, and their values; those of a "
+            "PATTERN, as above.",
         ),
     ] = False,
     active: Active = None,
@@ -82,17 +92,23 @@ def info(
     packages: Packages = None,
     argument: Argument = None,
 ) -> None:
-    """Show what a machine consists of."""
-    if parameters:
+    """Show what a machine consists of, or what of it has a name."""
+    if parameters or pattern is not None:
         from crane.common.packages import giving, package_folders
         from crane.description import parameters as parameters_of
+        from crane.description.names import matching, names_of
         from crane.formats import read
 
         with giving(package_folders(packages or ()), arguments(argument)):
-            values = parameters_of(read(machine))
-        width = max(map(len, values), default=0)
-        for name, value in values.items():
-            print(f"{name:{width}}  {value:.6g}")
+            spec = read(machine)
+        every = {"parameter": {name: f"{x:.6g}" for name, x in parameters_of(spec).items()}}
+        if pattern is not None:
+            every = matching(names_of(spec), pattern)
+        width = max((len(name) for values in every.values() for name in values), default=0)
+        for kind, values in every.items():
+            before = f"{kind:<11}" * (pattern is not None)
+            for name, text in values.items():
+                print(f"{before}{name:{width}}  {text}".rstrip())
         return
     loaded = load(machine, None, None, active, free, floating, packages, argument)
     for line in _describe(loaded):
@@ -175,7 +191,7 @@ def plot(
 
 
 @app.command()
-def demo(out: Out = Path("demo-output"), force: Force = False) -> None:
+def demo(out: Out = BY_COMMAND, force: Force = False) -> None:
     """Simulate the three published trajectories of the reduced-scale forwarder."""
     from crane.cli.demo import run_demo
     from crane.cli.runs import FIGURE, PAGE, check_folder

@@ -1,5 +1,6 @@
 """Commands between formats: convert for machines, import for recordings."""
 
+import warnings
 from pathlib import Path
 from typing import Annotated
 
@@ -22,7 +23,7 @@ from crane.cli.shared import (
     load,
     span_of,
 )
-from crane.common.errors import InputError, known
+from crane.common.errors import CraneError, CraneWarning, InputError, known
 
 _FORMATS = ("urdf+", "urdf", "mjcf", "machine")
 _SUFFIXES = {".urdf": "urdf+", ".xml": "mjcf", ".mjcf": "mjcf"}
@@ -104,14 +105,21 @@ def import_log(
 ) -> None:
     """Write the recording that is in the log of another program."""
     from crane.cli.runs import check_free
+    from crane.formats import recalled
     from crane.recordings import timeseries
-    from crane.recordings.logs import read_log
-    from crane.recordings.reading import within
+    from crane.recordings.logs import lines_of
+    from crane.recordings.reading import readings, within
 
     if out.suffix.lower() != ".csv":
         raise InputError(f"{out}: a recording is written as .csv, name it so")
     span = span_of(since, until)
     check_free(out, force)
-    table = within(read_log(log, columns), span, log)
+    machine, named = None, lines_of(columns)[0].get("machine", "")
+    try:
+        machine = recalled(named) if named else None
+    except CraneError as error:
+        text = f"{columns}: names of columns are not checked, its machine cannot be read: {error}"
+        warnings.warn(text, CraneWarning, stacklevel=2)
+    table = within(readings(log, machine, columns), span, log)
     timeseries.write(out, table)
     print(f"{len(table.values)} samples of {len(table.units)} columns written to {out}")

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from crane.cli.shared import (
+    BY_COMMAND,
     Change,
     Force,
     LoadFrame,
@@ -26,10 +27,10 @@ from crane.cli.shared import (
 @app.command()
 def design(
     machine: MachineName,
-    out: Out,
     vary: Annotated[
         list[str], typer.Option(metavar="NAME=LOW~HIGH", help="A number and its range.")
     ],
+    out: Out = BY_COMMAND,
     minimise: Annotated[
         list[str] | None, typer.Option(metavar="EXPRESSION", help="What shall be the least.")
     ] = None,

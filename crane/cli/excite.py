@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from crane.cli.shared import (
+    BY_COMMAND,
     Change,
     Force,
     Lock,
@@ -26,7 +27,7 @@ _SIGNALS = ("duration", "sensors", "rate", "margin")
 def excite(
     context: typer.Context,
     machine: MachineName,
-    out: Out,
+    out: Out = BY_COMMAND,
     fit: Annotated[
         list[str] | None,
         typer.Option(

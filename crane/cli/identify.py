@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from crane.cli.shared import (
+    BY_COMMAND,
     Columns,
     Force,
     From,
@@ -49,7 +50,7 @@ _PRIOR = "NAME=STD, as in bodies=10%, q1.viscous=50 or q1.viscous=200+-50, a sha
 def identify(
     machine: MachineName,
     recording: Recordings,
-    out: Out,
+    out: Out = BY_COMMAND,
     train: Train = None,
     validation: Validation = None,
     columns: Columns = None,

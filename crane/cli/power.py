@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from crane.cli.shared import (
+    BY_COMMAND,
     Active,
     Argument,
     Change,
@@ -38,7 +39,7 @@ def power(
             help="A run's folder, or a recording (CSV or npz) with pressures and spools.",
         ),
     ],
-    out: Out,
+    out: Out = BY_COMMAND,
     change: Change = None,
     lock: Lock = None,
     active: Active = None,

@@ -20,7 +20,7 @@ from crane.machine import Machine
 from crane.recordings.measured import completed, is_measured
 from crane.recordings.reading import ALWAYS, Span, quantities, read, readings
 from crane.recordings.recording import Recording
-from crane.recordings.summary import subject, summarize, title
+from crane.recordings.summary import heading, summarize, title
 
 if TYPE_CHECKING:
     from crane.identification.calibration.result import Calibration
@@ -98,8 +98,7 @@ def _stale(npz: bool) -> tuple[str, ...]:
 
 
 def _write_run(part: Path, recording: Recording, npz: bool) -> str:
-    heading = title(subject(recording), recording.task)
-    text = f"# {heading}\n\n{summarize(recording).to_markdown()}"
+    text = f"# {heading(recording)}\n\n{summarize(recording).to_markdown()}"
     if npz:
         recording.to_npz(part / RECORDING_NPZ)
     else:
@@ -125,8 +124,7 @@ def write_comparison(
     """
     from crane.view.plots.comparison import plot_comparison
 
-    heading = title(subject(recording), recording.task)
-    text = f"# {heading}\n\n{comparison.to_markdown()}"
+    text = f"# {heading(recording)}\n\n{comparison.to_markdown()}"
     with staging(folder, force, _stale(npz)) as part:
         _write_run(part, recording, npz)
         (part / COMPARISON).write_text(text, encoding="utf-8")
@@ -337,8 +335,8 @@ def write_power(folder: Path, account: "PowerAccount", force: bool = True) -> st
     from crane.view.plots.power import plot_power
     from crane.view.plots.sankey import plot_sankey
 
-    heading = title(account.machine, f"{account.task} power".strip())
-    text = f"# {heading}\n\n{account.to_markdown()}"
+    of = title(account.machine, f"{account.task} power".strip())
+    text = f"# {of}\n\n{account.to_markdown()}"
     with staging(folder, force) as part:
         (part / "power.md").write_text(text, encoding="utf-8")
         account.to_csv(part / "power.csv")

@@ -35,6 +35,13 @@ def _place(text: str | Path) -> Path:
     return Path(text)
 
 
+def _folder(context: typer.Context, folder: Path) -> Path:
+    """The folder that is given, or else that of the command's name."""
+    source = context.get_parameter_source("out")
+    given = source is not None and source.name != "DEFAULT"
+    return folder if given else Path(str(context.info_name).replace("-", "_"))
+
+
 MachineName = Annotated[
     str,
     typer.Argument(
@@ -44,8 +51,16 @@ MachineName = Annotated[
 Force = Annotated[bool, typer.Option("--force", help="Overwrite what is there.")]
 Out = Annotated[
     Path,
-    typer.Option("--out", metavar="FOLDER", parser=_place, help="Folder for the results."),
+    typer.Option(
+        "--out",
+        metavar="FOLDER",
+        parser=_place,
+        callback=_folder,
+        show_default=False,
+        help="Folder for the results; if not given, one here that is called as the command.",
+    ),
 ]
+BY_COMMAND = Path()  # default of `Out`
 OutFile = Annotated[
     Path | None,
     typer.Option("--out", metavar="FILE", parser=_place, help="The file to write."),

@@ -2,6 +2,8 @@
 
 import math
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +11,7 @@ import typer
 
 from crane.cli.loads import Load, loads_of
 from crane.cli.shared import (
+    BY_COMMAND,
     INTERRUPTED,
     Active,
     Argument,
@@ -29,7 +32,7 @@ from crane.cli.shared import (
     say,
     span_of,
 )
-from crane.common.errors import InputError, known
+from crane.common.errors import CraneError, InputError, SimulationError, known
 
 if TYPE_CHECKING:
     from crane.control import Command, Controller
@@ -40,7 +43,7 @@ if TYPE_CHECKING:
 @app.command()
 def simulate(
     machine: MachineName,
-    out: Out,
+    out: Out = BY_COMMAND,
     task: Annotated[str | None, typer.Option(help="A task of the machine.")] = None,
     controller: Annotated[
         str | None,
@@ -113,7 +116,6 @@ def simulate(
     """Simulate a task, a path, measured inputs, or the home posture, held or let go."""
     from crane.cli.runs import check_folder, write_run
     from crane.motion.paths import read_path
-    from crane.simulation import InterruptedRun
     from crane.simulation import simulate as run
 
     check_folder(out, force)
@@ -146,18 +148,37 @@ def simulate(
         control = control_of(loaded, task, controller, sway)
         duration = duration_of(loaded, task, duration)
     label = task or (path.stem if path else "hold" if control else "free motion")
-    try:
-        with progress_bar("simulating") as progress:
-            recording = run(
-                loaded, control, duration=duration, step=step, label=label, method=method,
-                tolerance=tolerance, progress=progress,
-            )  # fmt: skip
-    except InterruptedRun as cut:
-        write_run(out, cut.recording, npz, force)
-        say(f"{cut}: what there is of it is in {out}, whose summary says where it was cut")
-        sys.exit(INTERRUPTED)
+    with kept_in(out, npz, force), progress_bar("simulating") as progress:
+        recording = run(
+            loaded, control, duration=duration, step=step, label=label, method=method,
+            tolerance=tolerance, progress=progress,
+        )  # fmt: skip
     print(write_run(out, recording, npz, force), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")
+
+
+@contextmanager
+def kept_in(folder: Path, npz: bool, force: bool) -> Iterator[None]:
+    """Write what there is of a run that is stopped in the block, by an error or by its user.
+
+    Raises:
+        CraneError: What stopped it, with where what there is of it lies.
+    """
+    from crane.cli.runs import write_run
+    from crane.simulation import InterruptedRun
+
+    try:
+        yield
+    except (CraneError, InterruptedRun) as stop:
+        recording = getattr(stop, "recording", None)
+        if recording is None:
+            raise
+        write_run(folder, recording, npz, force)
+        told = f"{stop}; the run until t = {recording.time[-1]:.6g} s is in {folder}"
+        if isinstance(stop, CraneError):
+            raise SimulationError(told) from stop
+        say(told)
+        sys.exit(INTERRUPTED)
 
 
 def control_of(
@@ -238,7 +259,7 @@ def _replay(
     from crane.cli.runs import write_comparison
     from crane.simulation.replays import replay
 
-    with progress_bar("simulating") as progress:
+    with kept_in(out, npz, force), progress_bar("simulating") as progress:
         recording, comparison = replay(machine, inputs, step, progress, columns, span)
     print(write_comparison(out, recording, comparison, npz, force), end="")
     print(f"\nwritten to {out}; see it with: crane view {out}")

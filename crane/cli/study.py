@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from crane.cli.shared import (
+    BY_COMMAND,
     Change,
     Force,
     LoadFrame,
@@ -26,7 +27,6 @@ from crane.cli.shared import (
 @app.command()
 def study(
     machine: MachineName,
-    out: Out,
     vary: Annotated[
         list[str],
         typer.Option(
@@ -34,6 +34,7 @@ def study(
             help="A parameter and its values start:stop:count, or with --draws low~high.",
         ),
     ],
+    out: Out = BY_COMMAND,
     task: Annotated[
         list[str] | None, typer.Option(help="A task to measure with; all if not given.")
     ] = None,

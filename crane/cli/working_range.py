@@ -1,11 +1,11 @@
 """The command on how far a machine works: working-range."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from crane.cli.shared import (
+    BY_COMMAND,
     Active,
     Argument,
     Change,
@@ -34,7 +34,7 @@ def working_range(
     level: Annotated[
         float, typer.Option(metavar="M", help="Length of the level bottom, in m.")
     ] = 2.44,
-    out: Out = Path("working_range"),
+    out: Out = BY_COMMAND,
     change: Change = None,
     lock: Lock = None,
     active: Active = None,

@@ -1,11 +1,11 @@
 """The command on where a machine reaches: workspace."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from crane.cli.shared import (
+    BY_COMMAND,
     Active,
     Argument,
     Change,
@@ -25,7 +25,7 @@ from crane.cli.shared import (
 @app.command()
 def workspace(
     machine: MachineName,
-    out: Out = Path("workspace"),
+    out: Out = BY_COMMAND,
     samples: Annotated[int, typer.Option(help="About how many postures.")] = 10_000,
     frame: Annotated[
         str | None, typer.Option(metavar="LINK", help="What moves; the tip if not given.")

@@ -95,7 +95,14 @@ class RecordingError(CraneError):
 
 
 class SimulationError(CraneError):
-    """A simulation could not go on."""
+    """A simulation could not go on.
+
+    Attributes:
+        recording: What there is of it, whose `stopped` says where and why it ended; None where it
+            did not begin, or where nothing was to be recorded.
+    """
+
+    recording: Any = None
 
 
 class OutputError(CraneError):

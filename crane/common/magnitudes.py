@@ -7,6 +7,8 @@ tried in the units that data sheets use; what is then usual is proposed.
 import math
 from typing import NamedTuple
 
+LONGEST = 50.0  # [m], a length that no part of a machine has
+
 Units = tuple[tuple[str, float], ...]
 
 
@@ -84,6 +86,7 @@ USUAL = {
     "rate": Magnitude("1/s", 0.05, 1e3, 10.0),
     "bore": Magnitude("m", 2e-3, 0.6, 0.1, ((("mm", 1e-3), ("cm", 1e-2)),)),
     "rod": Magnitude("m", 1e-3, 0.5, 0.06, ((("mm", 1e-3), ("cm", 1e-2)),)),
+    "stroke": Magnitude("m", 5e-3, 20.0, 0.8, ((("mm", 1e-3), ("cm", 1e-2)),)),
     "tube": Magnitude("m", 2e-3, 0.8, 0.12, ((("mm", 1e-3), ("cm", 1e-2)),)),
     "standby": Magnitude("Pa", 1e5, 2e7, 2e6, _PRESSURE),
     "signal": Magnitude("Pa", 1e4, 1e7, 2e6, _PRESSURE),

@@ -1,4 +1,4 @@
-"""Files and folders are written whole or not at all."""
+"""Files and folders are written whole or not at all; folders that are not there are made."""
 
 import os
 import re
@@ -16,19 +16,22 @@ from crane.common.exchange import appeared, exchanged
 def replacing(path: str | Path) -> Iterator[Path]:
     """A temporary path to write to, which takes the place of `path` at the end.
 
-    The temporary file stands in the same folder and is removed when the block raises; whatever
-    was at `path` before then stays as it was.
+    The temporary file stands in the same folder, or where there is none in the nearest folder
+    above it, and is removed when the block raises; whatever was at `path` before then stays as it
+    was.
 
     Raises:
-        OutputError: The folder does not exist, nothing can be written there, or something other
-            than a plain file is in the way.
+        OutputError: Nothing can be written there, or something other than a plain file is in the
+            way.
     """
     path = Path(path)
-    _check_place(path)
+    check_file(path)
+    folder = _existing(path.parent)
     try:
-        leftovers.clear(path)
-        with leftovers.temporary(path) as part:
+        leftovers.clear(path, folder)
+        with leftovers.temporary(path, within=folder) as part:
             yield part
+            path.parent.mkdir(parents=True, exist_ok=True)
             os.replace(part, path)
     except OSError as error:
         raise _unwritable(path, error) from error
@@ -130,10 +133,16 @@ def check_file(path: Path) -> None:
     """See that a file can be written, before it is computed.
 
     Raises:
-        OutputError: The folder does not exist or may not be written to, or something other than a
-            plain file is in the way.
+        OutputError: Its folder can be neither written to nor made, or something other than a plain
+            file is in the way.
     """
-    _check_place(path)
+    try:
+        if path.is_dir():
+            raise OutputError(f"{path}: is a folder, give the name of a file")
+        if path.exists() and not path.is_file():
+            raise OutputError(f"{path}: is no plain file, give another name")
+    except OSError as error:  # a name longer than any file's, a folder that may not be entered
+        raise _unwritable(path, error) from None
     _check_writable(path.parent)
 
 
@@ -154,18 +163,6 @@ def check_folder(folder: Path) -> None:
 def file_name(text: str) -> str:
     """A name for a file that every system takes, as near to a text as possible."""
     return re.sub(r"[^\w.-]+", "_", text).strip("._")[:60] or "unnamed"
-
-
-def _check_place(path: Path) -> None:
-    try:
-        if path.is_dir():
-            raise OutputError(f"{path}: is a folder, give the name of a file")
-        if path.exists() and not path.is_file():
-            raise OutputError(f"{path}: is no plain file, give another name")
-        if not path.parent.is_dir():
-            raise OutputError(f"{path}: there is no folder {path.parent}, create it first")
-    except OSError as error:  # a name longer than any file's, a folder that may not be entered
-        raise _unwritable(path, error) from None
 
 
 def _check_writable(folder: Path) -> None:

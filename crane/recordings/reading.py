@@ -7,14 +7,17 @@ note `# sensors: ideal` and is taken as it is.
 """
 
 import math
+import re
 import warnings
 from collections.abc import Mapping
+from difflib import SequenceMatcher
 from pathlib import Path
 
 import numpy as np
 
 from crane.common.errors import CraneWarning, InputError, RecordingError, at, known
 from crane.description.sensors import (
+    PRESSURE,
     SENSOR,
     SIGNAL,
     TIME,
@@ -24,10 +27,13 @@ from crane.description.sensors import (
     unit_of,
     with_numbers,
 )
+from crane.description.sensors import quantities as quantity_names
 from crane.machine import Machine
 from crane.recordings import logs, timeseries
 from crane.recordings.recording import IDEAL, SENSORS
 from crane.recordings.timeseries import Table, column
+
+_ALIKE = 0.7  # likeness of names, from which on one is meant
 
 Span = tuple[float, float]
 ALWAYS: Span = (-math.inf, math.inf)
@@ -74,16 +80,54 @@ def readings(
     """The same as the sensors said it, from first to last.
 
     Raises:
-        RecordingError: A file is missing or malformed.
+        RecordingError: A file is missing or malformed, or names a quantity of the machine wrongly.
     """
     if columns is not None:
-        return logs.read_log(path, columns)
+        table = logs.read_log(path, columns)
+        if machine is not None:
+            _check_names(machine, table, columns)
+        return table
     told = {} if machine is None else {x: s for x, s in machine.sensors.items() if s.column}
     if machine is not None and told:
         arrays = timeseries.arrays(Path(path))
         if any(name in arrays for s in told.values() for name in logs.names_in(s.column)):
             return _logged(Path(path), machine, told, arrays)
     return timeseries.read(path)
+
+
+def _check_names(machine: Machine, table: Table, columns: str | Path) -> None:
+    """See that columns which almost have the name of a quantity of the machine have it.
+
+    Others are channels, which may be called anything.
+
+    Raises:
+        RecordingError: One has not.
+    """
+    names = quantity_names(machine.tree)
+    nodes = [] if machine.hydraulics is None else machine.hydraulics.nodes
+    own = {f"{PRESSURE}{node.replace('.', '_')}" for node in nodes}  # much like those of cylinders
+    for name in table.units:
+        if name in own or unit_of(machine.tree, name) is not None:
+            continue
+        near = max(names, key=lambda x: _likeness(x, name))
+        if _likeness(near, name) > _ALIKE:
+            raise RecordingError(
+                f"{columns}: '{name}' is no quantity of '{machine.name}', did you mean '{near}'? "
+                "If it is a channel of its own, give it another name"
+            )
+
+
+def _likeness(one: str, two: str) -> float:
+    """Of two names, 0 to 1, by those words in which they differ; other numbers are others."""
+    if re.findall(r"\d", one) != re.findall(r"\d", two):
+        return 0.0
+    words, others = (name.lower().split("_") for name in (one, two))
+    for end in (-1, 0):
+        while words and others and words[end] == others[end]:
+            del words[end], others[end]
+    if not words and not others:
+        return 1.0
+    return SequenceMatcher(None, "_".join(words), "_".join(others)).ratio()
 
 
 def _logged(

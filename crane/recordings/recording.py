@@ -14,10 +14,11 @@ derivative of X then. X_velocity and X_force without X is an error. Every other 
 channel, such as the angle q2 of a joint that is not active, with q2_velocity beside it or without.
 The order of the columns is any, the joints come in the order of their displacements. The comment
 lines may be left out where no joint is free; `machine name` is there where the machine calls
-itself something else than its file. Other units are converted where
-crane.recordings.timeseries knows them. An npz file serves, too: one array per column, named like
-those of the CSV, and the comment lines as the comment of the archive. What a crane's sensors tell
-instead of displacements and forces, crane.recordings.measured turns into them.
+itself something else than its file, `stopped` where a run ended before its time. Other units are
+converted where crane.recordings.timeseries knows them. An npz file serves, too: one array per
+column, named like those of the CSV, and the comment lines as the comment of the archive. What a
+crane's sensors tell instead of displacements and forces, crane.recordings.measured turns into
+them.
 """
 
 from collections import Counter
@@ -45,6 +46,7 @@ REFERENCE = "reference_"  # before the name of what a channel is the reference o
 SENSORS, IDEAL = "sensors", "ideal"  # a note of quantities themselves
 FREE = "free"  # a note of joints that nothing drives
 NAME = "machine name"  # a note where the machine's own is not that of its file
+STOPPED = "stopped"  # a note of a run that ended before its time
 _ACCELERATION = "_acceleration"
 _LISTED = 40  # names in a message
 
@@ -73,6 +75,7 @@ class Recording(Brief):
             is known of the sensors, which a file says in its note `sensors`.
         free: Those of the joints that nothing drives, whose forces are zero.
         machine_name: What the machine calls itself, "" if not known.
+        stopped: When and why it ended before its time, "at t = 1.2 s: ..."; "" if it did not.
     """
 
     time: Array
@@ -89,6 +92,7 @@ class Recording(Brief):
     ideal: bool = False
     free: tuple[str, ...] = ()
     machine_name: str = ""
+    stopped: str = ""
     copy: InitVar[bool] = True
 
     def __post_init__(self, copy: bool) -> None:
@@ -135,7 +139,7 @@ class Recording(Brief):
         units = self._units()
         for name, unit in units.items():
             timeseries.check_column(name, unit)
-        for name in ("machine", "task", "controller", "machine_name"):
+        for name in ("machine", "task", "controller", "machine_name", "stopped"):
             text = getattr(self, name)
             if text != text.strip() or not text.isprintable():
                 raise RecordingError(f"{name} {text!r} is not one line of text, give one")
@@ -166,7 +170,7 @@ class Recording(Brief):
         return (
             f"Recording of {what or 'a machine'}, {self.time[-1] - self.time[0]:.6g} s in "
             f"{counted(len(self.time), 'sample')}: {counted(len(self.channels), 'channel')} "
-            f"beside {joints or 'no joints'}"
+            f"beside {joints or 'no joints'}{'; stopped ' * bool(self.stopped)}{self.stopped}"
         )
 
     def _names(self) -> list[str]:
@@ -332,6 +336,8 @@ class Recording(Brief):
             notes[SENSORS] = IDEAL
         if self.free:
             notes[FREE] = ", ".join(self.free)
+        if self.stopped:
+            notes[STOPPED] = self.stopped
         return notes
 
     @classmethod
@@ -407,6 +413,7 @@ class Recording(Brief):
             ideal=table.notes.get(SENSORS) == IDEAL,
             free=free,
             machine_name=table.notes.get(NAME, ""),
+            stopped=table.notes.get(STOPPED, ""),
             copy=False,
         )
 

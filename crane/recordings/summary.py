@@ -59,6 +59,7 @@ class Summary:
         stability: How far it is from tipping, in words, "" where that is not recorded.
         balance: How far the balance of energy is off, see `energy_balance`, likewise.
         ringing: Pressures that swing without decaying, see `limit_cycles`, likewise.
+        stopped: When and why it ended before its time, "" if it did not.
     """
 
     duration: float
@@ -68,9 +69,10 @@ class Summary:
     stability: str = ""
     balance: str = ""
     ringing: str = ""
+    stopped: str = ""
 
     def to_markdown(self) -> str:
-        """A table with one row per joint, in degrees and millimetres."""
+        """A table with one row per joint, in degrees and millimetres, and what is to be said."""
         head = (
             "joint",
             "range",
@@ -102,8 +104,9 @@ class Summary:
             rows.append(("tip", "", "", "", "", *errors))
         table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
         balance = f"energy balance: {self.balance}" if self.balance else ""
-        told = (self.stability, self.ringing, balance)
-        return "\n".join([table, *(f"{text}\n" for text in told if text)])
+        end = f"**Stopped {self.stopped}**\n\n" if self.stopped else ""
+        below = (f"{text}\n" for text in (self.stability, self.ringing, balance) if text)
+        return end + "\n".join([table, *below])
 
 
 def tipping(recording: Recording) -> str:
@@ -161,6 +164,17 @@ def subject(recording: Recording) -> str:
     return recording.machine_name or Path(unchanged(recording.machine)).stem
 
 
+def label(recording: Recording) -> str:
+    """What a recording shows: its task, and until when where it was stopped."""
+    until = f"(stopped at {recording.time[-1]:.4g} s)" if recording.stopped else ""
+    return f"{recording.task} {until}".strip()
+
+
+def heading(recording: Recording) -> str:
+    """What its results are headed with."""
+    return title(subject(recording), label(recording))
+
+
 def summarize(recording: Recording) -> Summary:
     """Ranges, peaks, RMS values and tracking errors of a recording.
 
@@ -195,6 +209,7 @@ def summarize(recording: Recording) -> Summary:
         stability=_stability(recording),
         balance=_balance(recording),
         ringing=ringing(recording),
+        stopped=recording.stopped,
     )
 
 

@@ -119,7 +119,7 @@ def simulate_batch(
         if text := reference_beyond(machine, control, steps * step):
             beyond[i] = text
         dynamics = Dynamics(machine)
-        time, rows, notes = integrate(
+        found = integrate(
             dynamics,
             control,
             starts[i],
@@ -129,9 +129,12 @@ def simulate_batch(
             tolerance=tolerance,
             ends=duration is None,
         )
+        if found.stop is not None:
+            raise found.stop
+        time, rows = found.time, found.rows
         energy = np.hstack([rows.kinetic, rows.potential, rows.work[:, :1], rows.lost])
         q_a = rows.q[:, machine.closure.active]
-        doubts = [*notes, *said(machine, time, rows, step, fixed(dynamics, control, method))]
+        doubts = [*found.notes, *said(machine, time, rows, step, fixed(dynamics, control, method))]
         return time, q_a, rows.v_a, rows.tau, energy, "; ".join(doubts)
 
     results: dict[int, _Result] = {}

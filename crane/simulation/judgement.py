@@ -3,7 +3,6 @@
 import numpy as np
 
 from crane.codegen import Parts
-from crane.common.errors import SimulationError
 from crane.common.samples import FARTHEST, Array
 from crane.common.scratch import release
 from crane.description.ground import Contact
@@ -38,22 +37,26 @@ def said(
         fixed: Whether the method's steps are these, whatever their error.
         exact: Whether the formulation keeps its energy.
 
-    Raises:
-        SimulationError: An end stop gave back more energy than it took, or a piston left its
-            cylinder.
     """
-    if text := cylinders_left(machine, time, rows.q):
-        raise SimulationError(text)
-    gap = _gap(rows)
-    if exact and (text := stop_gains(machine, time, rows, step, gap)):
-        raise SimulationError(text)
     every = (
         limits_passed(machine, time, rows.q),
         strokes_passed(machine, time, rows.q),
         chatter(machine, time, rows, step) if fixed else "",
-        imbalance(rows, step, gap) if exact else "",
+        imbalance(rows, step, _gap(rows)) if exact else "",
     )
     return [text for text in every if text]
+
+
+def fault(
+    machine: Machine, time: Array, rows: Parts, step: float, exact: bool = True
+) -> tuple[int, str] | None:
+    """From which instant on a run is no motion of the machine, and why; None if it is one.
+
+    A piston has left its cylinder, or an end stop has given back more energy than it took.
+    Arguments as those of `said`.
+    """
+    left = cylinders_left(machine, time, rows.q)
+    return left or (stop_gains(machine, time, rows, step, _gap(rows)) if exact else None)
 
 
 def limits_passed(machine: Machine, time: Array, q: Array) -> str:
@@ -119,8 +122,8 @@ def strokes_passed(machine: Machine, time: Array, q: Array) -> str:
     return f"{', '.join(words)}: make end stops as stiff as steel is, or move slower"
 
 
-def cylinders_left(machine: Machine, time: Array, q: Array) -> str:
-    """What to say of a piston beyond all room of its chambers, hoses among it, else nothing.
+def cylinders_left(machine: Machine, time: Array, q: Array) -> tuple[int, str] | None:
+    """When a piston is beyond all room of its chambers, hoses among it, and what to say of it.
 
     Arguments as those of `limits_passed`.
     """
@@ -138,11 +141,11 @@ def cylinders_left(machine: Machine, time: Array, q: Array) -> str:
         if (out := (q[:, i] <= least) | (q[:, i] >= most)).any():
             first = int(np.argmax(out))
             chamber = "A" if q[first, i] <= least else "B"
-            return (
+            return first, (
                 f"at t = {time[first]:.4g} s the piston of '{joint}' has left its cylinder, whose "
                 f"chamber {chamber} has no room: give '{joint}' an end stop (end_stops)"
             )
-    return ""
+    return None
 
 
 def buried(machine: Machine, q: Array) -> str:
@@ -177,11 +180,13 @@ def _throughput(rows: Parts) -> float:
     return float(max(np.ptp(part) for part in parts))
 
 
-def stop_gains(machine: Machine, time: Array, rows: Parts, step: float, gap: Array) -> str:
-    """What to say of an end stop that gave back more energy than it took, else nothing."""
+def stop_gains(
+    machine: Machine, time: Array, rows: Parts, step: float, gap: Array
+) -> tuple[int, str] | None:
+    """When a stop was met that gave back more energy than it took, and what to say of it."""
     least = _IMBALANCE * _throughput(rows)
     if not np.ptp(gap) > least:
-        return ""
+        return None
     for stop in machine.end_stops:
         i = machine.column(stop.joint)
         lower, upper = machine.coordinates.lower[i], machine.coordinates.upper[i]
@@ -192,12 +197,12 @@ def stop_gains(machine: Machine, time: Array, rows: Parts, step: float, gap: Arr
             held = 0.5 * stop.stiffness * float(depth[first:behind].max()) ** 2
             gained = float(gap[before] - gap[after])
             if gained > max(_GAIN * held, least):
-                return (
+                return first, (
                     f"at t = {time[first]:.4g} s the end stop of '{stop.joint}' gives back "
                     f"{gained:.2g} J more than it takes, so the step of {step:g} s is too long "
                     "for it: shorten it, or let method DOP853 choose it"
                 )
-    return ""
+    return None
 
 
 def chatter(machine: Machine, time: Array, rows: Parts, step: float) -> str:

@@ -1,12 +1,15 @@
 """What a simulation leaves: a recording with channels."""
 
 from collections.abc import Iterator
+from contextlib import suppress
+from typing import NamedTuple
 
 import numpy as np
 
-from crane.codegen import Parts
+from crane.codegen import Layout, Parts
 from crane.common import scratch
-from crane.common.samples import Array
+from crane.common.errors import CraneError, one_line
+from crane.common.samples import LARGEST, Array
 from crane.common.shown import shortened
 from crane.control import Controller, Free, ValveDrive, reference_of
 from crane.description.external import PARTS
@@ -21,8 +24,88 @@ from crane.recordings.recording import FORCE_UNITS, Recording
 Column = tuple[str, Array, str]  # name, values, unit
 
 
+class Run(NamedTuple):
+    """What an integration leaves.
+
+    Attributes:
+        time: (N,) [s].
+        array: (N, .) rows at these instants.
+        layout: Of a row, see `crane.simulation.integration.row_layout`.
+        notes: What is to be said of the motion.
+        stop: What ended it before its time, if something did.
+    """
+
+    time: Array
+    array: Array
+    layout: Layout
+    notes: list[str]
+    stop: BaseException | None = None
+
+    @property
+    def rows(self) -> Parts:
+        """The rows part by part, (N, .) each."""
+        return self.layout.view(self.array)
+
+    def until(self, count: int, stop: BaseException | None) -> "Run":
+        """The first instants of it, and what ended it there."""
+        return self._replace(time=self.time[:count], array=self.array[:count], stop=stop)
+
+
+class InterruptedRun(KeyboardInterrupt):
+    """A run that was interrupted.
+
+    Attributes:
+        recording: What there is of it, whose `stopped` says where it ended.
+    """
+
+    def __init__(self, recording: Recording):
+        super().__init__(f"interrupted at t = {recording.time[-1]:g} s")
+        self.recording = recording
+
+
+def stopped(
+    machine: Machine, control: Controller, run: Run, task: str, until: float
+) -> BaseException:
+    """What stopped a run, which has what there is of it as its `recording`.
+
+    Args:
+        machine: The machine.
+        control: What drove it.
+        run: What was integrated.
+        task: Name to put into the recording.
+        until: When it should have ended [s].
+    """
+    assert (stop := run.stop) is not None
+    if not len(run.time):
+        return stop
+    largest = scratch.in_blocks(
+        lambda part: np.abs(run.array[part]).max(axis=1, keepdims=True), len(run.time)
+    )
+    # what has exploded is no motion
+    run = run.until(int(np.append(largest < LARGEST, False).argmin()), stop)
+    if not len(run.time):
+        return stop
+    interrupted = isinstance(stop, KeyboardInterrupt)
+    text = one_line(" ".join(str(stop).split())) or type(stop).__name__
+    if interrupted:
+        text = f"at t = {run.time[-1]:g} s of {until:g} s: interrupted"
+    elif not text.startswith("at t = "):
+        text = f"at t = {run.time[-1]:g} s: {text}"
+    with suppress(CraneError):  # channels that cannot be computed there hide no error
+        recording = recorded(machine, control, run.time, run.rows, task, text)
+        if interrupted:
+            return InterruptedRun(recording)
+        stop.recording = recording  # type: ignore[attr-defined]
+    return stop
+
+
 def recorded(
-    machine: Machine, control: Controller, time: Array, rows: Parts, task: str
+    machine: Machine,
+    control: Controller,
+    time: Array,
+    rows: Parts,
+    task: str,
+    stopped: str = "",
 ) -> Recording:
     """What the integration left as a recording.
 
@@ -32,6 +115,7 @@ def recorded(
         time: (N,) [s].
         rows: See `integrate`.
         task: Name to put into it.
+        stopped: When and why it ended before its time.
     """
     active = machine.closure.active
     q_a = scratch.in_blocks(lambda part: rows.q[part][:, active], len(time))
@@ -54,6 +138,7 @@ def recorded(
         ideal=True,
         free=machine.free,
         machine_name=shortened(machine.name).strip(),
+        stopped=stopped,
         copy=False,
     )
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.codegen import Parts, TooLongError
+from crane.codegen import TooLongError
 from crane.common import scratch
 from crane.common.errors import ClosureError, CraneWarning, InputError, SimulationError, known
 from crane.common.samples import Array, as_number, as_sample
@@ -45,8 +45,8 @@ from crane.simulation.integration.radau import RadauStepper
 from crane.simulation.integration.rosenbrock import StiffStepper
 from crane.simulation.integration.state import row_layout
 from crane.simulation.integration.steps import Steps
-from crane.simulation.judgement import buried, limits_passed, said
-from crane.simulation.recorded import recorded
+from crane.simulation.judgement import buried, fault, limits_passed, said
+from crane.simulation.recorded import Run, recorded, stopped
 
 _MOST = 4_000_000  # steps of one recording
 _FINEST, _COARSEST = 1e-13, 1e-2  # tolerances
@@ -63,18 +63,6 @@ _CONTROLLED: dict[str, Stepper] = {
 
 class _EndedError(Exception):
     """What commands the valves has no more to do."""
-
-
-class InterruptedRun(KeyboardInterrupt):
-    """A run that was interrupted.
-
-    Attributes:
-        recording: What there is of it; its `task` says where it was cut.
-    """
-
-    def __init__(self, recording: Recording):
-        super().__init__(f"interrupted at t = {recording.time[-1]:g} s")
-        self.recording = recording
 
 
 def simulate(
@@ -141,8 +129,9 @@ def simulate(
         LimitError: The start lies outside of the limits.
         SimulationError: The machine cannot go on: the loops do not close any more, or the motion
             explodes. Names the time, and the joint beyond its limit or a step that is short
-            enough.
-        InterruptedRun: It was interrupted; a `KeyboardInterrupt` with what there is of it.
+            enough. What there is of the run is its `recording`, as that of every error which a
+            controller in Python raises.
+        InterruptedRun: It was interrupted; a `KeyboardInterrupt` with its `recording`, likewise.
 
     A reference that leaves the limits of a joint is a warning before the first step: with an end
     stop it can be meant.
@@ -160,21 +149,20 @@ def simulate(
         warnings.warn(text, CraneWarning, stacklevel=2)
     dynamics = Dynamics(machine, formulation, backend)
     ends = duration is None
-    time, rows, notes = integrate(
+    run = integrate(
         dynamics, control, initial, steps, step, method, progress, tolerance, ends=ends
     )
-    for note in notes:
+    for note in run.notes:
         warnings.warn(note, CraneWarning, stacklevel=2)
-    if len(time) <= steps and not (ends and _has_ended(control)):
-        if text := limits_passed(machine, time, rows.q):
+    if run.stop is not None:
+        interrupted = isinstance(run.stop, KeyboardInterrupt) and len(run.time)
+        if interrupted and (text := limits_passed(machine, run.time, run.rows.q)):
             warnings.warn(text, CraneWarning, stacklevel=2)
-        cut = f"cut at {time[-1]:g} s of {steps * step:g} s"
-        raise InterruptedRun(recorded(machine, control, time, rows, f"{label} ({cut})".lstrip()))
-    for text in said(
-        machine, time, rows, step, fixed(dynamics, control, method), formulation == "exact"
-    ):
+        raise stopped(machine, control, run, label, steps * step)
+    every_step = fixed(dynamics, control, method)
+    for text in said(machine, run.time, run.rows, step, every_step, formulation == "exact"):
         warnings.warn(text, CraneWarning, stacklevel=2)
-    found = recorded(machine, control, time, rows, label)
+    found = recorded(machine, control, run.time, run.rows, label)
     if text := tipping(found):
         warnings.warn(text, CraneWarning, stacklevel=2)
     return found
@@ -191,8 +179,8 @@ def integrate(
     tolerance: float | None = None,
     chart: Chart | None = None,
     ends: bool = False,
-) -> tuple[Array, Parts, list[str]]:
-    """What `simulate` computes, without channels; see there for arguments and errors.
+) -> Run:
+    """What `simulate` computes, without channels; see there for arguments.
 
     Args:
         dynamics: The machine.
@@ -207,9 +195,12 @@ def integrate(
         ends: Whether to end where what commands the valves has no more to do.
 
     Returns:
-        Times (N,), what `crane.simulation.integration.row_layout` names, (N, .) each, and what is
-        to be said of the motion. N is smaller than there are steps where it was interrupted, or
-        has ended.
+        The run, shorter than asked for where something stopped it, or where levers have ended.
+
+    Raises:
+        InputError: As `simulate`.
+        LimitError: Likewise.
+        SimulationError: It cannot begin.
     """
     machine = dynamics.machine
     q_a, v_a = start_of(machine, initial, control)
@@ -241,23 +232,26 @@ def integrate(
         if ends and done and _has_ended(control):
             raise _EndedError
 
+    run = Run(times, rows, layout, integration.notes)
     try:
         integration.run(times[:-1], state, step, rows, report)
         rows[-1] = integration.last(times[-1], state)
+    except _EndedError:
+        run = run.until(integration.done, None)
     except HaltedError as halt:
         finer, done = integration.finer(times[:-1], rows, step), integration.done
         q_a = layout.view(rows[:done]).q[:, machine.closure.active]
-        raise explained(
-            machine, halt, times[:done], q_a, reference_of(control, machine), finer
-        ) from None
-    except (KeyboardInterrupt, _EndedError):
-        done = integration.done
-        if not done:
-            raise
-        return times[:done], layout.view(rows[:done]), integration.notes
-    if progress is not None:
-        progress(1.0)
-    return times, layout.view(rows), [*integration.notes, *chart.sticking.notes]
+        stop = explained(machine, halt, times[:done], q_a, reference_of(control, machine), finer)
+        return run.until(done, stop)
+    except (Exception, KeyboardInterrupt) as stop:  # a controller in Python may raise anything
+        return run.until(integration.done, stop)
+    else:
+        run.notes.extend(chart.sticking.notes)
+        if progress is not None:
+            progress(1.0)
+    if found := fault(machine, run.time, run.rows, step, dynamics.formulation == "exact"):
+        return run.until(found[0], SimulationError(found[1]))
+    return run
 
 
 def _has_ended(control: Controller) -> bool:

@@ -157,14 +157,13 @@ def _added(
     machine: Machine,
     steel: SteelCylinder,
     span: Span,
-    reached: range,
+    reached: Span,
     shares: bool,
     notes: Sequence[str],
 ) -> AddedCylinder:
     """The result, from the postures that the cylinder reaches."""
-    lever = np.abs(span.lever[reached])
-    first, last = reached[0], reached[-1]
-    strokes = np.clip(span.length[[first, last]] - steel.retracted, 0, steel.stroke)
+    lever = np.abs(reached.lever)
+    strokes = np.clip(reached.length[[0, -1]] - steel.retracted, 0, steel.stroke)
     return AddedCylinder(
         path=file,
         name=name,
@@ -172,7 +171,7 @@ def _added(
         shares=shares,
         unit=machine.unit(span.joint),
         limits=(float(span.values[0]), float(span.values[-1])),
-        covered=(float(span.values[first]), float(span.values[last])),
+        covered=(float(reached.values[0]), float(reached.values[-1])),
         length=(float(span.length.min()), float(span.length.max())),
         strokes=(float(strokes[0]), float(strokes[1])),
         lever=(float(lever.min()), float(lever.max())),

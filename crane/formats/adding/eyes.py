@@ -12,6 +12,8 @@ from crane.description.rigid import vector
 from crane.description.tree import Joint, Vector
 from crane.machine import Machine
 
+_NEAR = 1e-5  # of the fastest coordinate, over which distances are differentiated
+
 
 @dataclass(frozen=True)
 class Eye:
@@ -89,3 +91,17 @@ def apart(machine: Machine, eyes: Sequence[Eye], q: Array) -> Array:
         return np.array([apart(machine, eyes, one) for one in q])
     one, two = (eye.place(machine, q).translation for eye in eyes)
     return np.asarray(two - one)
+
+
+def lever(machine: Machine, eyes: Sequence[Eye], q: Array, joint: str) -> float:
+    """Change of the distance of two eyes with an active joint: the lever arm [m], or a ratio.
+
+    The derivative along gamma at a closed posture (nq,), by central differences.
+
+    Raises:
+        ClosureError: The joint does not tell the posture there.
+    """
+    way = machine.closure.gamma(q)[:, machine.active.index(joint)]
+    step = _NEAR / float(np.abs(way).max())
+    ahead, back = (np.linalg.norm(apart(machine, eyes, q + x * way)) for x in (step, -step))
+    return float(ahead - back) / (2 * step)

@@ -5,25 +5,31 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from crane.common.errors import CraneError, CraneWarning, InputError
+from crane.common.errors import CraneWarning, InputError
+from crane.common.magnitudes import LONGEST
 from crane.formats.adding.eyes import Eye
-from crane.formats.adding.span import Span
+from crane.formats.adding.span import Span, last_posture
 from crane.formats.adding.steel import SteelCylinder
 from crane.machine import Machine
 
 _STILL = 1e-9  # rate against the joint's, below which something does not move
-_RESOLVED = 1e-4  # of the stroke, to which its reachable part is told
+_RESOLVED = 1e-6  # of the stroke, to which its reachable part is told
 
 
 def fitted(
     span: Span, steel: SteelCylinder, eyes: Sequence[Eye], machine: Machine
-) -> tuple[int, range]:
-    """Index of the home posture and range of those reached, told where that is not all.
+) -> tuple[int, Span]:
+    """Index of the home posture and the part that is reached, told where that is not all.
 
     Raises:
-        InputError: There are none.
+        InputError: There is none, or the machine is not in metres.
     """
     ends = steel.retracted, steel.retracted + steel.stroke
+    if span.length.min() > LONGEST:
+        raise InputError(
+            f"'{eyes[0]}' and '{eyes[1]}' are {span.length.min():.4g} m apart and more, farther "
+            f"than a machine is large: look at its units with crane check, lengths are metres"
+        )
     lengths = f"{span.length.min():.4g} to {span.length.max():.4g} m"
     unit = machine.unit(span.joint)
     values = f"{span.values[0]:.4g} to {span.values[-1]:.4g} {unit}"
@@ -37,13 +43,16 @@ def fitted(
             "another stroke, dead length or eyes"
         )
     start, reached = found
-    if len(reached) < len(span.values):
+    if any(reached.values[k] != span.values[k] for k in (0, -1)):
         index = machine.active.index(span.joint)
         endless = bool(np.isinf([machine.lower[index], machine.upper[index]]).all())
-        a, b = span.values[reached[0]], span.values[reached[-1]]
-        inside = (span.length >= ends[0]) & (span.length <= ends[1])
-        beyond = [k for k in (reached[0] - 1, reached[-1] + 1) if 0 <= k < len(inside)]
-        dead = [f"{span.values[k]:.4g}" for k in beyond if inside[k]]
+        a, b = reached.values[[0, -1]]
+        dead = [
+            f"{reached.values[k]:.4g}"
+            for k in (0, -1)
+            if reached.values[k] != span.values[k]
+            and np.abs(reached.length[k] - ends).min() > _RESOLVED * steel.stroke
+        ]
         what = f", with a dead centre at {' and '.join(dead)}" if dead else ""
         if dead or not endless:  # else its range is what the stroke makes of it
             warnings.warn(
@@ -80,26 +89,13 @@ def warn_of_strokes(machine: Machine, name: str) -> None:
     """Warn of strokes that the linkage does not let the cylinder have."""
     if name not in machine.active:  # it shares the load: others say how far they go
         return
-    index, home = machine.active.index(name), machine.home[machine.closure.active]
-
-    def closes(stroke: float) -> bool:
-        target = home.copy()
-        target[index] = stroke
-        try:
-            machine.closure.solve(target)
-        except CraneError:
-            return False
-        return True
-
-    lost = []
+    index, home = machine.active.index(name), machine.home
+    within, lost = _RESOLVED * machine.upper[index], []
     for end in (float(machine.lower[index]), float(machine.upper[index])):
-        good, bad = float(home[index]), end
-        if closes(end):
-            continue
-        while abs(bad - good) > _RESOLVED * machine.upper[index]:
-            middle = (good + bad) / 2
-            good, bad = (middle, bad) if closes(middle) else (good, middle)
-        lost.append(f"{min(good, end):.4g} to {max(good, end):.4g} m")
+        start = float(home[machine.column(name)]), home
+        last, _ = last_posture(machine, name, start, end, within)
+        if abs(end - last) > within:
+            lost.append(f"{min(last, end):.4g} to {max(last, end):.4g} m")
     if lost:
         warnings.warn(
             f"the linkage does not close at {' and '.join(lost)} of the stroke of '{name}', "

@@ -1,7 +1,7 @@
 """How long a cylinder has to be over the range of the joint that it drives."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,13 +9,17 @@ import numpy as np
 from crane.closure.choice import units
 from crane.common.errors import CraneError, InputError
 from crane.common.samples import Array
-from crane.formats.adding.eyes import Eye, apart, path_between
+from crane.formats.adding.eyes import Eye, apart, lever, path_between
 from crane.machine import Machine
 
 _GRID = 400  # postures over the range of the joint
 _COARSE = 24  # the same while it is not known which joint
 _STILL = 1e-9  # change of the length, as a share of it, that is none
+_CLOSING = 1e-7  # share of the range to which it is known where the machine still closes
+_ROUNDING = 1e-15  # of a coordinate's size
 _DEAD = 0.02  # share of the best lever arm below which a posture is as good as a dead centre
+
+Sample = tuple[float, Array]  # a coordinate and the posture (nq,) there
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,8 @@ class Span:
     """The distance between two eyes over the range of one active joint, others at home.
 
     Attributes:
+        machine: Whose they are.
+        eyes: The two.
         joint: The joint.
         values: (N,) its coordinates where the machine closes [m], [rad].
         q: (N, nq) postures.
@@ -31,6 +37,8 @@ class Span:
         others: Joints that a cylinder could drive instead.
     """
 
+    machine: Machine
+    eyes: Sequence[Eye]
     joint: str
     values: Array
     q: Array
@@ -41,9 +49,9 @@ class Span:
     @property
     def lever(self) -> Array:
         """(N,) change of the length with the coordinate: the lever arm [m], or a ratio."""
-        return np.asarray(np.gradient(self.length, self.values))
+        return np.array([lever(self.machine, self.eyes, q, self.joint) for q in self.q])
 
-    def driven(self, least: float, most: float) -> "tuple[int, range] | None":
+    def driven(self, least: float, most: float) -> "tuple[int, Span] | None":
         """Where a cylinder of that length drives the joint.
 
         Args:
@@ -53,23 +61,58 @@ class Span:
         Returns:
             The posture to start from: home, or the nearest to it with a length between and a
             lever arm; and what is reached from there before the stroke ends or a dead centre
-            comes. None where no posture has such a length.
+            comes, its ends found between the postures. None where no posture has such a length.
         """
         slack = 1e-9 * most
         fits = (self.length >= least - slack) & (self.length <= most + slack)
-        lever = self.lever
-        able = fits & (np.abs(lever) > _DEAD * np.abs(lever).max())
+        rates = np.abs(np.gradient(self.length, self.values))
+        able = fits & (rates > _DEAD * rates.max())
         if not able.any():
             return None
         start = int(min(np.flatnonzero(able), key=lambda k: abs(int(k) - self.home)))
-        good = fits & (lever * lever[start] > 0)
-        ends = []
-        for step in (-1, 1):
-            k = start
-            while 0 <= k + step < len(good) and good[k + step]:
-                k += step
-            ends.append(k)
-        return start, range(ends[0], ends[1] + 1)
+        levers = self.lever
+        good = fits & (levers * levers[start] > 0)
+
+        def drives(q: Array) -> bool:
+            length = float(np.linalg.norm(apart(self.machine, self.eyes, q)))
+            if not least - slack <= length <= most + slack:
+                return False
+            return lever(self.machine, self.eyes, q, self.joint) * levers[start] > 0
+
+        first = last = start
+        while first > 0 and good[first - 1]:
+            first -= 1
+        while last + 1 < len(good) and good[last + 1]:
+            last += 1
+        within = _ROUNDING * max(abs(self.values[0]), abs(self.values[-1]))
+        samples = list(zip(self.values, self.q, strict=True))
+        reached = samples[first : last + 1]
+        if first > 0:
+            beyond = self.values[first - 1]
+            reached.insert(
+                0, last_posture(self.machine, self.joint, reached[0], beyond, within, drives)
+            )
+        if last + 1 < len(good):
+            beyond = self.values[last + 1]
+            reached.append(
+                last_posture(self.machine, self.joint, reached[-1], beyond, within, drives)
+            )
+        at = start - first + (first > 0)
+        return start, Span.of(self.machine, self.eyes, self.joint, reached, at)
+
+    @classmethod
+    def of(
+        cls,
+        machine: Machine,
+        eyes: Sequence[Eye],
+        joint: str,
+        samples: Sequence[Sample],
+        home: int,
+    ) -> "Span":
+        """The span over some postures, that at home among them."""
+        values, q = (np.array(part) for part in zip(*samples, strict=True))
+        length = np.linalg.norm(apart(machine, eyes, q), axis=1)
+        return cls(machine, eyes, joint, values, q, length, home)
 
 
 def span_of(machine: Machine, eyes: Sequence[Eye]) -> Span:
@@ -94,7 +137,7 @@ def span_of(machine: Machine, eyes: Sequence[Eye]) -> Span:
         span = _scanned(machine, eyes, joint, _COARSE)
         change = np.ptp(span.length) / max(span.length.max(), 1e-300)
         if len(span.length) > 1 and change > _STILL:
-            at_home = abs(float(span.lever[span.home]))
+            at_home = abs(lever(machine, eyes, span.q[span.home], joint))
             found[joint] = at_home * scale[machine.column(joint)]
     if not found:
         raise InputError(
@@ -121,25 +164,59 @@ def _scanned(machine: Machine, eyes: Sequence[Eye], joint: str, count: int) -> S
     targets = np.tile(machine.home[machine.closure.active], (len(values), 1))
     targets[:, index] = values
     try:
-        q = machine.closure.solve(targets)
-        kept = range(len(values))
+        samples = list(zip(values, machine.closure.solve(targets), strict=True))
     except CraneError:  # part of the range cannot be closed
-        q, kept = _outwards(machine, targets, at)
-    length = np.linalg.norm(apart(machine, eyes, q), axis=1)
-    return Span(joint, values[kept.start : kept.stop], q, length, at - kept.start)
+        before, after = (
+            _outwards(machine, joint, (home, np.array(machine.home)), rest.tolist())
+            for rest in (values[:at][::-1], values[at + 1 :])
+        )
+        samples, at = [*before[::-1], (home, np.array(machine.home)), *after], len(before)
+    return Span.of(machine, eyes, joint, samples, at)
 
 
-def _outwards(machine: Machine, targets: Array, at: int) -> tuple[Array, range]:
-    """Postures from that at home on to both sides, as far as the machine closes."""
-    found, ends = {at: np.array(machine.home)}, [at, at]
-    for side, step in enumerate((-1, 1)):
-        k = at + step
-        while 0 <= k < len(targets):
-            try:
-                found[k] = machine.closure.solve(targets[k], found[k - step])
-            except CraneError:
-                break
-            ends[side] = k
-            k += step
-    kept = range(ends[0], ends[1] + 1)
-    return np.array([found[k] for k in kept]), kept
+def _outwards(
+    machine: Machine, joint: str, sample: Sample, values: Sequence[float]
+) -> list[Sample]:
+    """Postures behind one, at coordinates of a joint, and the last at which the machine closes."""
+    found: list[Sample] = []
+    for value in values:
+        posture = _posture(machine, joint, value, sample[1])
+        if posture is None:
+            within = _CLOSING * abs(value - sample[0])
+            return [*found, last_posture(machine, joint, sample, value, within)]
+        sample = value, posture
+        found.append(sample)
+    return found
+
+
+def last_posture(
+    machine: Machine,
+    joint: str,
+    sample: Sample,
+    beyond: float,
+    within: float,
+    holds: Callable[[Array], bool] = lambda q: True,
+) -> Sample:
+    """The last posture, between one and a coordinate beyond, that closes and where it holds.
+
+    By bisection, until it is known to `within`.
+    """
+    value, q = sample
+    while abs(beyond - value) > within:
+        middle = (value + beyond) / 2
+        posture = _posture(machine, joint, middle, q)
+        if posture is not None and holds(posture):
+            value, q = middle, posture
+        else:
+            beyond = middle
+    return value, q
+
+
+def _posture(machine: Machine, joint: str, value: float, guess: Array) -> Array | None:
+    """Posture with a joint at a coordinate, others at home; None where it does not close."""
+    target = machine.home[machine.closure.active]
+    target[machine.active.index(joint)] = value
+    try:
+        return machine.closure.solve(target, guess)
+    except CraneError:
+        return None

@@ -1,13 +1,15 @@
 """A hydraulic cylinder of steel: its masses and what is drawn, from bore, rod and stroke."""
 
 import math
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 from lxml import etree
 
-from crane.common.errors import InputError
+from crane.common.errors import CraneWarning, InputError
+from crane.common.magnitudes import LONGEST, doubt, meant
 from crane.common.samples import as_number
 from crane.description.rigid import inertial
 from crane.description.tree import Inertial
@@ -64,6 +66,12 @@ class SteelCylinder:
         for what, value in given.items():
             if as_number(value, f"the {what}", "m") <= 0:
                 raise InputError(f"the {what} is {value:g} m, it must be positive")
+            usual = "stroke" if what == "dead length" else what
+            if value > LONGEST:
+                looks = meant(usual, value) or ", longer than any part of a machine, give metres"
+                raise InputError(f"the {what} is {value:g} m{looks}")
+            if text := doubt(usual, value):
+                warnings.warn(f"the {what} {text}", CraneWarning, stacklevel=4)
         bore, rod, stroke = float(bore), float(rod), float(stroke)
         return cls(bore, rod, stroke, stroke + 4 * bore if dead_length is None else dead_length)
 

@@ -12,13 +12,13 @@ import numpy as np
 from lxml import etree
 
 from crane.common.errors import CraneWarning
+from crane.common.magnitudes import LONGEST
 from crane.common.samples import Array
 from crane.description import MachineSpec, inertia_problem
 from crane.formats.check.geometry import Bounds, extents, numbers
 from crane.formats.visuals.visuals import Drawn, Mesh, read_drawn
 from crane.formats.xml import XmlFile
 
-_FAR = 50.0  # [m], a length that no part of a machine has
 _TURN = 2 * math.pi
 _NO_LIMIT = 3600.0  # [rad] from which on limits stand for none, in whatever unit
 _WIDE, _SLIM = 4.0, 0.01  # radius of gyration by the size of what is drawn
@@ -73,12 +73,12 @@ def _warn_lengths(xml: XmlFile) -> bool:
         for element in xml.root.iter(tag)
     )
     for element, values in given:
-        if values is not None and np.abs(values).max() > _FAR:
+        if values is not None and np.abs(values).max() > LONGEST:
             far = values[np.abs(values).argmax()]
             found.append((element, f"{far:g} m in <{element.tag}> is a long way for a machine"))
     for joint in xml.root.iterfind("joint"):
         far = _largest_limit(joint)
-        if joint.get("type") == "prismatic" and _FAR < abs(far) <= _NO_LIMIT:
+        if joint.get("type") == "prismatic" and LONGEST < abs(far) <= _NO_LIMIT:
             what = f"the limit {far:g} m of joint '{joint.get('name')}' is a long way"
             found.append((joint.find("limit"), what))
     found.sort(key=lambda item: item[0].sourceline or 0)
@@ -133,7 +133,7 @@ def _warn_drawn(drawn: Drawn) -> None:
             size = np.ptp(visual.shape.vertices, axis=0)
             sizes[visual.mesh] = np.maximum(size, sizes.get(visual.mesh, 0.0))
     for mesh, size in sizes.items():
-        if size.max() > _FAR:
+        if size.max() > LONGEST:
             _warn(
                 f"{mesh} is {size.max():.3g} m large, give it "
                 'scale="0.001 0.001 0.001" if it is in millimetres'
@@ -176,7 +176,7 @@ def _misfits(
             )
         return
     size = float(np.linalg.norm(bounds[1] - bounds[0]))
-    if not _DUMMY[0] < size < _FAR:
+    if not _DUMMY[0] < size < LONGEST:
         return
     if not _SLIM < radius / size < _WIDE:
         yield (

@@ -164,9 +164,10 @@ class Track:
             )
         self.chart.sticking.switches = []
         made = (dynamics, control, motion.initial, 2 * count, 0.5 * step, motion.method)
-        time, parts, self.notes = integrate(*made, progress, motion.tolerance, self.chart)
-        if len(time) <= 2 * count:
-            raise KeyboardInterrupt
+        run = integrate(*made, progress, motion.tolerance, self.chart)
+        if run.stop is not None:
+            raise run.stop
+        time, parts, self.notes = run.time, run.rows, run.notes
         self.time, self.own, self._step, self.rest = time, parts.own.shape[1], step, False
         _beside_dead_centres(self.chart, time, parts.q)
         self.stiff = control.circuit.stiff if isinstance(control, ValveDrive) else self.own

@@ -13,7 +13,7 @@ from crane.common.errors import OutputError, RecordingError
 from crane.common.output import replacing
 from crane.machine import Machine
 from crane.recordings.overlay import differences, shift_of
-from crane.recordings.summary import points, title
+from crane.recordings.summary import label, points, title
 from crane.view.page.arrays import packed
 from crane.view.page.channels import Grid, groups
 from crane.view.page.marks import actuators, loads, springs
@@ -108,7 +108,7 @@ def _about(machine: Machine, scene: Scene, recording: "Recording | None") -> dic
     """What is known of the machine itself."""
     return {
         "machine": machine.name,
-        "task": "home posture" if recording is None else recording.task,
+        "task": "home posture" if recording is None else label(recording),
         "tree": tree(machine),
         "tip": None if machine.tip is None else place(machine, machine.tip),
         "payload": payload_place(machine),
@@ -139,7 +139,7 @@ def _runs(
     spans = share * (1.0 if other is None else 0.5)
     grid = Grid.of(recording, scene.rows, spans)
     runs: list[dict[str, Any]] = [
-        {"motion": motion(scene.time, scene.q), "axis": grid.axis(), "label": recording.task}
+        {"motion": motion(scene.time, scene.q), "axis": grid.axis(), "label": label(recording)}
     ]
     second, apart = None, []
     if other is not None:
@@ -153,7 +153,7 @@ def _runs(
             {
                 "motion": motion(other.time[rows], postures(machine, other, rows)),
                 "axis": over.axis(),
-                "label": other.task,
+                "label": label(other),
                 "shift": shift_of(recording, other),
             }
         )

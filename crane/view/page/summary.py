@@ -42,6 +42,8 @@ def run_summary(machine: Machine, recording: "Recording | None") -> dict[str, An
     facts.insert(0, ("samples", f"{count}{rate}"))
     if abs(recording.time[0]) > 1e5:  # the page shows the time from there
         facts.insert(0, ("time 0 is", f"{np.floor(recording.time[0]):.0f} s"))
+    if recording.stopped:
+        facts.insert(0, ("stopped", recording.stopped))
     if count > 1:
         facts.insert(0, ("duration", f"{summary.duration:.4g} s"))
         given, taken = mechanical_work(recording)

@@ -23,7 +23,7 @@ from crane.common.samples import Array
 from crane.common.scratch import release
 from crane.common.units import reading
 from crane.recordings.recording import FORCE_UNITS, Recording
-from crane.recordings.summary import points, subject, tip_error, title
+from crane.recordings.summary import heading, points, tip_error
 from crane.view.plots.text import plain
 from crane.view.plots.thinning import envelope, thinned
 
@@ -366,7 +366,7 @@ def _letter(axes: Axes, letters: Iterator[str]) -> None:
 
 def _caption(figure: Figure, recording: Recording) -> None:
     """What is shown, and which line is what."""
-    words = title(subject(recording), recording.task)
+    words = heading(recording)
     if words:
         figure.suptitle(plain(words), x=0.01, ha="left", fontsize=11, fontweight="bold")
     lines = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}

@@ -1,0 +1,145 @@
+"""Runs that stop before their time leave what there is of them, and say when and why."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from oracles import SliderCrank
+from typed import typed
+
+import crane
+from crane.common.errors import CraneError, SimulationError
+
+SLIDER_CRANK = Path(__file__).parent / "data" / "slider_crank.yaml"
+STOPPED = re.compile(r"at t = (\S+) s: 's' comes to a dead centre, where inverse dynamics has no")
+
+pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+
+
+def broken(error, *arguments, **options):
+    """What is left of a run that stops with an error."""
+    with pytest.raises(error) as caught:
+        crane.simulate(*arguments, **options)
+    return caught.value.recording, str(caught.value)
+
+
+def same(part, whole):
+    """One run is the start of another, to the last bit, in all columns."""
+    assert list(part) == list(whole)
+    for name in part:
+        np.testing.assert_array_equal(part[name], whole[name][: len(part.time)], err_msg=name)
+
+
+def test_errors_of_controllers_carry_the_run_until_then(mini):
+    """Whatever a controller in Python raises, until the step in which it does."""
+
+    def hold(until):
+        def law(time, q_a, v_a):
+            if time > until:
+                raise ZeroDivisionError("a law's own\nfault")
+            return [100.0, -300.0, 200.0]
+
+        return law
+
+    found, text = broken(ZeroDivisionError, mini, hold(0.05), duration=0.2, label="push")
+    assert text == "a law's own\nfault" and found.task == "push"
+    assert found.stopped == "at t = 0.05 s: a law's own fault"
+    whole = crane.simulate(mini, hold(1.0), duration=0.2)
+    assert len(found.time) == 51
+    same(found, whole)
+
+
+@pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
+def test_an_explosion_leaves_finite_numbers(mini, backend):
+    free = mini.replace(friction={}, end_stops=())
+
+    def law(time, q_a, v_a):
+        return [0.0, -2e4, 0.0]
+
+    found, text = broken(SimulationError, free, law, duration=0.5, backend=backend)
+    assert found.stopped == text and "explodes" in text
+    until = found.time[-1]
+    assert text.startswith("at t = ") and 0.0 < until <= float(text.split()[3]) + 1e-9
+    same(found, crane.simulate(free, law, duration=until, backend=backend))
+
+
+def test_a_stop_that_gains_energy_ends_it_before_the_stop_is_met(mini):
+    machine = mini.replace(friction={}, end_stops=(crane.EndStop("X1", 1e8),))
+    start = np.array([0.0, 0.0295, 0.015]), np.array([0.0, 0.3, 0.0])
+    found, text = broken(SimulationError, machine, None, start, 0.01, 1e-3, method="rk4")
+    assert found.stopped == text and "gives back" in text
+    assert found["X1"][-1] <= machine.upper[1] < found["X1"][-1] + 1e-3 * found["X1_velocity"][-1]
+
+
+def test_what_cannot_begin_leaves_nothing():
+    machine = crane.load("mini_forwarder", {"link3_G.x": 0.11, "link3_G.y": -0.01})
+    found, text = broken(SimulationError, machine, None, [0.0, 0.015, 0.005], 0.1)
+    assert found is None and text.startswith("at t = 0 s, where the motion starts")
+
+
+@pytest.mark.parametrize("form", ["csv", "npz"])
+def test_files_keep_why_a_run_stopped(slider_crank, tmp_path, form):
+    run = crane.simulate(slider_crank, duration=0.02)
+    assert run.stopped == "" and "stopped" not in repr(run)
+    cut = crane.Recording(**{**vars(run), "stopped": "at t = 0.02 s: it's over"})
+    assert repr(cut).endswith("; stopped at t = 0.02 s: it's over")
+    path = tmp_path / f"run.{form}"
+    getattr(cut, f"to_{form}")(path)
+    assert crane.Recording.read(path).stopped == cut.stopped
+    with pytest.raises(CraneError, match="stopped .* is not one line of text"):
+        crane.Recording(**{**vars(run), "stopped": "two\nlines"})
+
+
+@pytest.fixture(scope="module")
+def stopped(tmp_path_factory):
+    """A slider that is to go farther than its crank and rod reach, from the command line."""
+    folder = tmp_path_factory.mktemp("stopped")
+    (folder / "out.csv").write_text("time [s],s [m]\n0,0.37\n0.5,0.39\n1,0.43\n")
+    command = ("simulate", SLIDER_CRANK, "--active", "s", "--path", "out.csv", "--out", "run")
+    return folder / "run", typed(*command, cwd=folder), command
+
+
+def test_a_run_that_stops_is_written_and_says_so(stopped):
+    folder, result, _ = stopped
+    assert (result.returncode, result.stdout) == (2, "")
+    assert "Traceback" not in result.stderr
+    line = result.stderr.splitlines()[-1]
+    assert line.startswith("error: at t = ") and STOPPED.search(line)
+    assert line.endswith("; the run until t = 0.582 s is in run")
+    assert sorted(path.name for path in folder.iterdir()) == ["recording.csv", "summary.md"]
+    recording = crane.Recording.read(folder / "recording.csv")
+    assert recording.time[-1] == pytest.approx(0.582)
+    told = STOPPED.match(recording.stopped)
+    assert told and recording.time[-1] < float(told[1]) < recording.time[-1] + 2e-3
+    # it gets as far as crank and rod in line do
+    reach = np.sqrt((SliderCrank.r + SliderCrank.rod) ** 2 - SliderCrank.e**2)
+    last = recording["s"][-1]
+    assert last < reach < last + 2e-3 * recording["s_velocity"][-1]
+    header = (folder / "recording.csv").read_text().partition("\ntime")[0].splitlines()
+    assert f"# stopped: {recording.stopped}" in header
+    summary = (folder / "summary.md").read_text()
+    assert summary.startswith("# slider_crank: out (stopped at 0.582 s)\n")
+    assert f"**Stopped {recording.stopped}**" in summary
+
+
+def test_page_and_figure_of_a_stopped_run_say_so(stopped):
+    from crane.view.plots.recording import recording_figure
+
+    folder, _, _ = stopped
+    result = typed("view", folder, "--no-open")
+    assert result.returncode == 0, result.stderr
+    page = (folder / "view.html").read_text()
+    recording = crane.Recording.read(folder / "recording.csv")
+    assert "<title>slider_crank: out (stopped at 0.582 s)</title>" in page
+    assert f'["stopped","{recording.stopped}"]' in page
+    figure = recording_figure(recording)
+    assert figure.get_suptitle() == "slider_crank: out (stopped at 0.582 s)"
+
+
+def test_an_earlier_run_is_replaced_only_where_that_is_asked(stopped, tmp_path):
+    folder, _, command = stopped
+    before = (folder / "recording.csv").read_bytes()
+    result = typed(*command, cwd=folder.parent)
+    assert result.returncode == 2 and "is not empty" in result.stderr
+    assert (folder / "recording.csv").read_bytes() == before
