@@ -46,6 +46,7 @@ REFERENCE = "reference_"  # before the name of what a channel is the reference o
 SENSORS, IDEAL = "sensors", "ideal"  # a note of quantities themselves
 FREE = "free"  # a note of joints that nothing drives
 NAME = "machine name"  # a note where the machine's own is not that of its file
+START = "start"  # a note of a run that starts elsewhere than its machine's file says
 STOPPED = "stopped"  # a note of a run that ended before its time
 _ACCELERATION = "_acceleration"
 _LISTED = 40  # names in a message
@@ -76,6 +77,7 @@ class Recording(Brief):
         free: Those of the joints that nothing drives, whose forces are zero.
         machine_name: What the machine calls itself, "" if not known.
         stopped: When and why it ended before its time, "at t = 1.2 s: ..."; "" if it did not.
+        start: How it starts where that is not what the machine's file says, "" if it is.
     """
 
     time: Array
@@ -93,6 +95,7 @@ class Recording(Brief):
     free: tuple[str, ...] = ()
     machine_name: str = ""
     stopped: str = ""
+    start: str = ""
     copy: InitVar[bool] = True
 
     def __post_init__(self, copy: bool) -> None:
@@ -139,7 +142,7 @@ class Recording(Brief):
         units = self._units()
         for name, unit in units.items():
             timeseries.check_column(name, unit)
-        for name in ("machine", "task", "controller", "machine_name", "stopped"):
+        for name in ("machine", "task", "controller", "machine_name", "stopped", "start"):
             text = getattr(self, name)
             if text != text.strip() or not text.isprintable():
                 raise RecordingError(f"{name} {text!r} is not one line of text, give one")
@@ -338,6 +341,8 @@ class Recording(Brief):
             notes[FREE] = ", ".join(self.free)
         if self.stopped:
             notes[STOPPED] = self.stopped
+        if self.start:
+            notes[START] = self.start
         return notes
 
     @classmethod
@@ -414,6 +419,7 @@ class Recording(Brief):
             free=free,
             machine_name=table.notes.get(NAME, ""),
             stopped=table.notes.get(STOPPED, ""),
+            start=table.notes.get(START, ""),
             copy=False,
         )
 

@@ -60,6 +60,7 @@ class Summary:
         balance: How far the balance of energy is off, see `energy_balance`, likewise.
         ringing: Pressures that swing without decaying, see `limit_cycles`, likewise.
         stopped: When and why it ended before its time, "" if it did not.
+        start: How it starts where that is not what the machine's file says.
     """
 
     duration: float
@@ -70,6 +71,7 @@ class Summary:
     balance: str = ""
     ringing: str = ""
     stopped: str = ""
+    start: str = ""
 
     def to_markdown(self) -> str:
         """A table with one row per joint, in degrees and millimetres, and what is to be said."""
@@ -104,8 +106,9 @@ class Summary:
             rows.append(("tip", "", "", "", "", *errors))
         table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
         balance = f"energy balance: {self.balance}" if self.balance else ""
+        start = f"starts {self.start}" if self.start else ""
         end = f"**Stopped {self.stopped}**\n\n" if self.stopped else ""
-        below = (f"{text}\n" for text in (self.stability, self.ringing, balance) if text)
+        below = (f"{text}\n" for text in (start, self.stability, self.ringing, balance) if text)
         return end + "\n".join([table, *below])
 
 
@@ -210,6 +213,7 @@ def summarize(recording: Recording) -> Summary:
         balance=_balance(recording),
         ringing=ringing(recording),
         stopped=recording.stopped,
+        start=recording.start,
     )
 
 

@@ -32,6 +32,7 @@ class Run(NamedTuple):
         array: (N, .) rows at these instants.
         layout: Of a row, see `crane.simulation.integration.row_layout`.
         notes: What is to be said of the motion.
+        start: How it starts, where that is not what the file says.
         stop: What ended it before its time, if something did.
     """
 
@@ -39,6 +40,7 @@ class Run(NamedTuple):
     array: Array
     layout: Layout
     notes: list[str]
+    start: str = ""
     stop: BaseException | None = None
 
     @property
@@ -106,6 +108,7 @@ def recorded(
     rows: Parts,
     task: str,
     stopped: str = "",
+    start: str = "",
 ) -> Recording:
     """What the integration left as a recording.
 
@@ -116,6 +119,7 @@ def recorded(
         rows: See `integrate`.
         task: Name to put into it.
         stopped: When and why it ended before its time.
+        start: How it starts, where that is not what the file says.
     """
     active = machine.closure.active
     q_a = scratch.in_blocks(lambda part: rows.q[part][:, active], len(time))
@@ -139,6 +143,7 @@ def recorded(
         free=machine.free,
         machine_name=shortened(machine.name).strip(),
         stopped=stopped,
+        start=start,
         copy=False,
     )
 

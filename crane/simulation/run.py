@@ -47,6 +47,7 @@ from crane.simulation.integration.state import row_layout
 from crane.simulation.integration.steps import Steps
 from crane.simulation.judgement import buried, fault, limits_passed, said
 from crane.simulation.recorded import Run, recorded, stopped
+from crane.simulation.static_equilibrium import on_contacts
 
 _MOST = 4_000_000  # steps of one recording
 _FINEST, _COARSEST = 1e-13, 1e-2  # tolerances
@@ -97,7 +98,8 @@ def simulate(
             force, and valves at their neutral signal where the machine has any.
         initial: Active coordinates (n,) [m], [rad] to start at rest from, or a pair (q_a, v_a)
             with velocities [m/s], [rad/s]; the start of the controller's reference, or of its
-            levers, at rest, or else the home posture.
+            levers, at rest, or else the home posture. If not given, what stands on contacts
+            starts in static equilibrium on them, see `crane.simulation.static_equilibrium`.
         duration: [s]; that of the controller's reference or levers if not given, which ends where
             the last of their phases does.
         step: [s].
@@ -162,7 +164,7 @@ def simulate(
     every_step = fixed(dynamics, control, method)
     for text in said(machine, run.time, run.rows, step, every_step, formulation == "exact"):
         warnings.warn(text, CraneWarning, stacklevel=2)
-    found = recorded(machine, control, run.time, run.rows, label)
+    found = recorded(machine, control, run.time, run.rows, label, start=run.start)
     if text := tipping(found):
         warnings.warn(text, CraneWarning, stacklevel=2)
     return found
@@ -204,6 +206,9 @@ def integrate(
     """
     machine = dynamics.machine
     q_a, v_a = start_of(machine, initial, control)
+    start = ""
+    if initial is None:
+        q_a, start = on_contacts(dynamics, q_a)
     try:
         # from home, whatever was solved before: a run is the same to the last bit
         posture = machine.closure.solve(q_a, guess=machine.home)
@@ -232,7 +237,7 @@ def integrate(
         if ends and done and _has_ended(control):
             raise _EndedError
 
-    run = Run(times, rows, layout, integration.notes)
+    run = Run(times, rows, layout, integration.notes, start)
     try:
         integration.run(times[:-1], state, step, rows, report)
         rows[-1] = integration.last(times[-1], state)
