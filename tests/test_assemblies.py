@@ -13,7 +13,7 @@ from work import at_most
 
 import crane
 from crane.closure.assemblies import ambiguities
-from crane.common.errors import CraneWarning
+from crane.common.errors import CraneError, CraneWarning
 from crane.description import bundled
 from crane.formats.check import check
 
@@ -194,23 +194,28 @@ def home_of(path):
         return crane.load(path).home
 
 
-def test_a_home_far_from_what_the_file_says_is_told(tmp_path):
-    """The nearest assembly is taken, and that it is 1 rad off is a line, with the other one."""
+def test_a_home_far_from_what_the_file_says_is_refused_unless_asked_for(tmp_path):
+    """The nearest assembly is 0.9 rad off."""
     _, rocker, link, pin = bucket.assemblies(0.25, bucket.ZERO)[0]
     for off in (0.2, 0.9):
         said = f"  rocker: {rocker + off:.3f}\n  link: {link - off:.3f}\n  bucket: {pin:.3f}\n"
         path = bucket.write(tmp_path, 0.25, home=said)
-        which, told = assembly(path, 0.25)
-        assert which == 0
-        far = [line for line in told if "home was sought" in line]
-        assert len(far) == (off > 0.5)
-        if far:
-            assert re.search(
-                r"bucket\.yaml:8: home was sought, because from what the file says of it \w+ "
-                r"closes far off; the driven joints held, .* that was found has \w+ 0\.9\d* rad "
-                r"off: look at it with crane sketch, and keep it with crane check --write-home",
-                far[0],
-            )
+        if off < 0.5:
+            assert assembly(path, 0.25)[0] == 0
+            continue
+        with pytest.raises(CraneError) as caught:
+            crane.load(path)
+        assert re.match(
+            r"bucket\.yaml:8: the loops close only far from the home that is said: \w+ is 0\.9 "
+            r"rad off; with home as said loop 'pin' is 539 mm open, and would close with no other "
+            r"length alone; correct home or the frames; if what was found is meant, keep it with "
+            r"crane check --write-home, or take it with --arg nearest_assembly:=true",
+            str(caught.value),
+        )
+        with pytest.warns(CraneWarning, match=r"sought, because .* closes far off; the driven"):
+            crane.load(path, arguments={"nearest_assembly": True})
+        assert "home written" in typed("check", path, "--write-home").stdout
+        assert assembly(path, 0.25) == (0, [])
 
 
 def test_the_sketch_shows_all_that_are_near(tmp_path):

@@ -218,6 +218,11 @@ def test_what_cannot_be_locked():
     for lock, message in (
         ({"q12": 0.0}, "joint 'q12' to lock is unknown, did you mean 'q2'"),
         ({"q1": float("inf")}, "the coordinate to lock 'q1' at is inf"),
+        (
+            {"X1": 0.3},
+            "joint 'X1' cannot be locked at 0.3 m, beyond its limits 0 to 0.03 "
+            "(chain_b1.urdf:57), give a coordinate within them",
+        ),
         ({"q1": 0, "X1": 0.01, "X2": 0.01}, "with q1, X1, X2 locked nothing drives the machine"),
     ):
         with pytest.raises(InputError) as caught:

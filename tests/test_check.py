@@ -468,10 +468,11 @@ UNITS = [
     seen(
         "degrees",
         [
-            "four_bar.yaml:14: warning: home was sought, because from what the file says of it "
-            "rocker closes far off; the driven joints held, the nearest of 2 postures that was "
-            "found has rocker 1.53 rad off: look at it with crane sketch, and keep it with crane "
-            "check --write-home",
+            "four_bar.yaml:14: error: the loops close only far from the home that is said: rocker "
+            "is 1.53 rad off; with home as said loop 'pin' is 367 mm open, and would close with "
+            "no other length alone; correct home or the frames; if what was found is meant, keep "
+            "it with crane check --write-home, or take it with --arg nearest_assembly:=true "
+            "(arguments={'nearest_assembly': True} in Python)",
             "four_bar.yaml:14: warning: loop 'pin' can be assembled another way at home, and the "
             "file does not say which is meant; under 'home:' write coupler: 1.045, rocker: "
             "-0.5914 for the other (rocker 2.09 rad off) or coupler: -0.5875, rocker: 3.031 to "

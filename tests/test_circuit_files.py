@@ -247,10 +247,10 @@ REFUSED = {
         {"supply": {"control": "fixed", "flow": 1e-3, "relief": 2e7, "power": 1e4}},
         "power:", "limits the power of a fixed pump"),
     "no flow": ({"supply": PUMP | {"flow": 0.0}}, "flow:", "has no 'flow'"),
-    "control": ({"supply": PUMP | {"control": "sensing"}}, "control:", "none of pressure, load"),
+    "control": ({"supply": PUMP | {"control": "sensing"}}, "control:", "'sensing' is unknown, "),
     "summed with nobody": (
         {"supply": PUMP | {"power": 1e4, "summed": ["supply", "third"]}},
-        "summed:", "names 'third', give pumps with a power: supply"),
+        "summed:", "names 'third', give pumps with a power, known: supply"),
     "summed without power": (
         {"supply": PUMP | {"summed": ["supply"]}}, "summed:", "has no 'power'"),
     "curve back": (
@@ -292,7 +292,7 @@ REFUSED = {
         "nothing is joined to the accumulator 'gas'"),
     "side alone": ({"elements": {"e": LEAK | {"side": "out"}}}, "side:", "give their 'joints'"),
     "joint of nobody": ({"elements": {"e": LEAK | {"joints": ["q"]}}}, "joints:", "'q'"),
-    "kind": ({"elements": {"e": LEAK | {"type": "valve"}}}, "type:", "none of orifice"),
+    "kind": ({"elements": {"e": LEAK | {"type": "valve"}}}, "type:", "'valve' is unknown, known:"),
     "no gain": (
         {"elements": {"e": {"type": "leak", "from": "supply", "to": "tank"}}}, "e:", "'gain'"),
     "name": ({"lines": {"a b": {"volume": 1e-3}}}, "a b:", "use letters, digits, _"),

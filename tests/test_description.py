@@ -66,7 +66,7 @@ class TestValid:
         assert rocker == pytest.approx(np.arctan2(end[1], end[0] - 0.4))
 
     def test_home_guess_picks_the_branch(self, four_bar):
-        other = four_bar(swap("  coupler: -1.0\n  rocker: 1.5", "  coupler: -2.5\n  rocker: -1.5"))
+        other = four_bar(swap("  coupler: -1.0\n  rocker: 1.5", "  coupler: -2.5\n  rocker: -2.2"))
         assert other.home[2] < 0
         assert other.closure.residual(other.home) < 1e-13
 
@@ -348,6 +348,20 @@ class TestWords:
         assert known(["link2_D", "link2_E"], "link_2D") == "did you mean 'link2_D'?"
         assert known(["link2_D"], "boom") == "known: link2_D"
         assert known([]) == "there are none"
+
+    def test_of_many_names_the_nearest_are_listed_first(self):
+        names = [f"link_{i}" for i in range(40)] + ["bucket_lip", "bucket_load", "tip_fork"]
+        assert known(names, "bucketlip") == "did you mean 'bucket_lip'?"
+        told = known(names, "tip")
+        assert told.startswith("the nearest of 43 known ones are tip_fork, ")
+        assert told.count(",") == 7
+        assert "bucket_lip, bucket_load" in known(names, "Bucket")
+        assert known(names) == (
+            "known: bucket_lip, bucket_load, link_0, link_1, link_10, link_11, link_12, link_13 "
+            "and 35 more"
+        )
+        many = (f"n{i}" for i in range(10**5))
+        assert len(known(many, "x")) < 200
 
     @pytest.mark.parametrize(
         ("mass", "moments", "problem"),

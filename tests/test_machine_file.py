@@ -140,11 +140,9 @@ TEXT = [
     ),
     case(
         "control characters in a key",
-        "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, known: "
-        "active, chains, contacts, control, couplings, cutters, drives, end_stops, extends, "
-        "floating, forces, free, friction, gas_springs, ground, home, hydraulics, identification, "
-        "loads, loops, name, payload, pins, ropes, rotor_inertia, sensors, soil, source, "
-        "supports, tasks, tip",
+        "four_bar.yaml:29: unknown key 'tip  [31m' in the machine file, the nearest of 31 "
+        "known ones are tip, active, floating, friction, end_stops, rotor_inertia, "
+        "identification, home",
         swap("tip: coupler_pin", '"tip\\n\\e[31m": coupler_pin'),
     ),
     case(
@@ -163,11 +161,9 @@ KEYS = [
     ),
     case(
         "unknown key far from all",
-        "four_bar.yaml:29: unknown key 'gravity' in the machine file, known: "
-        "active, chains, contacts, control, couplings, cutters, drives, end_stops, extends, "
-        "floating, forces, free, friction, gas_springs, ground, home, hydraulics, identification, "
-        "loads, loops, name, payload, pins, ropes, rotor_inertia, sensors, soil, source, "
-        "supports, tasks, tip",
+        "four_bar.yaml:29: unknown key 'gravity' in the machine file, the nearest of 31 "
+        "known ones are friction, hydraulics, gas_springs, active, chains, drives, ground, "
+        "payload",
         swap("tip: coupler_pin", "gravity: 9.81"),
     ),
     case(

@@ -33,7 +33,7 @@ STATE = """<group_state name="home">
 
 def again(path):
     """The machine as written: the posture of before, without search."""
-    before = crane.load(path)
+    before = crane.load(path, arguments={"nearest_assembly": True})
     assert write_home(path) == path.resolve()
     after = crane.load(path)
     assert after.closure.sought is None

@@ -15,6 +15,7 @@ from crane.cli.shared import (
     arguments,
     names,
 )
+from crane.common.packages import NEAREST_ASSEMBLY
 
 
 @app.command()
@@ -36,7 +37,8 @@ def check(
     from crane.formats.check import check as check_machine
 
     driven, found = (names(active), names(free)), (packages or (), arguments(argument))
-    report = check_machine(file, *driven, floating, *found)
+    anyway = {**found[1], NEAREST_ASSEMBLY: True} if write_home else found[1]
+    report = check_machine(file, *driven, floating, found[0], anyway)
     if write_home and not report.errors:
         from crane.formats import write_home as write
 

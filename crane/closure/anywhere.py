@@ -123,8 +123,10 @@ class Search:
         self._residual, self.guess = Residual(equations), guess
         self._unit = equations.units
         self._lower, self._upper = equations.coordinates.lower, equations.coordinates.upper
-        self._said, self._more = said, more
+        self.said, self._more = said, more
         self._rates = equations.coordinates.rates
+        self._in_loops = (equations.sign != 0).any(axis=0)
+        self._turns = ~equations.coordinates.slides
         self._winds = winding(equations)
         self._endless = self._winds & np.isinf(self._upper) & np.isinf(self._lower)
 
@@ -170,7 +172,7 @@ class Search:
     def away(self, q: Array) -> tuple[float, float, float]:
         """How far a posture is from the guess: what is said, its sum of squares, all joints."""
         apart = self.apart(q, self.guess)
-        said = apart[self._said]
+        said = apart[self.said]
         return (
             round(float(said.max(initial=0.0)), 3),
             round(float(np.linalg.norm(said)), 3),
@@ -178,11 +180,24 @@ class Search:
         )
 
     def off_said(self, q: Array) -> tuple[int, float]:
-        """The joint farthest from what is said, and by how much [rad], [machine's size]."""
-        if not len(self._said):
+        """The joint whose link is farthest from where it is said to be on what carries it.
+
+        Whole turns leave it there. Links that no loop goes through, rotors on gears for one, are
+        where couplings put them, and are no matter of how loops are assembled.
+
+        Args:
+            q: (nq,).
+
+        Returns:
+            Its column, and by how much [rad], [machine's size].
+        """
+        joints = self.said[self._in_loops[self.said]]
+        if not len(joints):
             return 0, 0.0
-        apart = self.apart(q, self.guess)[self._said]
-        return int(self._said[apart.argmax()]), float(apart.max())
+        off = (q - self.guess) / self._unit
+        turned = np.remainder(off + np.pi, 2 * np.pi) - np.pi
+        apart = np.abs(np.where(self._turns, turned, off))[joints]
+        return int(joints[apart.argmax()]), float(apart.max())
 
     def farthest(self, q: Array) -> tuple[int, float]:
         """The joint that is farthest from the guess, and by how much [m], [rad]."""

@@ -14,6 +14,15 @@ far off.
 
 The first of these that closes counts, and of the postures that it finds the one that is nearest to
 the guess, see `Search.postures`.
+
+Whether a posture is what the file says shows in its links: in how far those that are in loops turn
+or slide on what carries them, see `Search.off_said`, and in the orientation of the loops. In a
+plane the determinant of the two equations of a loop for its two passive joints is
+
+    det dphi / d(q_1, q_2) = l_1 l_2 sin(angle between the links),
+
+whose sign is the side on which their pin lies: it changes where the loop is assembled the other
+way round.
 """
 
 from collections.abc import Collection, Iterator
@@ -31,7 +40,7 @@ from crane.common.samples import Array
 
 _TRIED = 4  # of the postures that are found
 _SAME = 1e-3  # difference of postures that is none [rad], or share of the machine's size
-_FAR = 0.5  # [rad], or share of the machine's size: a home that is farther off is doubted
+FAR = 0.5  # [rad], or share of the machine's size: a home that is farther off is doubted
 
 
 @dataclass(frozen=True)
@@ -43,12 +52,22 @@ class Sought:
         count: How many postures were found.
         moved: Columns of joints that are elsewhere than guessed.
         farthest: The joint that is farthest from the guess, and by how much [m], [rad].
+        off_said: The joint that is farthest from what the file says, and by how much [rad], in
+            shares of the machine's size; see `Search.off_said`.
+        reversed: Names of loops that are the other way round than in the guess.
     """
 
     reason: str
     count: int
     moved: Indices
     farthest: tuple[int, float]
+    off_said: tuple[int, float]
+    reversed: tuple[str, ...]
+
+    @property
+    def is_far(self) -> bool:
+        """Whether home is another posture than what the file says."""
+        return self.off_said[1] > FAR
 
 
 def settle(
@@ -98,14 +117,14 @@ def settle(
         usable = _usable(equations, active, passive, found[:_TRIED])
         if isinstance(usable, Structure):
             count = len(found) if first is None else others + 1
-            return usable, _sought(search, reason, count, usable.home)
+            return usable, _sought(search, equations, reason, count, passive, usable)
         if usable is not None and first is None:
             raise refused if isinstance(refused, ActiveError) else usable
     if first is None:
         raise refused
-    if search.off_said(first.home)[1] <= _FAR:
+    if search.off_said(first.home)[1] <= FAR:
         return first, None
-    return first, _sought(search, reason, others + 1, first.home)
+    return first, _sought(search, equations, reason, others + 1, passive, first)
 
 
 def within(equations: LoopEquations, q: Array) -> NDArray[np.bool_]:
@@ -122,7 +141,7 @@ def _doubt(search: Search, equations: LoopEquations, passive: Indices, home: Arr
     if len(columns):
         return f"{names[int(columns[0])]} closes outside of its limits"
     joint, off = search.off_said(home)
-    return f"{names[joint]} closes far off" if off > _FAR else ""
+    return f"{names[joint]} closes far off" if off > FAR else ""
 
 
 def _nearer(
@@ -134,9 +153,40 @@ def _nearer(
     return [q for q in found if search.away(q)[:2] < search.away(home)[:2]]
 
 
-def _sought(search: Search, reason: str, count: int, home: Array) -> Sought:
+def _sought(
+    search: Search,
+    equations: LoopEquations,
+    reason: str,
+    count: int,
+    passive: Indices,
+    structure: Structure,
+) -> Sought:
+    home = structure.home
     moved = np.flatnonzero(search.apart(home, search.guess) > CLOSED)
-    return Sought(reason, count, moved, search.farthest(home))
+    return Sought(
+        reason,
+        count,
+        moved,
+        search.farthest(home),
+        search.off_said(home),
+        _reversed(search, equations, passive, structure),
+    )
+
+
+def _reversed(
+    search: Search, equations: LoopEquations, passive: Indices, structure: Structure
+) -> tuple[str, ...]:
+    """Loops that home has the other way round than what the file says, see the module."""
+    jacobians = [equations.scaled(q)[1] for q in (structure.home, search.guess)]
+    found: list[int] = []
+    for rows, columns in structure.blocks:
+        block, joints = structure.rows[rows], passive[columns]
+        if not np.isin(joints, search.said).all():
+            continue
+        home, said = (np.linalg.slogdet(slope[np.ix_(block, joints)])[0] for slope in jacobians)
+        if home * said < 0:
+            found += [int(i) for i in equations.loop_of_row[block]]
+    return tuple(equations.names[i] for i in dict.fromkeys(found))
 
 
 def _usable(

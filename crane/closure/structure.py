@@ -35,6 +35,10 @@ class HomeError(MechanismError):
         self.reason = reason
 
 
+class OpenLoopError(HomeError):
+    """The loops do not close from the guess."""
+
+
 class ActiveError(MechanismError):
     """Too many or too few active joints.
 
@@ -276,7 +280,7 @@ def _check_closed(equations: LoopEquations, exact: Exact, q: Array, where: str, 
     if not abs(phi[worst]) <= exact.closed[worst]:  # also NaN
         loop = equations.names[equations.loop_of_row[worst]]
         gap = f"{abs(phi[worst]):.3g} {'m' if equations.is_translation[worst] else 'rad'}"
-        raise HomeError(
+        raise OpenLoopError(
             f"loop '{loop}' cannot be closed {where}: it stays {gap} open, {hint}",
             f"loop {loop}",
             f"loop '{loop}' stays {gap} open",

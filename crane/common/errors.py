@@ -4,7 +4,7 @@ A message is one line that says what is wrong, where, and what to do about it.
 """
 
 from collections.abc import Iterable
-from difflib import get_close_matches
+from difflib import SequenceMatcher, get_close_matches
 from typing import Any
 
 _WORD, _LINE = 1000, 4000  # characters of a word and of a line that anybody reads
@@ -113,16 +113,34 @@ class CraneWarning(UserWarning):
     """Something is unusual enough to be told, and not wrong enough to refuse."""
 
 
-_MANY, _LISTED = 2000, 100  # names to search for a similar one, and to write into a line
+_MANY = 2000  # names to search for a similar one
+_HOLDS = 0.7  # likeness of names of which one holds the other
+_LISTED, _NEAREST = 20, 8  # names that a line has of all, and of many: those like the wanted one
 
 
 def known(names: Iterable[str], wanted: str | None = None) -> str:
-    """Words an error ends with: the nearest of the names that exist, or all of them."""
+    """Words an error ends with: the name that was meant, all there are, or of many the nearest.
+
+    Args:
+        names: Those that exist.
+        wanted: What was asked for, and is none of them.
+    """
     names = list(names)
     if not names:
         return "there are none"
     few = len(names) <= _MANY
     if few and wanted is not None and (near := get_close_matches(wanted, names, 1, 0.75)):
         return f"did you mean '{near[0]}'?"
-    listed = sorted(names)[:_LISTED] + ["..."] * (len(names) > _LISTED)
-    return "known: " + ", ".join(listed)
+    if len(names) <= _LISTED:
+        return "known: " + ", ".join(sorted(names))
+    if wanted is None or not few:
+        return f"known: {', '.join(sorted(names)[:_NEAREST])} and {len(names) - _NEAREST} more"
+    listed = sorted(names, key=lambda name: (-_likeness(name, wanted), name))[:_NEAREST]
+    return f"the nearest of {len(names)} known ones are {', '.join(listed)}"
+
+
+def _likeness(name: str, wanted: str) -> float:
+    """How alike two names are, 0 to 1, whatever their case; more if one holds the other."""
+    name, wanted = name.lower(), wanted.lower()
+    alike = SequenceMatcher(None, name, wanted).ratio()
+    return max(alike, _HOLDS) if wanted and (wanted in name or name in wanted) else alike

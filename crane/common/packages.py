@@ -18,6 +18,10 @@ from pathlib import Path
 
 from crane.common.errors import InputError
 
+URDF_CONSTRAINT = "urdf_constraint"  # reads a URDF's <constraint> elements as loops
+NEAREST_ASSEMBLY = "nearest_assembly"  # takes an assembly that is far from what the file says
+OWN_ARGUMENTS = (URDF_CONSTRAINT, NEAREST_ASSEMBLY)  # that no file need have
+
 _MANIFESTS = ("package.xml", "model.config")
 _NAME = re.compile(rb"<name[^>]*>\s*([^<]*?)\s*</name>")
 _DEPTH, _MOST = 4, 2000  # levels below a given folder, and folders looked into
@@ -78,6 +82,18 @@ def giving(
         yield now
     finally:
         _given.reset(token)
+
+
+def asked(name: str) -> bool:
+    """Whether one of the package's own arguments is true, see `OWN_ARGUMENTS`.
+
+    Raises:
+        InputError: It is neither true nor false.
+    """
+    value = given().arguments.get(name, "false").lower()
+    if value not in ("true", "false"):
+        raise InputError(f"the argument {name} is '{value}', give true or false")
+    return value == "true"
 
 
 def _text(value: object) -> str:

@@ -41,6 +41,7 @@ PAYLOAD = "payload.mass"
 PINS = "pins."
 _LISTS = ("forces", "gas_springs", "ropes", "end_stops")
 _TURNS = ("roll", "pitch", "yaw")
+_SLACK = 1e-9  # of a limit, for rounding
 
 
 # Where a number stands: names of fields, and indices in tuples, from a link or a joint on
@@ -325,11 +326,14 @@ def locked(spec: MachineSpec, lock: Mapping[str, float]) -> MachineSpec:
         lock: Coordinate [m], [rad] by joint.
 
     Raises:
-        InputError: No such joint, no finite coordinate, or the last active joint.
+        InputError: No such joint, no finite coordinate, one beyond its limits, or the last active
+            joint.
     """
     joints = {joint.name: joint for joint in spec.tree.moving}
     held = []
     spec, lock = grounded(spec, lock)
+    for name in lock.keys() & joints.keys():
+        _check_within(joints[name], lock[name])
     lock, couplings = _coupled(spec.couplings, lock)
     for name, given in lock.items():
         if name not in joints:
@@ -491,6 +495,21 @@ def _coupled(
         )
         for coupling in rest
     )
+
+
+def _check_within(joint: Joint, given: object) -> None:
+    """Raise where a joint cannot be at a coordinate [m], [rad]."""
+    value = as_number(
+        given, f"the coordinate to lock '{joint.name}' at", "m or rad", most=FARTHEST
+    )
+    lower, upper = joint.limits.lower, joint.limits.upper
+    slack = _SLACK * max(1.0, abs(value))
+    if not lower - slack <= value <= upper + slack:
+        unit = "m" if joint.kind == "prismatic" else "rad"
+        raise InputError(
+            f"joint '{joint.name}' cannot be locked at {value:g} {unit}, beyond its limits "
+            f"{joint.limits}, give a coordinate within them"
+        )
 
 
 def _fixed(joint: Joint, value: float) -> Joint:

@@ -138,7 +138,7 @@ def find(name: str | Path) -> Path:
             "SDF (.sdf) or a MJCF (.xml)"
         )
     hint = known([*machines, *robots], text)
-    if hint.startswith("known"):
+    if not hint.startswith("did you mean"):
         more = "; crane list --robots names more" if robots else ""
         hint = f"{known(machines)}{more}"
     raise DescriptionError(f"no machine and no file is named '{text}', {hint}")

@@ -370,9 +370,8 @@ class Dynamics(Brief):
         states = [name for name in by if name in asked]
         numbers = [name for name in by if name not in ("q_a", "v_a", "a_a", "tau_a")]
         if wrong := [name for name in by if name not in (*states, *numbers)]:
-            raise InputError(
-                f"'{quantity}' does not depend on {wrong[0]}, take {', '.join(asked)}"
-            )
+            hint = known(asked, wrong[0])
+            raise InputError(f"'{quantity}' does not depend on '{wrong[0]}', {hint}")
         found: dict[str, Array] = {}
         if states:
             formula = self._compiled(SLOPES + key)

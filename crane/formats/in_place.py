@@ -12,6 +12,7 @@ import yaml
 
 from crane.common.errors import CraneError, CraneWarning, OutputError
 from crane.common.output import check_file, replacing
+from crane.common.packages import NEAREST_ASSEMBLY
 from crane.description.sources import bundled, examples
 from crane.formats.loading import load
 from crane.formats.opening import is_sdf, is_simulators
@@ -33,6 +34,7 @@ def write_home(
 ) -> Path:
     """Write the closed home posture of a machine into its file, all joints in full digits.
 
+    That also takes over an assembly that is far from what the file says, which `load` refuses.
     A machine file and a robot.yaml get it under `home:`, a URDF in `<group_state name="home">`.
     Numbers that stand there are replaced, joints that are missing are added; comments stay. A file
     that does not give the same home when it is loaded again gets its old text back.
@@ -53,7 +55,8 @@ def write_home(
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CraneWarning)
-        machine = load(name, active=active, free=free, packages=packages, arguments=arguments)
+        anyway = {**(arguments or {}), NEAREST_ASSEMBLY: True}
+        machine = load(name, active=active, free=free, packages=packages, arguments=anyway)
         path = machine.path.resolve()
         _check_place(machine, path)
         try:
@@ -96,7 +99,7 @@ def _check(path: Path, before: Machine) -> None:
             active=before.chosen.get("active"),
             free=before.chosen.get("free"),
             packages=before.packages,
-            arguments=before.arguments,
+            arguments={x: v for x, v in before.arguments.items() if x != NEAREST_ASSEMBLY},
         )
     except CraneError as error:
         raise OutputError(f"{path}: home cannot be written into it ({error})") from None

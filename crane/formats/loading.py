@@ -12,6 +12,7 @@ from weakref import WeakKeyDictionary
 import pinocchio as pin
 
 from crane.closure import Closure
+from crane.closure.structure import OpenLoopError
 from crane.common.counted import few_warnings
 from crane.common.errors import CraneWarning, DescriptionError, InputError
 from crane.common.packages import giving, package_folders, values_by_name
@@ -19,7 +20,7 @@ from crane.description import Coupling, LoopSpec, MachineSpec, changed, driven, 
 from crane.description.floating import floated, freedoms_of
 from crane.description.sources import WITH, find
 from crane.formats.ambiguity import warn_of_assemblies
-from crane.formats.home import warn_of_home
+from crane.formats.home import check_home, with_remedy
 from crane.formats.machine_file.read import read
 from crane.machine.assemble import assemble, closed, home_guess
 from crane.machine.between import check_elements
@@ -59,7 +60,8 @@ def load(
             `$(find ...)`, or folders in which these are, see `crane.common.packages`.
         arguments: Values of the arguments of a xacro file; `model` of an SDF with several models;
             `urdf_constraint`, true where a URDF's `<constraint>` elements, as proposed upstream,
-            are to be read as loops, see `crane.formats.urdf.constraints`.
+            are to be read as loops, see `crane.formats.urdf.constraints`; `nearest_assembly`, true
+            to take an assembly that is far from the home that a file says.
         strict: Whether to refuse, as `check` does, what can be computed with in spite of its
             form: inertias that no body has, see `crane.machine.masses`.
 
@@ -183,7 +185,9 @@ def _assembled(
     if lock:
         spec = locked(spec, lock)
     model = assemble(spec)
-    closure = known(model, spec.loops, spec.couplings) or _closed(spec, model)
+    closure = known(model, spec.loops, spec.couplings) or _closed(
+        spec, model, bool(changes or lock)
+    )
     _UNCHANGED[closure] = unchanged
     spec, model = with_computable_inertias(spec, model, closure)
     check_masses(spec, model, closure)
@@ -240,10 +244,13 @@ def _of_alike(
     return next((closure for closure in found if closure is not None), None)
 
 
-def _closed(spec: MachineSpec, model: pin.Model) -> Closure:
+def _closed(spec: MachineSpec, model: pin.Model, varied: bool) -> Closure:
     guess = home_guess(spec, model)
-    closure = closed(spec, model, guess)
-    warn_of_home(spec, closure)
+    try:
+        closure = closed(spec, model, guess)
+    except OpenLoopError as error:
+        raise error if varied else with_remedy(spec, model, guess, error) from None
+    check_home(spec, closure, guess, varied)
     warn_of_assemblies(spec, closure, guess)
     return closure
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from crane.common.errors import known
 from crane.hydraulics.numbers import PartError, above, check_numbers, positive
 
 KINDS = ("orifice", "check", "relief", "leak")
@@ -97,9 +98,9 @@ class Element:
     def __post_init__(self) -> None:
         check_numbers(self, "the element")
         if self.kind not in KINDS:
-            raise PartError("type", f"element '{self.kind}' is none of {', '.join(KINDS)}")
+            raise PartError("type", f"element '{self.kind}' is unknown, {known(KINDS, self.kind)}")
         if self.side not in SIDES:
-            raise PartError("side", f"side '{self.side}' is none of {', '.join(SIDES)}")
+            raise PartError("side", f"side '{self.side}' is unknown, {known(SIDES, self.side)}")
         if self.side != "both" and not self.joints:
             raise PartError("side", f"side '{self.side}' is that of valves, give their 'joints'")
         by = "coefficient" if self.kind in ("orifice", "check") else "gain"

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from crane.common.errors import known
 from crane.common.magnitudes import meant
 from crane.hydraulics.numbers import PartError, PlacedError, above, check_numbers, positive
 
@@ -90,9 +91,8 @@ class Supply:
                 ),
             )
         if self.control not in CONTROLS:
-            raise PartError(
-                "control", f"control '{self.control}' is none of {', '.join(CONTROLS)}"
-            )
+            hint = known(CONTROLS, self.control)
+            raise PartError("control", f"control '{self.control}' is unknown, {hint}")
         if not self.flow and (self.control != "pressure" or self.power or self.response):
             raise PartError(
                 "flow", "a regulated pump has no 'flow', give the most that it delivers"
@@ -172,10 +172,10 @@ def check_summed(supplies: dict[str, Supply]) -> None:
     for name, supply in supplies.items():
         for other in supply.summed:
             if other not in supplies or not supplies[other].power:
-                known = ", ".join(x for x, y in supplies.items() if y.power)
+                hint = known((x for x, y in supplies.items() if y.power), other)
                 raise PlacedError(
                     (*_place(name), "summed"),
-                    f"'summed' of '{name}' names '{other}', give pumps with a power: {known}",
+                    f"'summed' of '{name}' names '{other}', give pumps with a power, {hint}",
                 )
 
 

@@ -9,7 +9,7 @@ import pinocchio as pin
 from crane.closure import Closure, frame_id
 from crane.closure.coordinates import Coordinates
 from crane.closure.equations import LoopEquations
-from crane.closure.structure import ActiveError
+from crane.closure.structure import ActiveError, OpenLoopError
 from crane.common.errors import DescriptionError, MechanismError, at
 from crane.common.samples import Array
 from crane.description import LoopSpec, MachineSpec, inertia_problem
@@ -63,7 +63,8 @@ def closed(
         loops: Loops to close, if not all.
 
     Raises:
-        MechanismError: The parts do not make a machine that can be driven; with file and line.
+        OpenLoopError: A loop does not close; with file and line.
+        MechanismError: The parts do not make a machine that can be driven; likewise.
     """
     loops = spec.loops if loops is None else loops
     # while findings are collected, joints that close rings are no part of the tree
@@ -88,7 +89,10 @@ def closed(
         closure = _completed(spec, model, guess, loops, error)
         if closure is not None:
             return closure
-    raise MechanismError(at(spec.where.get(error.about, spec.path.name), error), error.about)
+    text = at(spec.where.get(error.about, spec.path.name), error)
+    if isinstance(error, OpenLoopError):
+        raise OpenLoopError(text, error.about, error.reason)
+    raise MechanismError(text, error.about)
 
 
 def _closure(

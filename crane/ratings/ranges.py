@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from crane.common.errors import InputError
+from crane.common.errors import InputError, known
 from crane.common.samples import as_number
 from crane.common.shown import Brief
 from crane.machine import Machine
@@ -51,10 +51,8 @@ class WorkingRange(Brief):
         for one in self.dimensions:
             if one.name == name:
                 return one
-        raise InputError(
-            f"'{name}' is no dimension of '{self.machine.name}', known: "
-            + ", ".join(one.name for one in self.dimensions)
-        )
+        hint = known((one.name for one in self.dimensions), name)
+        raise InputError(f"'{name}' is no dimension of '{self.machine.name}', {hint}")
 
     def to_markdown(self) -> str:
         """A table: each dimension, where it is, and how it is defined."""

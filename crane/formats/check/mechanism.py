@@ -9,12 +9,13 @@ from crane.closure import Closure
 from crane.closure.equations import LoopEquations
 from crane.closure.exactness import least_squares_step
 from crane.closure.home import within
+from crane.closure.structure import OpenLoopError
 from crane.common.errors import CraneWarning, MechanismError
 from crane.common.samples import Array
 from crane.description import MachineSpec
 from crane.description.findings import Findings, flag
 from crane.formats.ambiguity import warn_of_assemblies
-from crane.formats.home import warn_of_home
+from crane.formats.home import check_home, with_remedy
 from crane.machine.assemble import assemble, closed, home_guess
 from crane.machine.between import check_elements
 from crane.machine.masses import check_masses, with_computable_inertias
@@ -55,7 +56,7 @@ def check_mechanism(spec: MachineSpec, found: Findings) -> Closure | None:
     check_masses(spec, model, closure)
     check_elements(spec, closure)
     _warn_of_limits(spec, closure)
-    warn_of_home(spec, closure)
+    check_home(spec, closure, guess)
     warn_of_assemblies(spec, closure, guess, thorough=True)
     return closure
 
@@ -64,7 +65,9 @@ def _note_with_gaps(
     spec: MachineSpec, model: pin.Model, guess: Array, error: MechanismError
 ) -> None:
     """Note an error; where loops stay open, how far each does."""
-    gaps = _gaps(spec, model, guess) if "cannot be closed" in str(error) else {}
+    gaps = {}
+    if isinstance(error, OpenLoopError):
+        gaps, error = _gaps(spec, model, guess), with_remedy(spec, model, guess, error)
     apart = gaps.pop(error.about, "")
     flag(MechanismError(f"{error}{f' (it is {apart})' if apart else ''}", error.about))
     for about, gap in gaps.items():

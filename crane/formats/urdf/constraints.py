@@ -21,13 +21,14 @@ As long as that is not accepted it may change, so it is read only where that is 
 import numpy as np
 from lxml import etree
 
-from crane.common.errors import InputError, known
-from crane.common.packages import given
+from crane.common.errors import known
+from crane.common.packages import URDF_CONSTRAINT, asked
 from crane.description.findings import recoverable
 from crane.formats.xml import XmlFile
 
-ASKED = "urdf_constraint"  # the argument that asks for it
-HINT = f"read it by --arg {ASKED}:=true, arguments={{'{ASKED}': True}} in Python"
+HINT = (
+    f"read it by --arg {URDF_CONSTRAINT}:=true, arguments={{'{URDF_CONSTRAINT}': True}} in Python"
+)
 _LOOPS = {
     "revolute": "revolute", "prismatic": "prismatic", "spherical": "spherical", "link": "fixed",
 }  # fmt: skip
@@ -51,20 +52,13 @@ def read_constraints(xml: XmlFile) -> None:
         DescriptionError: One is malformed, or of a type that no `<loop>` has.
         InputError: The argument that asks for it is neither true nor false.
     """
-    if not _asked():
+    if not asked(URDF_CONSTRAINT):
         return
     for element in xml.root.findall("constraint"):
         with recoverable():
             _translate(xml, element)
             continue
         xml.root.remove(element)  # what is wrong with it was noted
-
-
-def _asked() -> bool:
-    value = given().arguments.get(ASKED, "false").lower()
-    if value not in ("true", "false"):
-        raise InputError(f"the argument {ASKED} is '{value}', give true or false")
-    return value == "true"
 
 
 def _translate(xml: XmlFile, element: etree._Element) -> None:

@@ -1,6 +1,6 @@
 """Home posture and tip in a URDF, for which URDF+ has no place: elements of SRDF."""
 
-from collections.abc import Container, Mapping
+from collections.abc import Collection, Container, Mapping
 
 from lxml import etree
 
@@ -11,7 +11,7 @@ from crane.formats.xml import XmlFile
 _HOME, _TIP = "home", "tip"
 
 
-def read_home(xml: XmlFile, joints: Container[str]) -> tuple[dict[str, float], dict[str, str]]:
+def read_home(xml: XmlFile, joints: Collection[str]) -> tuple[dict[str, float], dict[str, str]]:
     """Coordinates of `<group_state name="home">`, and where each was written.
 
     Args:
@@ -58,11 +58,12 @@ def read_tip(xml: XmlFile, links: Mapping[str, etree._Element]) -> str | None:
 
 
 def _coordinate(
-    xml: XmlFile, joint: etree._Element, joints: Container[str], before: Container[str]
+    xml: XmlFile, joint: etree._Element, joints: Collection[str], before: Container[str]
 ) -> tuple[str, float]:
     name = joint.get("name", "").strip()
     if name not in joints:
-        what = f"home names the joint '{name}', which is unknown or does not move, correct it"
+        hint = known(joints, name)
+        what = f"home names the joint '{name}', which is unknown or does not move, {hint}"
         error: DescriptionError = xml.fail(joint, what)
         raise error
     value = xml.number(joint, "value", f"home of '{name}'")

@@ -10,8 +10,7 @@ from lxml import etree
 
 from crane.common.errors import CraneError, DescriptionError, InputError, known
 from crane.common.extras import how
-from crane.common.packages import given
-from crane.formats.urdf.constraints import ASKED
+from crane.common.packages import OWN_ARGUMENTS, given
 from crane.formats.xacro import process
 from crane.formats.xml import Places, XmlFile
 
@@ -91,5 +90,5 @@ def _refused(file: Path, told: dict[str, Any]) -> CraneError:
 
 def _check_arguments(file: Path, has: list[str]) -> None:
     for name in given().arguments:
-        if name not in (*has, ASKED):
+        if name not in (*has, *OWN_ARGUMENTS):
             raise InputError(f"{file.name} has no argument '{name}', {known(has, name)}")

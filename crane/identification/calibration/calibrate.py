@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from crane.common.errors import InputError, RecordingError, at
+from crane.common.errors import known as known_names
 from crane.common.samples import Array
 from crane.common.threads import on_one_thread
 from crane.common.waiting import telling
@@ -193,7 +194,7 @@ def _case(
         found = sensors_of(machine, table)
         for name in sensors or ():
             if name not in found:
-                raise InputError(f"'{name}' cannot be compared, choose among {', '.join(found)}")
+                raise InputError(f"'{name}' cannot be compared, {known_names(found, name)}")
         found = found if sensors is None else list(sensors)
         known = known_sensors(table, machine)
         return case_of(machine, Path(path).name, table, known, found, window)

@@ -171,7 +171,7 @@ def _unit(every: Mapping[str, str], name: str) -> str:
     if name.startswith(INCLINATION):
         return "rad/s" if name.endswith(VELOCITY) else "rad"
     if name not in every:
-        raise InputError(f"'{name}' cannot be compared, choose among {', '.join(every)}")
+        raise InputError(f"'{name}' cannot be compared, {known(every, name)}")
     return every[name]
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from crane.common.errors import InputError
+from crane.common.errors import InputError, known
 from crane.common.samples import Array
 from crane.common.shown import Brief
 from crane.common.threads import on_one_thread
@@ -179,7 +179,7 @@ def identify_orifices(
         RecordingError: Columns missing, or samples that cannot serve.
     """
     if method not in METHODS:
-        raise InputError(f"method '{method}' is unknown, known: {', '.join(METHODS)}")
+        raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
     cylinder, _ = parts(machine, joint)
     if cylinder.counterbalance_a or cylinder.counterbalance_b:
         raise InputError(

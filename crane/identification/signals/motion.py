@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from crane.common.errors import InputError, RecordingError
+from crane.common.errors import InputError, RecordingError, known
 from crane.common.samples import Array, as_number
 from crane.common.shown import Brief
 from crane.identification.signals.smoother import smooth
 
+METHODS = ("kalman", "lowpass")
 _FEWEST = 50  # samples
 _LONGEST_GAP = 5.0  # steps
 _JITTER = 0.01  # steps
@@ -87,8 +88,8 @@ def differentiate(
         RecordingError: Samples are not equidistant, or too few.
     """
     step = sampling(time)
-    if method not in ("kalman", "lowpass"):
-        raise InputError(f"method '{method}' is unknown, known: kalman, lowpass")
+    if method not in METHODS:
+        raise InputError(f"method '{method}' is unknown, {known(METHODS, method)}")
     if (method == "lowpass") != (cutoff is not None):
         verb = "needs" if cutoff is None else "estimates its own and takes no"
         raise InputError(f"method '{method}' {verb} cutoff, give one to 'lowpass' alone")

@@ -1,0 +1,264 @@
+"""The number of a description that keeps its loops from closing where the file says home is.
+
+A linkage of which one length is wrong does not close at the home that its file says, or only far
+from it. With p a length and q_P the passive joints, the question of each length is which change
+of it closes the loops with the joints nearest to where they are said to be:
+
+    min |q_P - said|^2    such that    phi(q_P, p) = 0,
+
+by Newton's method; phi is linear in p, which places a pin. The wrong length leaves the joints
+where they are said to be, but for the digits; any other one turns them. Where the file says no
+passive joint, it is the least change with which the loops close at all. Driven joints at home are
+tried like lengths.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from crane.closure.equations import LoopEquations
+from crane.closure.exactness import DIGITS
+from crane.closure.structure import Indices
+from crane.common.samples import Array
+from crane.description import LoopSpec, MachineSpec
+from crane.description.changes import number_at, tree_numbers
+from crane.machine.assemble import assemble
+from crane.machine.drives import active_joints
+
+_LOOSE = 1e-6  # weight of the change of a length, and of joints that the file does not say
+_ITERATIONS, _CHANGES = 25, 6
+_LEVER = 0.1  # share of a length's slope along the gap, below which it does not close it
+_CLEAR = 0.05  # [rad], shares: joints are where they are said to be
+_ALIKE, _DIGIT = 2.0, 2e-3  # ratio of distances that decides nothing, and digits of a home
+_LISTED = 2
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """A number that would let the loops close.
+
+    Attributes:
+        name: As `crane.description.parameters` has it, or `home JOINT`.
+        now: Its value [m], [rad].
+        then: The value with which they close.
+        turns: Whether it is an angle.
+    """
+
+    name: str
+    now: float
+    then: float
+    turns: bool
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.then:.4g} {'rad' if self.turns else 'm'} (now {self.now:.4g})"
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Where a machine does not close at the home that its file says.
+
+    Attributes:
+        loop: The loop whose frames are farthest apart there.
+        gap: By how much [m].
+        remedies: Numbers that would close it, the likeliest first; none where no single one does.
+    """
+
+    loop: str
+    gap: float
+    remedies: tuple[Remedy, ...]
+
+    def __str__(self) -> str:
+        gap = f"{self.gap:.3g} m" if self.gap >= 1 else f"{1e3 * self.gap:.3g} mm"
+        close = self.listed or "no other length alone"
+        return f"with home as said loop '{self.loop}' is {gap} open, and would close with {close}"
+
+    @property
+    def listed(self) -> str:
+        """The remedies in words."""
+        return " or ".join(map(str, self.remedies))
+
+
+def misfit(spec: MachineSpec, model: pin.Model, guess: Array) -> Misfit | None:
+    """What keeps a machine from closing at the home that its file says.
+
+    Args:
+        spec: The machine as read.
+        model: Its tree.
+        guess: (nq,) home as the file says it.
+
+    Returns:
+        None where no frames are apart there. Joints that the file does not say are where frames
+        come nearest to each other.
+    """
+    equations = LoopEquations(model, spec.loops, spec.couplings)
+    names = equations.coordinates.names
+    active = [names.index(name) for name in active_joints(spec, model)]
+    passive = np.setdiff1d(np.arange(model.nv), active)
+    in_loops = (equations.sign != 0).any(axis=0)[passive]
+    said = np.isin(names, list(spec.home))[passive]
+    guess = _nearest(
+        equations, guess, passive[in_loops & ~said], lambda q, _: (*equations.scaled(q), guess)
+    )
+    gaps, size = _gaps(equations, guess), equations.size
+    if not len(gaps) or gaps.max() <= DIGITS * size:
+        return None
+    open_loops = [loop for loop, gap in zip(spec.loops, gaps, strict=True) if gap > DIGITS * size]
+    tried = []
+    for name, now, unit, turns, changed in _numbers(spec, equations, open_loops, guess, active):
+        if (in_loops & said).any():
+            found = _change(equations, guess, passive, said, changed)
+        else:
+            found = _least(equations, guess, passive, changed)
+        if found is not None and (turns or now * (now + found[0] * unit) > 0):
+            tried.append((found[1], Remedy(name, now, now + found[0] * unit, turns)))
+    tried.sort(key=lambda one: (one[0], abs(one[1].then - one[1].now)))
+    most = max(_ALIKE * tried[0][0], _DIGIT) if tried else 0.0
+    if (in_loops & said).any():
+        most = min(most, _CLEAR)
+    alike = [one for distance, one in tried if distance <= most]
+    worst = int(gaps.argmax())
+    return Misfit(spec.loops[worst].name, float(gaps[worst]), tuple(alike[:_LISTED]))
+
+
+# at a posture (nq,) and a change of a number, all in shares: phi (m,), dphi/dq, dphi/dp
+Changed = Callable[[Array, float], tuple[Array, Array, Array]]
+
+
+def _numbers(
+    spec: MachineSpec,
+    equations: LoopEquations,
+    loops: Sequence[LoopSpec],
+    guess: Array,
+    active: Sequence[int],
+) -> Iterator[tuple[str, float, float, bool, Changed]]:
+    """Lengths that loops go through, and driven joints: name, value, unit, whether it turns."""
+    joints = {joint for loop in loops for joint in _joints(spec, loop)}
+    size = equations.size
+
+    def length(other: LoopEquations) -> Changed:
+        def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
+            (phi, slopes), (there, others) = equations.evaluate(q), other.evaluate(q)
+            shares = equations.row_units
+            slopes = (slopes + change * (others - slopes)) / shares[:, None] * equations.units
+            return (phi + change * (there - phi)) / shares, slopes, (there - phi) / shares
+
+        return changed
+
+    def drive(column: int) -> Changed:
+        def changed(q: Array, change: float) -> tuple[Array, Array, Array]:
+            there = q.copy()
+            there[column] += change * equations.units[column]
+            phi, slopes = equations.scaled(there)
+            return phi, slopes, slopes[:, column]
+
+        return changed
+
+    for name, part, way in tree_numbers(spec.tree, spec.chains):
+        if way[0] != "xyz" or part.name not in joints or not (now := number_at(part, way)):
+            continue
+        joint = spec.tree.joints[part.name]
+        x, y, z = (value + size * (i == way[1]) for i, value in enumerate(joint.xyz))
+        joint = dataclasses.replace(joint, xyz=(x, y, z))
+        moved = assemble(dataclasses.replace(spec, tree=spec.tree.replacing(joint)))
+        yield name, now, size, False, length(LoopEquations(moved, spec.loops, spec.couplings))
+    for column in active:
+        name = equations.coordinates.names[column]
+        if name in joints and name in spec.home:
+            unit, turns = float(equations.units[column]), not equations.coordinates.slides[column]
+            yield f"home {name}", float(guess[column]), unit, bool(turns), drive(column)
+
+
+def _joints(spec: MachineSpec, loop: LoopSpec) -> set[str]:
+    """Joints of the tree that a loop goes through, fixed ones among them."""
+    above = {joint.child: joint for joint in spec.tree.joints.values()}
+    ways = []
+    for link in (loop.predecessor, loop.successor):
+        way = set()
+        while link in above:
+            way.add(above[link].name)
+            link = above[link].parent
+        ways.append(way)
+    return ways[0] ^ ways[1]
+
+
+def _gaps(equations: LoopEquations, q: Array) -> Array:
+    """(l,) how far apart the frames of loops are along what they lock [m]."""
+    phi = equations.evaluate(q)[0]
+    return np.array([
+        np.linalg.norm(phi[(equations.loop_of_row == i) & equations.is_translation])
+        for i in range(len(equations.loops))
+    ])  # fmt: skip
+
+
+def _change(
+    equations: LoopEquations,
+    guess: Array,
+    passive: Indices,
+    said: NDArray[np.bool_],
+    changed: Changed,
+) -> tuple[float, float] | None:
+    """The change of a number in its unit that turns joints least that are said, by how much."""
+    x, units = np.zeros(len(passive) + 1), equations.units[passive]
+    weights = np.append(np.where(said, 1.0, _LOOSE), _LOOSE)
+    for _ in range(_ITERATIONS):
+        q = guess.copy()
+        q[passive] += x[:-1] * units
+        gap, jacobian, slope = changed(q, float(x[-1]))
+        slopes = np.column_stack([jacobian[:, passive], slope])
+        wanted = np.linalg.lstsq(slopes / weights, slopes @ x - gap, rcond=1e-12)[0] / weights
+        step = np.abs(wanted - x).max()
+        if not step < 1.0:  # also NaN
+            return None
+        x = wanted
+        if step < 1e-9:
+            break
+    if not np.abs(gap).max() < DIGITS:
+        return None
+    return float(x[-1]), float(np.abs(x[:-1][said]).max(initial=0.0))
+
+
+def _least(
+    equations: LoopEquations, guess: Array, passive: Indices, changed: Changed
+) -> tuple[float, float] | None:
+    """The least change of a number in its unit that closes the loops, and its amount.
+
+    Of the gap |phi| that is left at the nearest approach the slope is phi . (dphi/dp) / |phi|.
+    """
+    q, change = guess.copy(), 0.0
+    for _ in range(_CHANGES):
+        q = _nearest(equations, q, passive, changed, change)
+        phi, _, slope = changed(q, change)
+        if np.abs(phi).max() < DIGITS:
+            return change, abs(change)
+        lever = float(phi @ slope)
+        if abs(lever) < _LEVER * float(np.linalg.norm(phi) * np.linalg.norm(slope)):
+            return None
+        change -= float(phi @ phi) / lever
+    return None
+
+
+def _nearest(
+    equations: LoopEquations, q: Array, free: Indices, changed: Changed, change: float = 0.0
+) -> Array:
+    """The posture in which loops come nearest to closing, from one beside it."""
+    from scipy.optimize import least_squares  # slow to import, and not needed where they close
+
+    def there(x: Array) -> Array:
+        out = q.copy()
+        out[free] += x * equations.units[free]
+        return out
+
+    if not len(free):
+        return q
+
+    def gap(x: Array) -> Array:
+        return changed(there(x), change)[0]
+
+    def slope(x: Array) -> Array:
+        return changed(there(x), change)[1][:, free]
+
+    return there(least_squares(gap, np.zeros(len(free)), slope).x)
