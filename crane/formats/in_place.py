@@ -4,7 +4,9 @@ import re
 import shutil
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from xml.parsers import expat
 
 import numpy as np
@@ -80,7 +82,15 @@ def _replace(path: Path, text: str) -> None:
         shutil.copymode(path, part)
 
 
+def _own_arguments(machine: Machine) -> dict[str, str]:
+    """Those of its file, without the one that takes whatever home was found."""
+    return {x: value for x, value in machine.arguments.items() if x != NEAREST_ASSEMBLY}
+
+
 def _check_place(machine: Machine, path: Path) -> None:
+    sought = machine.closure.sought
+    if sought is None or not sought.is_far:
+        machine = replace(machine, arguments=MappingProxyType(_own_arguments(machine)))
     elsewhere = f"write it into a copy: crane convert {machine.command} FOLDER"
     packaged = {place.resolve() for place in (*bundled().values(), *examples().values())}
     if path in packaged:
@@ -99,7 +109,7 @@ def _check(path: Path, before: Machine) -> None:
             active=before.chosen.get("active"),
             free=before.chosen.get("free"),
             packages=before.packages,
-            arguments={x: v for x, v in before.arguments.items() if x != NEAREST_ASSEMBLY},
+            arguments=_own_arguments(before),
         )
     except CraneError as error:
         raise OutputError(f"{path}: home cannot be written into it ({error})") from None
