@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from crane.codegen import Number
-from crane.common.errors import InputError, SimulationError
+from crane.common.errors import ClosureError, InputError, SimulationError
 from crane.common.samples import Array, as_number
 from crane.common.shown import Brief
 from crane.control.base import At
@@ -78,6 +78,8 @@ class Phases(Command, Brief, threading.local):
         self._phases, self._spools = tuple(phases), tuple(circuit.spools.values())
         self._columns = {x: int(machine.column(x)) for x in circuit.joints}
         self._joints = circuit.joints
+        self._closure = machine.closure
+        self._home = dict(zip(machine.active, machine.home[machine.closure.active], strict=True))
         self._units = {x: machine.unit(x) for x in circuit.joints}
         self._which = [self._joints.index(spool.joint) for spool in self._spools]
         # what may be left of a phase as it ends, and the way of the levers back
@@ -150,9 +152,19 @@ class Phases(Command, Brief, threading.local):
             raise SimulationError(
                 f"at t = {time:.6g} s: phase '{phase.name}' has not ended within "
                 f"{phase.within:g} s, '{joint}' is at {now[joint]:.4g} {unit} on its way from "
-                f"{self._from[joint]:.4g} to {phase.until[joint]:.4g} {unit}: give it more time "
-                "or lever, or a position that it reaches"
+                f"{self._from[joint]:.4g} to {phase.until[joint]:.4g} {unit}: "
+                + self._remedy(phase, now)
             )
+
+    def _remedy(self, phase: Phase, now: Mapping[str, float]) -> str:
+        """What to do about a phase that does not end; a dead centre on the way is named."""
+        end = {joint: phase.until[joint] for joint in self._waiting}
+        q_a = np.array([{**now, **end}.get(joint, at) for joint, at in self._home.items()])
+        try:
+            self._closure.solve(q_a)
+        except ClosureError as error:
+            return f"a dead centre is in between ({error}), give a position before it"
+        return "give it more time or lever, or a position that it reaches"
 
     def _targets(self) -> Array:
         """Where the hand wants the levers (m,)."""

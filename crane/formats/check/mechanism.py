@@ -15,6 +15,7 @@ from crane.common.samples import Array
 from crane.description import MachineSpec
 from crane.description.findings import Findings, flag
 from crane.formats.ambiguity import warn_of_assemblies
+from crane.formats.check.strokes import warn_of_strokes, warn_of_tasks
 from crane.formats.home import check_home, with_remedy
 from crane.machine.assemble import assemble, closed, home_guess
 from crane.machine.between import check_elements
@@ -58,6 +59,9 @@ def check_mechanism(spec: MachineSpec, found: Findings) -> Closure | None:
     _warn_of_limits(spec, closure)
     check_home(spec, closure, guess)
     warn_of_assemblies(spec, closure, guess, thorough=True)
+    if found.usable:
+        warn_of_tasks(spec, closure)
+        warn_of_strokes(spec, closure)
     return closure
 
 
