@@ -21,6 +21,7 @@ from crane.ratings.places import Places
 from crane.ratings.rules import Rule
 from crane.ratings.slopes import field_slopes
 from crane.ratings.strength import strengths
+from crane.ratings.strokes import check_drives
 from crane.recordings.timeseries import Table, write
 
 _CELLS = 50  # about how many the larger extent is divided into
@@ -147,13 +148,7 @@ def places_of(machine: Machine, frame: str | None) -> Places:
     Raises:
         InputError: Its drives are not its active joints, or see `Places`.
     """
-    if machine.motors and any(
-        drive.name not in machine.active or len(drive.factors) > 1 for drive in machine.motors
-    ):
-        raise InputError(
-            f"the drives of '{machine.name}' are not its active joints, choose them: --active"
-        )
-    return Places(Statics(machine, frame))
+    return Places(Statics(check_drives(machine), frame))
 
 
 def charted(

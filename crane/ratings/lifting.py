@@ -149,7 +149,7 @@ def capacity(
 
 def raiser(places: Places) -> str:
     """The drive that carries most: whose stroke moves the machine's first moment farthest."""
-    machine, strokes = places.machine, [*places.pair, *places.others]
+    machine, strokes = places.machine, places.moving
     at = places.statics.at(machine.home[None])
     moved = np.linalg.norm(at.slopes[0], axis=0) * (places.high - places.low)
     return machine.active[max(strokes, key=lambda i: moved[i])]

@@ -12,20 +12,17 @@ from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.common.shown import Brief
 from crane.dynamics.statics import AtRest, Statics
-from crane.motion.kinematics import Kinematics
-from crane.motion.workspaces.explore import limits_of, strokes_of
-from crane.motion.workspaces.patch import Patch, fill, last_closed
-from crane.motion.workspaces.section import section_of, slewing
+from crane.motion.workspaces.patch import Patch, fill
 from crane.ratings.grids import within
+from crane.ratings.strokes import Strokes
 
 _NODES = 33  # values of both strokes of a patch
 _LEVELS = (1, 17, 7)  # values of each further stroke, by how many there are
-_DRAWN = 200  # postures from which it is seen how the frame moves
 _ITERATIONS = 12
 _STRIDE = 0.2  # of a stroke, the farthest that one iteration moves
 _MISS = 1e-11  # of the machine's size
 _SLACK = 1e-9  # of a stroke, beyond its limits
-_SAME = 1e-6  # of a stroke
+_SAME = 1e-6  # of a stroke: postures that are one
 _FINE = 1e-8  # of a stroke, to which the best is sought
 _PEAKS, _APART = 3, 1.5  # how many of the best levels are improved, and steps between two of them
 _ROUNDS = 200
@@ -52,20 +49,16 @@ class Found(Brief):
         return Found(self.place[which], self.q[which], self.at.some(which))
 
 
-class Places:
+class Places(Strokes):
     """All ways in which a machine puts a frame at places of its section, within its limits.
 
     Two strokes, those that move the frame most, follow from the place by Newton's method; further
-    ones are free to choose: of a place, the posture of the largest value is sought over them. A
-    joint that slews the whole machine stays at home, as do strokes that do not move the frame.
+    ones are free to choose: of a place, the posture of the largest value is sought over them.
 
     Args:
         statics: The machine and the frame.
 
     Attributes:
-        section: Of the frame's places: radius and height.
-        low: (n,) lower limits of the active joints.
-        high: (n,) upper limits.
         pair: The two strokes, among the active joints.
         others: Further strokes that move it.
         postures: (N, nq) closed ones all over the strokes.
@@ -76,42 +69,16 @@ class Places:
     """
 
     def __init__(self, statics: Statics):
-        machine = self.machine = statics.machine
-        self.statics = statics
-        frame, active = statics.frame, machine.closure.active
-        self.low, self.high = limits_of(machine)
-        self._span = np.where(self.high > self.low, self.high - self.low, 1.0)
-        slew, random = slewing(machine, frame), np.random.default_rng(0)
-        if machine.free:
+        super().__init__(statics)
+        machine, moving = self.machine, self.moving
+        if not 2 <= len(moving) <= len(_LEVELS) + 1:
+            names = ", ".join(machine.active[i] for i in moving)
+            less = "fewer" if len(moving) < 2 else "some: --lock"
             raise InputError(
-                f"'{machine.free[0]}' of '{machine.name}' is free, hold it: "
-                f"--lock {machine.free[0]}=0"
+                f"what moves '{statics.frame}' in its section is {names or 'nothing'}, a chart "
+                f"takes 2 to {len(_LEVELS) + 1} strokes: name another frame, or lock {less}"
             )
-        kinematics = Kinematics(machine, frame)
-        strokes = strokes_of(
-            machine, kinematics, self.low, self.high, None if slew is None else slew[0], random
-        )
-        drawn = np.repeat(machine.home[None], _DRAWN, axis=0)
-        for k in strokes:
-            drawn[:, active[k]] = random.uniform(self.low[k], self.high[k], _DRAWN)
-        closed, good = statics.closed(drawn)
-        for i in np.flatnonzero(np.logical_not(good)).tolist():  # far from home, step by step
-            closed[i] = last_closed(machine, machine.home, drawn[i, active])[0]
-        at = statics.at(closed)
-        self.section = section_of(machine, frame, at.tip, kinematics.position_at(machine.home))
-        moves = np.linalg.norm(self.section.slopes(at.tip, at.ways), axis=1).mean(axis=0)
-        far = moves * self._span
-        strokes = [i for i in strokes if far[i] > _SAME * far[strokes].max()]
-        if not 2 <= len(strokes) <= len(_LEVELS) + 1:
-            names = ", ".join(machine.active[i] for i in strokes)
-            less = "fewer" if len(strokes) < 2 else "some: --lock"
-            raise InputError(
-                f"what moves '{frame}' in its section is {names or 'nothing'}, a chart takes 2 to "
-                f"{len(_LEVELS) + 1} strokes: name another frame, or lock {less}"
-            )
-        order = sorted(strokes, key=lambda i: -far[i])
-        self.pair = (min(order[:2]), max(order[:2]))
-        self.others = sorted(order[2:])
+        self.pair, self.others = (moving[0], moving[1]), moving[2:]
         self._patches = list(self._filled())
         if not self._patches:
             raise InputError(f"no posture of '{machine.name}' closes on the way from home")
@@ -184,7 +151,7 @@ class Places:
     def _peaks(self, found: Found, values: Array) -> NDArray[np.intp]:
         """Indices of the largest values of each place that are not beside each other."""
         columns = self.machine.closure.active[self.others]
-        step = self._span[self.others] / (_LEVELS[len(self.others)] - 1)
+        step = self.span[self.others] / (_LEVELS[len(self.others)] - 1)
         levels = found.q[:, columns] / step
         left: NDArray[np.intp] = np.arange(len(values))
         out: list[NDArray[np.intp]] = []
@@ -201,8 +168,8 @@ class Places:
         self, found: Found, values: Array, targets: Array, value: Value
     ) -> tuple[Found, Array]:
         """Move all strokes to larger values along the null space of the frame's motion."""
-        strokes = [*self.pair, *self.others]
-        columns, span = self.machine.closure.active[strokes], self._span[strokes]
+        strokes = self.moving
+        columns, span = self.machine.closure.active[strokes], self.span[strokes]
         count = len(self.others)
         step = np.full(len(values), 1.0 / (_LEVELS[count] - 1))
         q, values, random = found.q.copy(), values.copy(), np.random.default_rng(0)
@@ -242,7 +209,7 @@ class Places:
             Postures, what they are at rest, and whether each is there and within its limits.
         """
         closure, strokes = self.machine.closure, list(strokes)
-        columns, span = closure.active[strokes], self._span[strokes]
+        columns, span = closure.active[strokes], self.span[strokes]
         q, good = self.statics.closed(q)
         at = self.statics.at(q)
         near = _MISS * closure.size
@@ -264,14 +231,14 @@ class Places:
             here = here[closes & (np.abs(miss[here]).max(axis=1) > near)]
         good[here] = False
         q_a = q[:, closure.active]
-        slack = _SLACK * self._span
+        slack = _SLACK * self.span
         inside = np.all((q_a >= self.low - slack) & (q_a <= self.high + slack), axis=1)
         return q, at, good & inside
 
     def _different(self, found: Found) -> NDArray[np.intp]:
         """Of postures that are the same at one place, one each."""
-        q_a = found.q[:, self.machine.closure.active] / (_SAME * self._span)
-        keys = np.column_stack([found.place, np.round(q_a[:, [*self.pair, *self.others]])])
+        q_a = found.q[:, self.machine.closure.active] / (_SAME * self.span)
+        keys = np.column_stack([found.place, np.round(q_a[:, self.moving])])
         return np.asarray(np.sort(np.unique(keys, axis=0, return_index=True)[1]))
 
 

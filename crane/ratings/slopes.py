@@ -85,7 +85,7 @@ def field_slopes(chart: "Field", names: Sequence[str]) -> Array:
             with np.errstate(divide="ignore", invalid="ignore"):
                 per_p = per_p + bound.sign * of_drives[:, k] / _rate(x, parts)[:, None]
         each[j] = per_q * causes.shares[bound.cause], per_p * causes.shares[bound.cause]
-    strokes = [*places.pair, *places.others]
+    strokes = places.moving
     section = places.section  # it stands at home: seen from there, what slews is turned back
     back = Rotation.from_rotvec(-angles[:, None] * section.second).as_matrix()
     tips = section.origin + (back @ (at.tip - section.origin)[:, :, None])[:, :, 0]

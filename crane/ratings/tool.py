@@ -19,6 +19,7 @@ from crane.ratings.pivots import digging, turns
 from crane.ratings.places import Places
 from crane.ratings.rules import rule_of
 from crane.ratings.strength import strengths
+from crane.ratings.strokes import Strokes
 
 DIRECTIONS = ("up", "down", "in", "out", "tangent", "-tangent", "normal", "-normal")
 
@@ -152,13 +153,13 @@ def _words(direction: str | Sequence[float], action: Action, machine: Machine) -
     )
 
 
-def tangent(places: Places, i: int) -> Along:
+def tangent(strokes: Strokes, i: int) -> Along:
     """What acts on the frame that stroke i moves as its drive pushes where it is stronger.
 
     Raises:
         InputError: Nothing limits the drive.
     """
-    machine = places.machine
+    machine = strokes.machine
     joint = machine.active[i]
     drives = {x.joint: x for x in strengths(machine, [joint])}
     if joint not in drives:
