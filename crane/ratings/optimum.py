@@ -37,11 +37,14 @@ def strongest(strokes: Strokes, causes: Causes, q: Array, moved: list[int]) -> A
     def least(at: AtRest) -> float:
         return float(causes.largest(at)[0].min())
 
+    def unit(at: AtRest) -> Array:
+        return causes.action.unit(at, np.zeros(1))
+
     start = statics.at(q[None])
     first = least(start)
     if not 0 < first < np.inf:
         return q
-    begun = [causes.terms(bound, start) for bound in causes.bounds]
+    begun = [causes.terms(bound, start, unit(start)) for bound in causes.bounds]
     size = np.array([abs(a[0]) + abs(b[0]) * first for a, b, *_ in begun])
     kept: dict[bytes, tuple[Array, AtRest, AtRest]] = {}
 
@@ -57,7 +60,7 @@ def strongest(strokes: Strokes, causes: Causes, q: Array, moved: list[int]) -> A
 
     def left(y: Any) -> Any:
         _, here, _ = at(y)
-        terms = [causes.terms(bound, here) for bound in causes.bounds]
+        terms = [causes.terms(bound, here, unit(here)) for bound in causes.bounds]
         return -np.array([a[0] + b[0] * first * y[-1] for a, b, *_ in terms]) / size
 
     def slopes(y: Any) -> Any:
@@ -68,7 +71,7 @@ def strongest(strokes: Strokes, causes: Causes, q: Array, moved: list[int]) -> A
                 one = AtRest(*(part[..., i] for part in by))
                 a, b, *_ = causes.changes(bound, here, one)
                 row[k] = (a[0] + b[0] * first * y[-1]) * span[k]
-            row[-1] = causes.terms(bound, here)[1][0] * first
+            row[-1] = causes.terms(bound, here, unit(here))[1][0] * first
         return -rows / size[:, None]
 
     def cost(y: Any) -> tuple[float, Any]:

@@ -139,8 +139,8 @@ def tool_force(
     if working is None:
         working = machine.driven_joints if alone is None else [alone]
     found = charted(
-        ToolForce, places, action, rule_of("none"), working, weights=weights, slews=slews,
-        step=step, radii=radii, heights=heights,
+        ToolForce, machine, places, action, rule_of("none"), working, weights=weights,
+        slews=slews, step=step, radii=radii, heights=heights,
     )  # fmt: skip
     return dataclasses.replace(found, direction=_words(direction, action, machine))
 
