@@ -329,6 +329,43 @@ def test_what_moves_straight_up_ends_on_a_slope_too(tmp_path):
         assert chart.loads.item() == pytest.approx(wanted, rel=1e-9), slope
 
 
+# places [m] whose best posture is in a narrow range of the bucket's stroke; X_boom, X_arm and
+# X_bucket of it, found by trying 129 strokes of the bucket
+NARROW = {
+    (2.0, -3.0): (0.00189, 0.75296, 1.07571),
+    (2.5, -2.0): (0.11074, 0.98087, 1.06143),
+    (3.0, -1.5): (0.19582, 1.03093, 1.07032),
+    (3.0, -1.0): (0.21817, 1.16495, 1.07089),
+    (3.5, 3.0): (0.85811, 1.47824, 1.08933),
+}
+
+
+def test_no_narrow_peak_is_missed(excavator):
+    """Postures that carry up to 39 % more than a peak beside; alone, and in a chart."""
+    chart = crane.capacity(excavator, step=0.5, slews=[0.0])
+    for place, strokes in NARROW.items():
+        start = excavator.closure.solve(np.r_[0.0, strokes])[None]
+        q, _, there = chart.places.moved(start, np.array([place]), chart.places.pair)
+        assert there.all()
+        load = min(by_hand(excavator, chart, q[0]).values())
+        a, b = np.abs(chart.radii - place[0]).argmin(), np.abs(chart.heights - place[1]).argmin()
+        alone = chart.at_places([place[0]], [place[1]]).loads[0, 0, 0]
+        assert load <= chart.loads[0, b, a] * (1 + 1e-9) and load <= alone * (1 + 1e-9)
+        assert load >= 0.995 * chart.loads[0, b, a]  # the same peak
+
+
+def test_causes_that_end_a_load_together_are_all_told(excavator):
+    """Where the best posture balances two, not that which rounding makes the less."""
+    chart = crane.capacity(excavator, step=0.5, slews=[0.0])
+    reached = np.isfinite(chart.loads)
+    with np.errstate(invalid="ignore"):
+        gaps = np.sort(np.nan_to_num(chart.each / chart.loads[..., None] - 1, nan=np.inf))[..., 1]
+    both = chart.together.sum(axis=-1) > 1
+    assert both.sum() > 150 and np.array_equal(both[reached], gaps[reached] < 1e-6)
+    assert not np.any((gaps[reached] > 1e-6) & (gaps[reached] < 1e-5))  # nothing in between
+    assert np.array_equal(chart.cause[reached], chart.together[reached].argmax(axis=-1))
+
+
 @pytest.mark.parametrize(
     "given",
     [{"radii": ["a"]}, {"slews": ["x"]}, {"rule": None}, {"radii": [[1, 2], [3]]}],

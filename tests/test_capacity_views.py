@@ -20,7 +20,7 @@ import crane
 from crane.ratings.tables import load_table
 from crane.ratings.words import sides
 from crane.view.page.capacity import page_data, write_capacity_page
-from crane.view.plots.capacity import _draw_contours, capacity_figure
+from crane.view.plots.capacity import _draw_contours, capacity_figure, contours
 from crane.view.plots.capacity_sheet import sheet_figure
 from crane.view.sketch.outline import outline
 
@@ -146,6 +146,33 @@ def test_pictures_name_all_causes(chart):
     for text in sheet.texts:  # nothing runs off the page
         box = text.get_window_extent()
         assert page.x0 <= box.x0 and box.x1 <= page.x1 and page.y0 <= box.y0 and box.y1 <= page.y1
+
+
+def test_contours_run_to_the_edge(chart):
+    """Their ends are in cells at the border of those that have loads; and none leaves these."""
+    loads, half = np.isfinite(chart.loads[0]), np.diff(chart.radii)[0] / 2
+    b, a = np.nonzero(loads)
+    reached = np.column_stack([chart.radii[a], chart.heights[b]])
+    b, a = np.nonzero(np.logical_not(loads))
+    open_ = np.column_stack([chart.radii[a], chart.heights[b]])
+    ends = 0
+    for _, lines in contours(chart, 0):
+        for line in lines:
+            away = np.abs(line[:, None] - reached).max(axis=2).min(axis=1)
+            assert away.max() <= half + 1e-9
+            if np.linalg.norm(line[0] - line[-1]) > 1e-9:
+                gaps = np.abs(line[[0, -1], None] - open_).max(axis=2).min(axis=1)
+                assert gaps.max() < 1.8 * half  # 1 at the edge, 2 at the outermost places
+                ends += 2
+    assert ends > 8
+
+
+def test_the_heading_is_above_those_of_the_panels(chart):
+    figure = capacity_figure(chart)
+    FigureCanvasAgg(figure).draw()
+    heading = figure._suptitle.get_window_extent()
+    for axes in figure.axes:
+        assert axes._left_title.get_window_extent().y1 < heading.y0
 
 
 def turned(text):

@@ -216,6 +216,12 @@ def test_version_and_units_in_help():
     assert "In seconds; that of the task" in text and "recorded instants in seconds" in text
 
 
+def test_a_hydraulic_machine_without_signals_stands_on_its_valves(tmp_path):
+    """It is not free: no lever is moved."""
+    run = typed("simulate", "patu655", "--duration", "0.02", "--out", tmp_path / "run")
+    assert run.stdout.startswith("# patu655: valves at rest\n")
+
+
 def test_without_a_task_a_controller_holds_and_none_lets_go(free_run, tmp_path):
     assert free_run[1].stdout.startswith("# mini_forwarder: free motion\n")
     time = "--duration", "0.02"

@@ -353,7 +353,8 @@ def test_meshes_are_scaled_and_placed(tmp_path):
         '</geometry><material name="own"><color rgba="1 0.5 0 1"/></material></visual>'
     )
     (tmp_path / "arm.urdf").write_text(ARM.format(foot=visual))
-    (found,) = read_visuals(crane.load(tmp_path / "arm.urdf"))
+    visuals = read_visuals(crane.load(tmp_path / "arm.urdf"))
+    (found,) = (x for x in visuals if x.link == "foot")
     assert isinstance(found.shape, Mesh)
     assert found.colour == (1, 0.5, 0, 1)
     corners = found.corners()

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import wheel_loader
 
 import crane
 from crane.common.errors import CraneWarning
+from crane.dynamics.frames import FrameJacobians
 from crane.formats.check import check
 from crane.formats.visuals import mesh_process, meshes
 from crane.formats.visuals.visuals import PLAIN, Box, Cylinder, Mesh, Sphere, read_drawn
@@ -333,3 +335,31 @@ def test_meshes_are_read_without_what_takes_long_to_import(tmp_path):
     nothing = b'{"files": [], "triangles": 0}'
     subprocess.run([sys.executable, "-P", "-c", code], input=nothing, cwd=tmp_path, check=True)
     assert (tmp_path / "told").read_text() == "[] True"
+
+
+def test_bodies_without_visuals_are_bars_between_their_pins(tmp_path):
+    """Where others have visuals: boom, bellcrank and link of a loader whose bucket has some."""
+    path = wheel_loader.write(tmp_path)
+    urdf = tmp_path / "wheel_loader.urdf"
+    drawn = '<visual><geometry><box size="1 2 1"/></geometry></visual></link>'
+    text = urdf.read_text()
+    for link in ("frame", "bucket"):
+        start = text.index("</inertial></link>", text.index(f'<link name="{link}">'))
+        text = f"{text[:start]}</inertial>{drawn}{text[start + len('</inertial></link>') :]}"
+    urdf.write_text(text)
+    machine = crane.load(path)
+    frames, found = FrameJacobians(machine), {}
+    frames.place(machine.home)
+    for visual in read_visuals(machine):
+        if isinstance(visual.shape, Sphere):
+            place = frames.pose(visual.link).homogeneous @ visual.placement
+            found.setdefault(visual.link, []).append(place[[0, 2], 3])
+    known = {
+        "boom": (wheel_loader.PIN, wheel_loader.CRANK, wheel_loader.LIFT_EYE),
+        "bellcrank": (wheel_loader.EYE, wheel_loader.LINK),
+        "link": (wheel_loader.BUCKET,),
+    }
+    for body, pins in known.items():
+        gaps = np.linalg.norm(np.array(pins)[:, None] - np.array(found[body]), axis=2)
+        assert gaps.min(axis=1).max() < 1e-9
+    assert "bucket" not in found and "frame" not in found

@@ -147,7 +147,8 @@ def simulate(
     else:
         control = control_of(loaded, task, controller, sway)
         duration = duration_of(loaded, task, duration)
-    label = task or (path.stem if path else "hold" if control else "free motion")
+    left = "free motion" if loaded.hydraulics is None else "valves at rest"
+    label = task or (path.stem if path else "hold" if control else left)
     with kept_in(out, npz, force), progress_bar("simulating") as progress:
         recording = run(
             loaded, control, duration=duration, step=step, label=label, method=method,

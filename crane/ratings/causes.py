@@ -137,8 +137,9 @@ class Causes:
         """
         pins = self.in_pins(at, angles, q)
         out = np.full((len(at.mass), len(self.all)), np.inf)
+        unit = self.action.unit(at, np.zeros(len(at.mass)) if angles is None else angles)
         for bound in self.bounds:
-            end = self.end(bound, self.terms(bound, at, angles, pins))
+            end = self.end(bound, self.terms(bound, at, unit, pins))
             out[:, bound.cause] = np.minimum(out[:, bound.cause], end)
         return np.asarray(out * self.shares)
 
@@ -162,7 +163,7 @@ class Causes:
         self,
         bound: Bound,
         at: AtRest,
-        angles: Array | None = None,
+        unit: Array,
         pins: tuple[Array, Array] | None = None,
     ) -> tuple[Array, ...]:
         """What a bound's a, b (N,), c and d (N, 3) are: a + b x + |c + d x| <= 0.
@@ -170,16 +171,15 @@ class Causes:
         Args:
             bound: One of `bounds`.
             at: The machine at rest.
-            angles: See `largest`.
+            unit: (N, 3) of what acts, see `Action`.
             pins: See `in_pins`.
         """
         if bound.pin is not None:
             assert pins is not None
             none = np.zeros(len(at.mass))
             return none - self._most[bound.pin], none, *(x[:, bound.pin] for x in pins)
-        angles = np.zeros(len(at.mass)) if angles is None else angles
         weighs, lever, rest = self._levers(bound, at, 1.0)
-        return self._terms(bound, weighs, rest, [(lever, self.action.unit(at, angles))])
+        return self._terms(bound, weighs, rest, [(lever, unit)])
 
     def changes(
         self, bound: Bound, at: AtRest, by: AtRest, angles: Array | None = None

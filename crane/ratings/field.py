@@ -19,12 +19,14 @@ from crane.ratings.actions import Action, slewed
 from crane.ratings.causes import TIPS, Cause, Causes
 from crane.ratings.places import Places
 from crane.ratings.rules import Rule
-from crane.ratings.slopes import field_slopes
+from crane.ratings.slopes import EQUAL, field_slopes
 from crane.ratings.strength import strengths
+from crane.ratings.strokes import check_drives
 from crane.recordings.timeseries import Table, write
 
-_CELLS = 50  # about how many the larger extent is divided into
-_NICE = (1.0, 2.0, 2.5, 5.0, 10.0)
+_CELLS = {0: 100, 1: 75, 2: 40}  # of the larger extent at most, by how many strokes are free
+_NICE = (1.0, 2.5, 5.0, 10.0)  # multiples of a quarter, for tables by 0.5, 1, 1.5 ... m
+_DIGITS = 12  # behind the point of places
 _MOST = 400  # cells along one axis
 
 
@@ -34,8 +36,7 @@ class Field(Brief):
 
     Attributes:
         machine: The machine.
-        frame: What is acted on.
-        section: The plane of the places.
+        places: What is acted on, and how it gets anywhere.
         action: What acts on it, per magnitude.
         rule: By which it is rated.
         working: Joints whose drives work; others hold.
@@ -49,14 +50,14 @@ class Field(Brief):
         causes: What may end it.
         values: (s, b, a) magnitudes; NaN where the frame does not reach, infinite where nothing
             ends them.
-        cause: (s, b, a) index of what ends it, -1 where nothing does.
+        cause: (s, b, a) index of what ends it, the first of those that do together; -1 where
+            nothing does.
         each: (s, b, a, K) magnitudes by cause.
         q_a: (s, b, a, n) active coordinates; of all that reach the place those of the largest.
     """
 
     machine: Machine
-    frame: str
-    section: Section
+    places: Places
     action: Action
     rule: Rule
     working: tuple[str, ...]
@@ -75,9 +76,24 @@ class Field(Brief):
     quantity: ClassVar[tuple[str, str]] = ("value", "1")
 
     @property
+    def frame(self) -> str:
+        """What is acted on."""
+        return self.places.statics.frame
+
+    @property
+    def section(self) -> Section:
+        """The plane of the places."""
+        return self.places.section
+
+    @property
     def ends(self) -> tuple[int, ...]:
-        """Indices of the causes that end it somewhere."""
+        """Indices of the causes that are the first to end it somewhere."""
         return tuple(np.unique(self.cause[self.cause >= 0]).tolist())
+
+    @property
+    def together(self) -> NDArray[np.bool_]:
+        """(s, b, a, K) which causes end it: several where the best posture balances them."""
+        return _together(self.each, self.values)
 
     def slopes(self, names: Sequence[str]) -> Array:
         """Derivatives of the values by numbers of the machine, see `crane.ratings.slopes`.
@@ -147,17 +163,12 @@ def places_of(machine: Machine, frame: str | None) -> Places:
     Raises:
         InputError: Its drives are not its active joints, or see `Places`.
     """
-    if machine.motors and any(
-        drive.name not in machine.active or len(drive.factors) > 1 for drive in machine.motors
-    ):
-        raise InputError(
-            f"the drives of '{machine.name}' are not its active joints, choose them: --active"
-        )
-    return Places(Statics(machine, frame))
+    return Places(Statics(check_drives(machine), frame))
 
 
 def charted(
     kind: type[F],
+    machine: Machine,
     places: Places,
     action: Action,
     rule: Rule,
@@ -175,6 +186,7 @@ def charted(
 
     Args:
         kind: What it becomes.
+        machine: The machine.
         places: Of the frame.
         action: What acts on it.
         rule: By which it is rated.
@@ -190,7 +202,7 @@ def charted(
     Raises:
         InputError: See `capacity`.
     """
-    machine, statics = places.machine, places.statics
+    statics = places.statics
     causes = Causes(statics, strengths(machine, working, friction), rule, action, slope, weights)
     axes = _axes(places, step, radii, heights)
     tips = any(cause.why == TIPS for cause in causes.all)
@@ -221,13 +233,19 @@ def charted(
             q_a[k, best.place, slew] = turn
     reached = np.isfinite(q_a[..., 0])
     least = np.where(reached, np.where(np.isnan(each), np.inf, each).min(axis=2), np.nan)
-    first = np.where(np.isfinite(least), np.nan_to_num(each, nan=np.inf).argmin(axis=2), -1)
+    first = np.where(np.isfinite(least), _together(each, least).argmax(axis=2), -1)
     shape = (len(turns), b, a)
     return kind(
-        machine, statics.frame, places.section, action, rule, tuple(working), slope, friction,
-        weights, *axes, turns, causes.all, least.reshape(shape), first.reshape(shape),
-        each.reshape(*shape, count), q_a.reshape(*shape, n),
+        machine, places, action, rule, tuple(working), slope, friction, weights, *axes, turns,
+        causes.all, least.reshape(shape), first.reshape(shape), each.reshape(*shape, count),
+        q_a.reshape(*shape, n),
     )  # fmt: skip
+
+
+def _together(each: Array, least: Array) -> NDArray[np.bool_]:
+    with np.errstate(invalid="ignore"):
+        ends: NDArray[np.bool_] = each <= least[..., None] * (1 + EQUAL)
+    return ends & np.isfinite(least)[..., None]
 
 
 def _axes(
@@ -239,7 +257,7 @@ def _axes(
     """Coordinates of the places: multiples of a step within the reach, or those that are given."""
     low, high = places.reach.min(axis=0), places.reach.max(axis=0)
     if step is None:
-        rough = float((high - low).max()) / _CELLS
+        rough = float((high - low).max()) / _CELLS[len(places.others)]
         power = 10.0 ** np.floor(np.log10(rough))
         step = float(power * next(x for x in _NICE if x * power >= rough))
     step = as_number(step, "the step", "m", above=0.0)
@@ -253,7 +271,8 @@ def _axes(
         (radii, heights), ("radii", "heights"), low, high, strict=True
     ):
         if given is None:
-            out.append(step * np.arange(np.floor(one / step), np.ceil(two / step) + 1))
+            count = np.arange(np.floor(one / step), np.ceil(two / step) + 1)
+            out.append(np.round(step * count, _DIGITS))  # 3.4, not 3.4000000000000004
             continue
         values = as_sample(given, len(given), name)
         if not len(values) or not np.isfinite(values).all() or (np.diff(values) <= 0).any():

@@ -86,9 +86,9 @@ class Capacity(Field):
     def at_places(self, radii: Sequence[float], heights: Sequence[float]) -> "Capacity":
         """The same at other places, see `capacity`."""
         slews = None if self.section.slew is None else self.slews.tolist()
-        return capacity(
-            self.machine, self.frame, rule=self.rule, raising=self.raising, slews=slews,
-            slope=self.slope, friction=self.friction, radii=radii, heights=heights,
+        return charted(
+            Capacity, self.machine, self.places, self.action, self.rule, self.raising,
+            slope=self.slope, friction=self.friction, slews=slews, radii=radii, heights=heights,
         )  # fmt: skip
 
     def to_markdown(self) -> str:
@@ -142,14 +142,14 @@ def capacity(
     if raising is None:
         raising = [raiser(places)] if rule.raises else machine.driven_joints
     return charted(
-        Capacity, places, load_on(machine), rule, raising, slope=slope, friction=friction,
-        slews=slews, step=step, radii=radii, heights=heights,
+        Capacity, machine, places, load_on(machine), rule, raising, slope=slope,
+        friction=friction, slews=slews, step=step, radii=radii, heights=heights,
     )  # fmt: skip
 
 
 def raiser(places: Places) -> str:
     """The drive that carries most: whose stroke moves the machine's first moment farthest."""
-    machine, strokes = places.machine, [*places.pair, *places.others]
+    machine, strokes = places.machine, places.moving
     at = places.statics.at(machine.home[None])
     moved = np.linalg.norm(at.slopes[0], axis=0) * (places.high - places.low)
     return machine.active[max(strokes, key=lambda i: moved[i])]

@@ -8,12 +8,13 @@ import numpy as np
 from crane.common.errors import InputError, known
 from crane.common.samples import as_number
 from crane.common.shown import Brief
+from crane.dynamics.statics import Statics
 from crane.machine import Machine
 from crane.motion.workspaces import Workspace, workspace
 from crane.motion.workspaces.section import upwards
 from crane.ratings.dimensions import Dimension, Dimensions
-from crane.ratings.field import places_of
 from crane.ratings.pivots import digging, pivot
+from crane.ratings.strokes import Strokes, check_drives
 from crane.recordings.timeseries import Table, write
 
 LEVEL = 2.44  # length of the level bottom, 8 ft [m]
@@ -117,9 +118,9 @@ def working_range(
             "drawn in one: name another frame"
         )
     joint = pin = None
-    places = places_of(machine, frame)
+    strokes = Strokes(Statics(check_drives(machine), frame))
     try:
-        i = digging(places, bucket)[0]
+        i = digging(strokes, bucket)[0]
         joint, pin = machine.active[i], pivot(machine, space.frame, i)
     except InputError:
         if bucket is not None:

@@ -11,17 +11,16 @@ from scipy.spatial.transform import Rotation
 from crane.common.errors import InputError
 from crane.common.samples import Array
 from crane.dynamics.named import Named
-from crane.dynamics.statics import AtRest, Statics
+from crane.dynamics.statics import AtRest
 from crane.machine import Machine
 from crane.ratings.actions import slewed
 from crane.ratings.causes import Causes, lines_of
-from crane.ratings.places import Places
 from crane.ratings.strength import strengths
 
 if TYPE_CHECKING:
     from crane.ratings.field import Field
 
-_EQUAL = 1e-6  # of a load: causes that end it together
+EQUAL = 1e-6  # of a load: causes that end it together
 _AT_LIMIT = 1e-6  # of a stroke
 
 
@@ -52,8 +51,7 @@ def field_slopes(chart: "Field", names: Sequence[str]) -> Array:
         InputError: There is no such number, or it moves a support.
     """
     machine, names = chart.machine, list(names)
-    statics = Statics(machine, chart.frame)
-    places = Places(statics)
+    places, statics = chart.places, chart.places.statics
     drives = strengths(machine, chart.working, chart.friction)
     causes = Causes(statics, drives, chart.rule, chart.action, chart.slope, chart.weights)
     named = Named(machine)
@@ -70,11 +68,11 @@ def field_slopes(chart: "Field", names: Sequence[str]) -> Array:
     at, by_q, by_p = statics.at(q), statics.derivatives(q), statics.by_numbers(q, names)
     angles = slewed(machine, chart.frame, places.section, chart.slews[s])
     loads = chart.values[s, b, a]
-    pins = causes.in_pins(at, angles, q)
+    unit, pins = chart.action.unit(at, angles), causes.in_pins(at, angles, q)
     each = {}  # by bound but pins: derivatives of its load by q_A (N, n) and by numbers (N, k)
     ends = np.empty((len(here), len(causes.bounds)))
     for j, bound in enumerate(causes.bounds):
-        parts = causes.terms(bound, at, angles, pins)
+        parts = causes.terms(bound, at, unit, pins)
         x = causes.end(bound, parts)
         ends[:, j] = x * causes.shares[bound.cause]
         if bound.pin is not None:
@@ -85,7 +83,7 @@ def field_slopes(chart: "Field", names: Sequence[str]) -> Array:
             with np.errstate(divide="ignore", invalid="ignore"):
                 per_p = per_p + bound.sign * of_drives[:, k] / _rate(x, parts)[:, None]
         each[j] = per_q * causes.shares[bound.cause], per_p * causes.shares[bound.cause]
-    strokes = [*places.pair, *places.others]
+    strokes = places.moving
     section = places.section  # it stands at home: seen from there, what slews is turned back
     back = Rotation.from_rotvec(-angles[:, None] * section.second).as_matrix()
     tips = section.origin + (back @ (at.tip - section.origin)[:, :, None])[:, :, 0]
@@ -93,7 +91,7 @@ def field_slopes(chart: "Field", names: Sequence[str]) -> Array:
     place_by = section.slopes(tips, back @ by_p.tip)
     span = places.high - places.low
     for i in range(len(here)):
-        together = np.flatnonzero(ends[i] <= loads[i] * (1 + _EQUAL)).tolist()
+        together = np.flatnonzero(ends[i] <= loads[i] * (1 + EQUAL)).tolist()
         if not all(j in each for j in together):
             continue
         rises = np.array([each[j][0][i, strokes] for j in together])

@@ -127,8 +127,9 @@ def _farthest(
     if len(chart.radii) > 1:
         beside = chart.radii[last : last + 2] if last + 1 < len(chart.radii) else chart.radii[-2:]
         beyond = chart.radii[last] + np.linspace(0.0, 1.0, _FINER + 1) * np.diff(beside)
-        chart = chart.at_places(beyond.tolist(), [chart.heights[i]])
-        i, last = 0, int(np.flatnonzero(~np.isnan(chart.loads[0, 0]))[-1])
+        row = beyond, chart.heights[[i]]
+        farthest = beyond[chart.places.all(row).place.max()]
+        chart, i, last = chart.at_places([farthest], [chart.heights[i]]), 0, 0
     loads = chart.loads[:, i, last]
     ends = [k >= 0 and _drive(chart.causes[k]) for k in chart.cause[:, i, last]]
     return float(chart.radii[last]), loads, np.array(ends)

@@ -19,6 +19,7 @@ from crane.ratings.pivots import digging, turns
 from crane.ratings.places import Places
 from crane.ratings.rules import rule_of
 from crane.ratings.strength import strengths
+from crane.ratings.strokes import Strokes
 
 DIRECTIONS = ("up", "down", "in", "out", "tangent", "-tangent", "normal", "-normal")
 
@@ -138,8 +139,8 @@ def tool_force(
     if working is None:
         working = machine.driven_joints if alone is None else [alone]
     found = charted(
-        ToolForce, places, action, rule_of("none"), working, weights=weights, slews=slews,
-        step=step, radii=radii, heights=heights,
+        ToolForce, machine, places, action, rule_of("none"), working, weights=weights,
+        slews=slews, step=step, radii=radii, heights=heights,
     )  # fmt: skip
     return dataclasses.replace(found, direction=_words(direction, action, machine))
 
@@ -152,13 +153,13 @@ def _words(direction: str | Sequence[float], action: Action, machine: Machine) -
     )
 
 
-def tangent(places: Places, i: int) -> Along:
+def tangent(strokes: Strokes, i: int) -> Along:
     """What acts on the frame that stroke i moves as its drive pushes where it is stronger.
 
     Raises:
         InputError: Nothing limits the drive.
     """
-    machine = places.machine
+    machine = strokes.machine
     joint = machine.active[i]
     drives = {x.joint: x for x in strengths(machine, [joint])}
     if joint not in drives:

@@ -67,11 +67,15 @@ def sides(chart: "Capacity") -> list[str]:
     ]
 
 
-def shares(chart: "Capacity") -> list[tuple[str, float]]:
-    """Causes that end loads, and the share of all places where each does."""
+def shares(chart: "Capacity") -> list[tuple[str, float, float]]:
+    """Causes that end loads, the share of all places where each does, and with another one."""
     all_places = max(int((~np.isnan(chart.loads)).sum()), 1)
-    found = [(str(chart.causes[k]), float((chart.cause == k).sum()) / all_places)
-             for k in chart.ends]  # fmt: skip
+    several = chart.together.sum(axis=-1) > 1
+    found = []
+    for k in chart.ends:
+        ends = chart.together[..., k]
+        each, both = (float(x.sum()) / all_places for x in (ends, ends & several))
+        found.append((str(chart.causes[k]), each, both))
     return sorted(found, key=lambda one: -one[1])
 
 
@@ -93,8 +97,11 @@ def to_markdown(chart: "Capacity") -> str:
     lines = [f"# Lifting capacity of {chart.machine.name}\n"]
     lines += [f"- {name}: {text}" for name, text in facts(chart)]
     lines += ["", *_table(headings(chart, table), rows), "", note(chart, table)]
-    lines += ["\n| ended by | of all places |", "| --- | ---: |"]
-    lines += [f"| {cause} | {100 * share:.3g} % |" for cause, share in shares(chart)]
+    lines += ["\n| ended by | of all places | of all, with another |", "| --- | ---: | ---: |"]
+    lines += [
+        f"| {cause} | {100 * share:.3g} % | {100 * both:.3g} % |"
+        for cause, share, both in shares(chart)
+    ]
     if rows := bearing(chart):
         lines += ["", *_table(["under these loads", "", *chart.section.names, "slew"], rows)]
     return "\n".join(lines) + "\n"

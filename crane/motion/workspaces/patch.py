@@ -88,25 +88,37 @@ def _solved(machine: Machine, targets: Array, guess: Array, out: Array) -> bool:
 
 
 def fill(
-    machine: Machine, base: Array, pair: tuple[int, int], axes: tuple[Array, Array]
+    machine: Machine,
+    base: Array,
+    pair: tuple[int, int],
+    axes: tuple[Array, Array],
+    start: Array | None = None,
 ) -> Patch | None:
     """The closed postures of a patch, from the one nearest to home on.
 
+    Args:
+        machine: The machine.
+        base: (n,) where the active joints are held that are not of the pair.
+        pair: Two of them, or one twice.
+        axes: Their values; an axis of one value is held at the base.
+        start: (nq,) closed posture to come from; home if not given.
+
     Returns:
-        None where the way from home to the patch is barred.
+        None where the way from there to the patch is barred.
     """
     closure, shape = machine.closure, (len(axes[0]), len(axes[1]))
     patch = Patch(
         pair, base, axes, np.zeros(shape, dtype=bool), np.full((*shape, machine.model.nv), np.nan)
     )
-    home = machine.home[closure.active]
-    first = tuple(int(np.abs(axis - home[i]).argmin()) for i, axis in zip(pair, axes, strict=True))
-    q, able = last_closed(machine, machine.home, patch.target((first[0], first[1])))
+    begun = machine.home if start is None else start
+    near = begun[closure.active]
+    one, two = (int(np.abs(x - near[i]).argmin()) for i, x in zip(pair, axes, strict=True))
+    first = (one, two)
+    q, able = last_closed(machine, begun, patch.target(first))
     if not able:
         return None
-    start = (first[0], first[1])
-    patch.closed[start], patch.q[start] = True, q
-    waiting = [start]
+    patch.closed[first], patch.q[first] = True, q
+    waiting = [first]
     while waiting:
         at = waiting.pop()
         if closure.compiled:

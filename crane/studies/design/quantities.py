@@ -303,7 +303,7 @@ class Point:
     def _sought(self, name: str, arguments: tuple[Any, ...]) -> tuple[float, Array]:
         """From the best of the postures all over the strokes, by their exact slopes."""
         places, closure = self._tip, self.machine.closure
-        strokes = [*places.pair, *places.others]
+        strokes = places.moving
         columns = closure.active[strokes]
         low, span = places.low[strokes], (places.high - places.low)[strokes]
         values = self._goal(name, arguments, places.statics.at(places.postures).tip)[0]

@@ -16,11 +16,12 @@ _BARRELS = 3.0  # largest distances on one body, the longest stroke that is draw
 
 
 def read_visuals(machine: Machine) -> list[Visual]:
-    """The visuals of every link, or a skeleton where no URDF has any.
+    """The visuals of every link, and a skeleton of bodies with mass that have none.
 
-    A mesh whose file is missing or damaged is a box, and what cannot be drawn is left out, with a
-    warning; where nothing but boxes would be left, the skeleton is there, too. Bodies that slide
-    and have no visuals are rods or blocks.
+    Where no URDF has any, the skeleton is of all that there is. A mesh whose file is missing or
+    damaged is a box, and what cannot be drawn is left out, with a warning; where nothing but boxes
+    would be left, the skeleton is there, too. Bodies that slide and have no visuals are rods or
+    blocks.
     """
     visuals: list[Visual] = []
     missing: list[str] = []
@@ -42,8 +43,11 @@ def read_visuals(machine: Machine) -> list[Visual]:
         _warn(f"{problems[0]}{more}")
     frames = machine.model.frames
     shown = {frames[machine.frame(visual.link)].parentJoint for visual in visuals}
-    if all(visual.shape is box for visual in visuals):
-        visuals += skeleton(machine)
+    bare = all(visual.shape is box for visual in visuals)
+    long = {joint for joint, end, _ in _ends(machine) if joint and end.any()}
+    masses = machine.model.inertias
+    bodies = {joint for joint in long - shown if masses[joint].mass}
+    visuals += skeleton(machine, None if bare else bodies)
     return visuals + sliding(machine, shown)
 
 
@@ -107,15 +111,21 @@ def sliding(machine: Machine, drawn: Collection[int]) -> list[Visual]:
     return found
 
 
-def skeleton(machine: Machine) -> list[Visual]:
+def skeleton(machine: Machine, bodies: Collection[int] | None = None) -> list[Visual]:
     """Bars from each joint to the joints and frames of the body it moves.
 
     Where springs are held by what stands still there is a ball alone: a bar would hide them.
+
+    Args:
+        machine: The machine.
+        bodies: By the joints that move them; all, and what stands still, if not given.
     """
     model, links, radius = machine.model, _links(machine), 0.03 * longest(machine)
     held = {link for item in machine.elements for link in item.between or ()}
     visuals = []
     for body, end, name in _ends(machine):
+        if bodies is not None and body not in bodies:
+            continue
         in_link = model.frames[machine.frame(links[body])].placement.inverse()
         ball = in_link.homogeneous
         ball[:3, 3] = in_link.act(end)

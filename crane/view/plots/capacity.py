@@ -1,5 +1,6 @@
 """Rated loads over radius and height: contours, coloured by what ends them."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 from contourpy import contour_generator
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
@@ -30,6 +32,8 @@ _FREE = "#eeeeee"  # where nothing ends a load
 BODY, ROD = "#4a4f57", "#8b929b"
 _FONT, _LETTER, _APART = 7, 0.62, 1.5  # of labels: points, width, distance by that
 _TRIED = (0.5, 0.35, 0.65, 0.2, 0.8, 0.1, 0.9)  # shares of a line
+_ROOM = 0.1  # above and below panels [inch]
+_DENSE = 8  # parts of a contour within a cell, to end it where the cells do
 _LEVELS, _SHOWN = 8, (0.05, 0.9)  # contours at most, and between which quantiles of the loads
 _ROUND = np.array([1, 1.25, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10])
 
@@ -66,6 +70,7 @@ def capacity_figure(chart: Capacity) -> Figure:
                     axes.set_ylabel("")
             else:
                 axes.set_axis_off()
+        figure.set_layout_engine("constrained", h_pad=_ROOM)  # or headings touch
         figure.suptitle(plain(heading(chart)), x=0.01, ha="left", fontsize=11, fontweight="bold")
         figure.legend(
             handles=swatches(chart), loc="outside lower center", ncols=2 if many > 1 else 1
@@ -155,11 +160,45 @@ def contours(chart: Capacity, k: int) -> list[tuple[float, list[Array]]]:
     finite = finite[finite > 0]
     if not len(finite):
         return []
-    loads = np.ma.masked_invalid(chart.loads[k])
-    lines = contour_generator(chart.radii, chart.heights, loads, name="serial")
+    loads = chart.loads[k]
+    beyond = np.ma.masked_invalid(_continued(np.where(np.isfinite(loads), loads, np.nan)))
+    lines = contour_generator(chart.radii, chart.heights, beyond, name="serial")
     low, high = np.quantile(finite, _SHOWN)
-    return [(level, [np.asarray(line) for line in lines.lines(level)])
+    return [(level, [part for line in lines.lines(level)
+                     for part in _parts_within(chart, k, np.asarray(line))])
             for level in _levels(float(low), float(high))]  # fmt: skip
+
+
+def _continued(loads: Array) -> Array:
+    """Loads (b, a), and around them those that two places beside continue, in a straight line.
+
+    Of cells at the border the contours would miss the outer half else.
+    """
+    b, a = loads.shape
+    wide = np.pad(loads, 2, constant_values=np.nan)
+    sums, counts = np.zeros(loads.shape), np.zeros(loads.shape)
+    for i, j in itertools.product((-1, 0, 1), repeat=2):
+        one, two = (wide[2 + n * i :, 2 + n * j :][:b, :a] for n in (1, 2))
+        ahead = np.where(np.isfinite(two), 2 * one - two, one)
+        sums += np.where(np.isfinite(ahead), ahead, 0.0)
+        counts += np.isfinite(ahead)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(np.isfinite(loads), loads, sums / counts))
+
+
+def _parts_within(chart: Capacity, k: int, line: Array) -> list[Array]:
+    """Parts of a line (n, 2) within the cells that have loads."""
+    along = np.arange(len(line))
+    fine = np.linspace(0.0, len(line) - 1.0, _DENSE * (len(line) - 1) + 1)
+    points = np.column_stack([np.interp(fine, along, x) for x in line.T])
+    a, b = (
+        np.searchsorted((x[1:] + x[:-1]) / 2, points[:, i])
+        for i, x in enumerate((chart.radii, chart.heights))
+    )
+    inside = np.isfinite(chart.loads[k, b, a])
+    cuts = np.flatnonzero(np.diff(inside)) + 1
+    parts = zip(np.split(points, cuts), np.split(inside, cuts), strict=True)
+    return [part for part, kept in parts if kept[0] and len(part) > 1]
 
 
 def _draw_contours(axes: Axes, chart: Capacity, k: int) -> None:
@@ -168,9 +207,8 @@ def _draw_contours(axes: Axes, chart: Capacity, k: int) -> None:
     levels = [level for level, lines in found if lines]
     if not levels:
         return
-    loads = np.ma.masked_invalid(chart.loads[k])
-    lines = axes.contour(chart.radii, chart.heights, loads, levels, colors=[INK],
-                         linewidths=0.9, zorder=4)  # fmt: skip
+    lines = ContourSet(axes, levels, [ways for _, ways in found if ways], colors=[INK],
+                       linewidths=0.9, zorder=4)  # fmt: skip
     unit, scale = reading("kg", max(level for level, _ in found))
 
     def said(level: float) -> str:

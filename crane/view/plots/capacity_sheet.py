@@ -104,7 +104,7 @@ def _draw_facts(figure: Figure, chart: Capacity, left: float, top: float) -> Non
     y -= 0.1
     _write(figure, left, y, "ended by (of all places)", fontweight="bold")
     tints = {str(chart.causes[k]): tint for k, tint in colours(chart).items()}
-    for cause, share in shares(chart):
+    for cause, share, _ in shares(chart):
         y -= _LINE + 0.02
         _write(figure, left, y, "■", tints[cause], 11.0)
         lines = textwrap.wrap(f"{cause}, {100 * share:.3g}\u00a0%", letters - 5)

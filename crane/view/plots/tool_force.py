@@ -18,7 +18,6 @@ from crane.view.plots.text import plain
 
 _COLORS = ("#1f5fa8", "#e0701a", "#2a8c4a", "#8a5fb0", "#d9b53f", "#b04a7a", "#3f8f9f", "#9a6b3f",
            "#7a7a7a", "#6f9bca", "#c2452d", "#333333")  # fmt: skip
-_TOGETHER = 1e-6  # of a force: causes that end it together
 _ARROWS = 12  # along the larger side
 
 
@@ -45,10 +44,7 @@ def tool_force_figure(field: ToolForce) -> Figure:
         height = np.clip(4.2 * tall / max(wide, 1e-9), 2.6, 6.5) * count + 2.0
         figure = Figure(figsize=(9.6, float(height)), layout="constrained")
         grid = figure.subplots(count, 2, squeeze=False, sharex=True, sharey=True)
-        with np.errstate(invalid="ignore"):
-            ending = field.each <= field.values[..., None] * (1 + _TOGETHER)
-        first = np.where(field.cause < 0, -1, ending.argmax(axis=-1))  # of those that do together
-        ends = np.unique(first[first >= 0]).tolist()
+        ends = field.ends
         colors = {k: _COLORS[j % len(_COLORS)] for j, k in enumerate(ends)}
         for s, (left, right) in enumerate(grid):
             forces = field.forces[s] / 1e3
@@ -69,7 +65,7 @@ def tool_force_figure(field: ToolForce) -> Figure:
             bar.outline.set_visible(False)
             which = np.full(forces.shape, np.nan)
             for j, k in enumerate(ends):
-                which[first[s] == k] = j
+                which[field.cause[s] == k] = j
             palette = ListedColormap([colors[k] for k in ends] or [INK])
             right.pcolormesh(field.radii, field.heights, np.ma.masked_invalid(which),
                              shading="nearest", cmap=palette, vmin=-0.5,
