@@ -116,8 +116,11 @@ def test_bennetts_condition_is_needed(tmp_path):
 
 def test_bennetts_linkage_of_the_other_hand_is_told_to_be_far_from_what_the_file_says(tmp_path):
     """The other way round, a length is negative: opposite hinges turn the same way then."""
+    path = bennett(tmp_path, other=-OTHER_LENGTH)
+    with pytest.raises(crane.CraneError, match="three is 2.6 rad off, loop 'four' the other way"):
+        crane.load(path)
     with pytest.warns(CraneWarning, match=r"three closes far off; .* has three 2.6 rad off"):
-        machine = crane.load(bennett(tmp_path, other=-OTHER_LENGTH))
+        machine = crane.load(path, arguments={"nearest_assembly": True})
     one = np.linspace(0.4, 2.9, 60)
     q = machine.closure.solve(one[:, None])
     assert machine.closure.residual(q).max() < 1e-13

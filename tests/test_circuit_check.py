@@ -349,4 +349,4 @@ def test_the_note_on_a_bundled_circuit():
 
 def test_the_table_has_no_unknown_names():
     names = {name for kind in KINDS for name in number_names(kind)} | set(MOTOR)
-    assert set(USUAL) - names <= {"meter_out", "bore", "rod"}
+    assert set(USUAL) - names <= {"meter_out", "bore", "rod", "stroke"}

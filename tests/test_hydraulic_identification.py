@@ -430,7 +430,7 @@ def without(run, name):
     ("change", "line"),
     [
         (lambda m, r: (m, r, "tip", "weak"), "'tip' has no cylinder, known: boom"),
-        (lambda m, r: (m, r, "boom", "lss"), "'lss' is unknown, known: weak, chambers, ls"),
+        (lambda m, r: (m, r, "boom", "lss"), "'lss' is unknown, did you mean 'ls'?"),
         (lambda m, r: (m, [], "boom", "weak"), "no recordings, give at least one"),
         (lambda m, r: (holding(m), r, "boom", "weak"), "counterbalance valve.*another cylinder"),
         (lambda m, r: (dataclasses.replace(m, hydraulics=None), r, "boom", "weak"),

@@ -259,11 +259,8 @@ MINI_FORWARDER = [
     case(
         "tip is a joint",
         "mini_forwarder.yaml:{line of tip: q3}: the tip frame 'q3' is unknown, "
-        "known: A1_barrel, A1_base, A1_eye, A1_rod, A2_barrel, A2_eye, A2_rod, "
-        "base, link1, link1_B, link1_C, link2, link2_D, link2_E, link2_F, "
-        "link2_base, link3, link3_G, link3_H, link3_elbow, link4, link4_J, "
-        "link4_base, link5, link5_J, link5_base, link6, link6_K, link7, link7_K, "
-        "link7_tip",
+        "the nearest of 31 known ones are link3, link3_G, link3_H, link3_elbow, A1_barrel, "
+        "A1_base, A1_eye, A1_rod",
         swap("tip: link7_tip", "tip: q3", MINI),
         machine=MINI,
     ),

@@ -30,7 +30,7 @@ from crane.machine.assemble import assemble
 from crane.machine.drives import active_joints
 
 _LOOSE = 1e-6  # weight of the change of a length, and of joints that the file does not say
-_ITERATIONS, _CHANGES = 25, 6
+_ITERATIONS, _CHANGES, _EVALUATIONS = 25, 6, 30
 _LEVER = 0.1  # share of a length's slope along the gap, below which it does not close it
 _CLEAR = 0.05  # [rad], shares: joints are where they are said to be
 _ALIKE, _DIGIT = 2.0, 2e-3  # ratio of distances that decides nothing, and digits of a home
@@ -261,4 +261,4 @@ def _nearest(
     def slope(x: Array) -> Array:
         return changed(there(x), change)[1][:, free]
 
-    return there(least_squares(gap, np.zeros(len(free)), slope).x)
+    return there(least_squares(gap, np.zeros(len(free)), slope, max_nfev=_EVALUATIONS).x)
