@@ -28,7 +28,7 @@ from crane.common.errors import CraneError, CraneWarning  # noqa: E402
 from crane.formats import read  # noqa: E402
 
 DATA = Path(__file__).parent / "data"
-MOST = 250_000  # lines of the package for one file; a home that is searched for in vain takes 211,000
+MOST = 250_000  # lines of the package for one file; a search for home in vain takes 211,000
 
 FOUR_BAR_MJCF = """<mujoco model="bar">
   <compiler angle="radian"/>

@@ -48,6 +48,12 @@ def drawn(linkage):
     return sides([(feet[one], at, feet[two]) for _, one, two, at in linkage.loops])
 
 
+SOME_SLOW = [
+    pytest.param(name, marks=pytest.mark.slow) if name in ("loader", "nearly in line") else name
+    for name in LINKAGES
+]
+
+
 @pytest.mark.parametrize("name", LINKAGES)
 def test_right_lengths_close_as_said_without_a_word(name, tmp_path):
     linkage = LINKAGES[name]
@@ -59,7 +65,7 @@ def test_right_lengths_close_as_said_without_a_word(name, tmp_path):
     assert sides(places(machine, linkage)) == drawn(linkage)
 
 
-@pytest.mark.parametrize("name", LINKAGES)
+@pytest.mark.parametrize("name", SOME_SLOW)
 def test_no_wrong_length_turns_a_linkage_over(name, tmp_path):
     """Right assembly near what is said, or an error with the gap and the length."""
     linkage, refused = LINKAGES[name], 0
@@ -81,7 +87,7 @@ def test_no_wrong_length_turns_a_linkage_over(name, tmp_path):
     assert refused or name == "double rocker"
 
 
-@pytest.mark.parametrize("name", ["bucket", "loader"])
+@pytest.mark.parametrize("name", ["bucket", pytest.param("loader", marks=pytest.mark.slow)])
 def test_changes_may_move_home_and_not_turn_it_over(name, tmp_path):
     """A variant is another machine than the one of which the file says home."""
     linkage = LINKAGES[name]
