@@ -100,7 +100,7 @@ def test_some_mutations(tmp_path, name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [250, pytest.param(None, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [60, pytest.param(None, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", sorted(bundled()))
 def test_mutations(tmp_path, name, count):
     run(tmp_path, name, count, seed=1)

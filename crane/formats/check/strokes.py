@@ -13,7 +13,7 @@ from crane.description.spec import TIP
 
 _SAMPLES, _WORK = 150, 6000  # of the strokes' box, and samples times joints at most
 _FAILED = 20  # of these that end it: each takes a hundred times as long as one that closes
-_LONG = 50.0  # [m], of a stroke
+_LONG = 100.0  # characteristic lengths of the machine, of a stroke that is told as millimetres
 _TOLD = 0.01  # share of the box that does not close
 _SLACK = 1e-6  # of a limit [rad], [machine's size], as runs have it
 
@@ -73,7 +73,7 @@ def warn_of_strokes(spec: MachineSpec, closure: Closure) -> None:
     """
     coordinates, active = closure.equations.coordinates, closure.active
     lower, upper = coordinates.lower[active], coordinates.upper[active]
-    moved = coordinates.slides[active] & (upper - lower < _LONG)  # else it is told as millimetres
+    moved = coordinates.slides[active] & (upper - lower < _LONG * closure.size)
     moved &= (closure.equations.sign[:, active] != 0).any(axis=0)
     if not moved.any():
         return
