@@ -138,6 +138,7 @@ def test_what_is_fitted_can_be_loaded(fitted):
     assert found.machine.changes == again.changes
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_what_is_wrong_is_found_without_being_named(fitted, tmp_path):
     """Five numbers are off, one of them said otherwise by hand; what is right stays."""
@@ -340,6 +341,7 @@ def test_numbers_keep_their_sign():
     assert (pin.low, pin.high) == (-np.inf, np.inf)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_recordings_that_are_held_out_whole_and_several_that_are_fitted(tmp_path):
     machine = simple(tmp_path)

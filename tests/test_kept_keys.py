@@ -360,8 +360,10 @@ print(json.dumps(notes))
 @pytest.mark.parametrize(
     "names",
     [
-        ("kr300", "slider_crank.yaml", "stewart.urdf"),
-        pytest.param(("mini_forwarder", "patu655", "five_bar.urdf"), marks=pytest.mark.long),
+        ("slider_crank.yaml", "stewart.urdf"),
+        pytest.param(
+            ("kr300", "mini_forwarder", "patu655", "five_bar.urdf"), marks=pytest.mark.long
+        ),
     ],
 )
 def test_what_is_kept_is_what_would_be_traced_now(names, tmp_path):
