@@ -118,8 +118,7 @@ def _options(
 ) -> None:
     """Machines with closed kinematic chains: simulate, identify and show.
 
-    Add --strict to any command to refuse inertias that no body has, which are computed with
-    otherwise, and --debug to see where an error comes from.
+    Every command takes --strict, which refuses inertias that no body has, and --debug.
     """
 
 
