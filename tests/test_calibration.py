@@ -22,6 +22,8 @@ from crane.identification.calibration.problem import noise_of
 from crane.identification.calibration.unknowns import unknowns_of
 from crane.recordings import timeseries
 
+pytestmark = pytest.mark.slow
+
 LIFTING = Path(__file__).parents[2] / "shared" / "data" / "patu655" / "lifting_first_half.csv"
 TRUTH = {
     "valve.x.neutral": 5.87, "friction.x.viscous": 900.0, "oil.bulk_modulus": 0.9e9,

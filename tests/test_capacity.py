@@ -72,6 +72,7 @@ def test_every_cell_is_what_statics_by_hand_give(excavator):
         assert away == pytest.approx([chart.radii[a], chart.heights[b]], abs=1e-9)
 
 
+@pytest.mark.slow
 def test_every_cause_is_reached(excavator):
     chart = crane.capacity(excavator, slews=[0.0, np.pi / 2, np.pi], rule="iso10567", step=1.0)
     ends = {str(chart.causes[k]) for k in chart.ends}

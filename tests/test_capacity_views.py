@@ -220,6 +220,7 @@ def test_names_are_drawn_as_they_are(chart, tmp_path):
     assert "<b>" not in text and "&lt;b&gt;" in text
 
 
+@pytest.mark.slow
 def test_the_page_holds_the_chart(chart, tmp_path):
     text = write_capacity_page(chart, tmp_path / "capacity.html").read_text(encoding="utf-8")
     (inside,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
@@ -264,6 +265,7 @@ def test_the_command_writes_tables_pictures_and_page(tmp_path):
     assert typed(*words, cwd=tmp_path).returncode == 2  # not over what is there
 
 
+@pytest.mark.slow
 def test_a_rule_of_what_tips_is_told_where_nothing_does(tmp_path):
     words = "capacity", "patu655", "--step", "2", "--rule"
     done = typed(*words, "sfs4677", "--out", "rated", cwd=tmp_path)

@@ -128,6 +128,7 @@ def test_load_sensing_with_response(tmp_path, sensing):
     compare(machine, {"x": u}, rates, names, 2.5, times, start=[("sensed", TANK)])
 
 
+@pytest.mark.slow
 def test_accumulator_with_heat_under_a_load(tmp_path):
     """A load that swings on gas: closed valve, chamber A throttled into an accumulator."""
     v0, p0, n, tau, port = 8e-4, 1.5e6, 1.3, 0.7, 1e-4

@@ -119,6 +119,7 @@ def test_accelerations_can_be_limited(slider_crank):
     assert tame.after.logdet < free.after.logdet
 
 
+@pytest.mark.slow
 def test_forces_can_be_what_limits(edited):
     """A crank whose drive is weak: a third of the force that the motion would take."""
     machine = edited("slider_crank.yaml")
@@ -304,6 +305,7 @@ def test_command(tmp_path):
         assert len(result.stderr.splitlines()) == 1 and text in result.stderr
 
 
+@pytest.mark.slow
 def test_all_cylinders_together_take_what_the_pump_gives():
     """Of velocities of rod and piston sides at instants that the search has not seen."""
     machine = crane.load("patu655")

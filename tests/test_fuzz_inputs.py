@@ -8,7 +8,7 @@ plotted, shown, identified from and replayed, or refused by an error of the pack
 import pytest
 from judge import judge
 
-SOME = {"visuals": 4, "meshes": 1, "npz": 5, "csv": 6}
+SOME = {"visuals": 2, "npz": 2, "csv": 2}
 MANY = {"visuals": 120, "meshes": 10, "npz": 50, "csv": 90}  # meshes: 20 files each
 
 

@@ -147,6 +147,7 @@ def test_its_own_choice_of_steps_is_as_good(made):
     assert (np.abs(back - forward) <= 1e-6 * size).all(), np.abs(back - forward) / size
 
 
+@pytest.mark.slow
 def test_differences_of_order_8_agree():
     machine = crane.load("mini_forwarder", changes={
         f"friction.{joint}.{key}": 0.0

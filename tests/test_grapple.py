@@ -12,6 +12,8 @@ from crane.common.errors import CraneError
 from crane.control import flow_share
 from crane.motion.sway import METHODS, Sway, impulses, retimed, without_sway
 
+pytestmark = pytest.mark.slow
+
 GRAVITY = 9.81
 NAME = "patu655_grapple"
 # mass, centre below the upper pin, inertias about axes forward, up and across

@@ -20,6 +20,8 @@ sys.path.insert(0, str(ROOT / "scripts"))
 from hydraulic_forwarder import circuit, experiment, mechanics  # noqa: E402
 from hydraulic_forwarder.paper import ANGLES  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 PAGE = ROOT / "docs" / "validation" / "hydraulic_forwarder.md"
 # what somebody takes this crane to be on the command line
 LOCKED = ("--lock", "slew=0")

@@ -32,7 +32,7 @@ from crane.identification.signals.motion import Motion
 HERE = Path(__file__).parents[1]
 RAW = HERE / ".." / "shared" / "data" / "patu655" / "lifting_first_half.csv"
 COLUMNS = HERE / "scripts" / "columns" / "patu655.txt"
-pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+pytestmark = [pytest.mark.filterwarnings("ignore::crane.CraneWarning"), pytest.mark.slow]
 motion = partial(motions.motion, duration=20.0, noise=1.0)
 
 

@@ -199,6 +199,7 @@ def test_a_resting_joint_is_left_out(mini):
     assert np.isnan([result.training.rmse[0], result.training.relative[0]]).all()
 
 
+@pytest.mark.slow
 def test_recordings_of_simulations_serve(mini):
     """From strokes and forces alone, velocities by the smoother."""
     given = motion(mini)

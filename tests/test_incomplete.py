@@ -261,6 +261,7 @@ def test_kinematics_needs_no_masses(tmp_path):
     assert done.stderr.splitlines()[-1].startswith("error: no link of 'swing' that moves has")
 
 
+@pytest.mark.slow
 def test_free_joints_get_no_force_and_computed_torque_moves_the_others(tmp_path):
     """Partial feedback linearisation: the lift follows to rounding, the swing has no force."""
     machine, told = loaded(swinging(tmp_path), active=["lift"], free=["swing"])

@@ -171,6 +171,7 @@ def test_the_radius_is_about_the_centre_that_the_lip_turns_about(loader):
     assert f"| arm | X_lift | {words}, {found.arm.turn.offset:.3f} m off boom |" in text
 
 
+@pytest.mark.slow
 def test_a_toggle_is_said_and_ended_by_what_holds(with_toggle):
     """Bellcrank and link in line: the cylinder moves and the bucket does not."""
     found = crane.breakout(with_toggle, bucket="X_tilt")

@@ -105,6 +105,7 @@ def test_changes_may_move_home_and_not_turn_it_over(name, tmp_path):
     assert far
 
 
+@pytest.mark.slow
 def test_the_line_names_the_gap_and_the_length(tmp_path):
     """The lower arm of a loader's bell crank 0.24 m off; by hand: its pin on the boom is."""
     linkage = LINKAGES["loader"]

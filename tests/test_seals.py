@@ -359,6 +359,7 @@ def test_joints_that_hold_share_the_limits_of_the_moment():
     assert seals > 0.2 * limit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["compiled", "pinocchio"])
 def test_measured_pressures_of_the_tank_count(tmp_path, backend):
     """A replay of a recording whose tank is not the machine's: that of the recording counts."""

@@ -17,7 +17,7 @@ from crane.studies import measures
 from crane.studies.measures import of_strokes
 from crane.view.plots.study import plot_study
 
-pytestmark = pytest.mark.filterwarnings("ignore::crane.CraneWarning")
+pytestmark = [pytest.mark.filterwarnings("ignore::crane.CraneWarning"), pytest.mark.slow]
 PIN = {"link3_G.x": np.linspace(0.08, 0.11, 4), "link3_G.y": [-0.01, 0.0]}
 
 
