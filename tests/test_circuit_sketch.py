@@ -16,6 +16,8 @@ from crane.hydraulics.sources import TANK
 from crane.view.sketch.circuit import circuit_figure
 from crane.view.sketch.circuit.quantities import bar, figure, litres, per_turn, volume
 
+pytestmark = pytest.mark.slow
+
 
 def counted(folder, kind, count):
     """A circuit with so many functions."""

@@ -10,6 +10,8 @@ from crane.studies.design.dual import FUNCTIONS, Dual
 from crane.studies.design.expressions import Expression, requirement
 from crane.studies.design.quantities import Point, Terms
 
+pytestmark = pytest.mark.slow
+
 FOUR_BAR = """<robot name="four_bar">
 <link name="ground"/>{links}
 {joints}

@@ -25,6 +25,8 @@ from crane.identification.hydraulics.valve import identify_valve
 from crane.identification.signals.steady import steady, steady_means
 from crane.identification.signals.weak_form import Windows
 
+pytestmark = pytest.mark.slow
+
 # A lift of 8 t on one cylinder of the size of a forestry crane's; equations (21) to (23) below.
 MASS, LOAD, STROKE, LOWER = 8000.0, 40e3, 0.5, -0.1
 AREA_A, AREA_B, HOSE_A, HOSE_B = 7.854e-3, 5.391e-3, 0.8e-3, 0.9e-3

@@ -9,6 +9,8 @@ import crane
 from crane.common.errors import ClosureError, CraneWarning
 from crane.studies.measures import of_strokes
 
+pytestmark = pytest.mark.slow
+
 BASE, ARMS = np.array([0.3, 1.0]), (2.5, 1.6, 1.1)  # joint of the first arm, lengths [m]
 EYE = np.array([0.5, 0.4])  # of the rods, on the arm that they move
 MOUNTS = ((0.1, -0.9), (-0.7, 0.5), (-0.6, 0.55))  # of the barrels, from the arm's joint

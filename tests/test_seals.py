@@ -24,6 +24,8 @@ from crane.simulation.integration.charts import Chart
 from crane.simulation.integration.rosenbrock import StiffStepper
 from crane.simulation.integration.stepwise import PythonStepper
 
+pytestmark = pytest.mark.slow
+
 G, TANK = 9.81, 1e5
 SEAL, BRAKE = 1.5e-4, 2000.0
 METHODS = ("rosenbrock", "DOP853", pytest.param("Radau", marks=pytest.mark.long))
