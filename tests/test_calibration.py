@@ -519,6 +519,7 @@ def test_a_sensor_that_is_said_to_be_noisy_hardly_counts(fitted):
     assert wide > 5 * narrow
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_what_a_model_lacks_is_named_with_how_much_of_it(tmp_path):
     """Air in a chamber that nobody asked for; without it nothing is missed."""

@@ -172,6 +172,7 @@ def test_a_feasible_estimate_is_as_known_as_its_own_objective_says(mini, plain):
     assert ratio.min() > 0.1  # where few stretches of the recording tell, the prior tells more
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::crane.CraneWarning")
 @pytest.mark.filterwarnings("ignore:Solution may be inaccurate")

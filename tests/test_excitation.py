@@ -178,6 +178,7 @@ def test_it_tells_more_than_random_and_naive_references(found):
     assert found.after.smallest > 10 * found.before.smallest
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_condition_can_be_the_criterion(slider_crank):
     one, other = (

@@ -178,6 +178,7 @@ def test_differences_of_order_8_agree():
         assert found.of(name) == pytest.approx(true, rel=1e-7, abs=noise), name
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_all_numbers_that_matter_are_found():
     machine, controller, initial, _, _, _ = forwarder()

@@ -243,6 +243,7 @@ def workers(nanny):
                 process.wait(300)
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("nanny", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_a_worker_that_dies_loses_nothing(nanny, tmp_path):
