@@ -204,12 +204,6 @@ def _usable(
     return refused
 
 
-def _beyond(equations: LoopEquations, q: Array, passive: Indices) -> str | None:
-    """A passive joint that is outside of its limits, None where all are within."""
-    columns = passive[~within(equations, q)[passive]]
-    return equations.coordinates.names[int(columns[0])] if len(columns) else None
-
-
 def _analysed(
     equations: LoopEquations, active: Indices, passive: Indices, guess: Array
 ) -> Structure:

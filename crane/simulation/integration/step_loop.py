@@ -47,7 +47,7 @@ class Attempt:
 
 
 @dataclass(frozen=True)
-class _Step:
+class _StepVariables:
     """Variables of one step.
 
     Attributes:
@@ -163,7 +163,7 @@ class StepLoop:
         with r.otherwise():
             r.store(r.h, 1, wanted)
 
-    def _propose(self) -> _Step:
+    def _propose(self) -> _StepVariables:
         """Size and end of the next step; leaves the loop at the end."""
         r, whole = self._r, self._whole
         left, proposed = r.let(self._end - self._t), r.let(r.h[1])
@@ -186,7 +186,7 @@ class StepLoop:
         length = r.let(select(last, left, proposed))
         with r.when(~(length >= whole * _SHORTEST) & (self._ahead <= 0.0)):
             self._stop()
-        return _Step(length, last, goal, sure, proposed)
+        return _StepVariables(length, last, goal, sure, proposed)
 
     def _locate(self, left: Value, sure: Value) -> None:
         """Shorten what is left to where the secant method expects the event."""
@@ -204,7 +204,7 @@ class StepLoop:
         r.set(left, ahead * share)
         r.set(self._tries, self._tries + 1)
 
-    def _finish(self, step: _Step, wanted: Value) -> None:
+    def _finish(self, step: _StepVariables, wanted: Value) -> None:
         """Behind a step whose error is small and whose end is closed."""
         r = self._r
         self._call("rate", self._t + step.length, self._following, self._ending)
@@ -215,7 +215,7 @@ class StepLoop:
         with r.when(beyond_it < 1):
             self._accept(step, wanted, event, worst)
 
-    def _detect(self, step: _Step, beyond_it: Value, event: Value, worst: Value) -> None:
+    def _detect(self, step: _StepVariables, beyond_it: Value, event: Value, worst: Value) -> None:
         """Whether an event lies within the step (beyond_it) or at its end."""
         r = self._r
         if self._sticks:
@@ -233,7 +233,7 @@ class StepLoop:
                 r.set(self._ahead, step.length)
                 r.set(self._high, worst)
 
-    def _record(self, step: _Step, beyond_it: Value, event: Value) -> None:
+    def _record(self, step: _StepVariables, beyond_it: Value, event: Value) -> None:
         """Write the rows of the output instants within the step."""
         r, due, length = self._r, self._due, step.length
         count, since = r.let(self._recorded), r.let(due)
@@ -263,7 +263,7 @@ class StepLoop:
             r.set(self._recorded, self._recorded + 1)
             r.set(due, due + self._whole)
 
-    def _accept(self, step: _Step, wanted: Value, event: Value, worst: Value) -> None:
+    def _accept(self, step: _StepVariables, wanted: Value, event: Value, worst: Value) -> None:
         """Go on from the end of the step."""
         r, ahead = self._r, self._ahead
         # a part that was cut short says nothing against the length it was cut from
